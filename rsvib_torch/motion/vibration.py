@@ -17,7 +17,7 @@ from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming
+from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
 
 __all__ = ["Vibration", "VibrationStd", "blind_frequencies", "image_motion_line", "tone_head", "tone_rows"]
 
@@ -422,11 +422,6 @@ class VibrationStd(
     image_acceleration: Tensor
     displacement: Tensor | None = None
 
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: empty for one vibration, (B,) for a batch of stacks."""
-        return self.amplitude.shape[:-2]
-
     def summary(self) -> str:
         """Standard deviations of the tones of each axis as a table; of a batch, those of the strongest tones."""
         rows = [
@@ -436,16 +431,10 @@ class VibrationStd(
         head = [*axis_head(self.batch_shape), *tone_head(axes=self.amplitude.shape[-2])]
         return "standard deviations\n" + text_table(head, rows)
 
-    def __getitem__(self, index: int) -> "VibrationStd":
-        """The standard deviations of one stack of a batch."""
-        return self.mapped(lambda values: values[index])
-
     @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
-        if timing.scan_axis == -2:
-            return self
-        order, axes = [1, 0, 2, 3][: self.amplitude.shape[-2]], self.image_motion.ndim
+        order, axes = row_axes(timing, self.amplitude.shape[-2])[0], self.image_motion.ndim
         return self.mapped(lambda values: values[..., order] if values.ndim == axes else values[..., order, :])
 
 
