@@ -50,7 +50,13 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
 
 
 def restore_in_strips(
-    method: Callable[..., Tensor], images: Tensor, motion: Motion, timing: RowTiming, options: Mapping[str, Any]
+    method: Callable[..., Tensor],
+    images: Tensor,
+    motion: Motion,
+    timing: RowTiming,
+    options: Mapping[str, Any],
+    *,
+    pass_strips: bool = False,
 ) -> Tensor:
     """Frames restored by a method, in strips of columns if the motion has roll or zoom.
 
@@ -60,6 +66,7 @@ def restore_in_strips(
         motion: (B) in row order.
         timing: The sensor.
         options: Options of the method; masks shaped like the images are cut as well.
+        pass_strips: Whether the method has the option ``strips``, see ``RestorationMethod``.
 
     Returns:
         Restored frames as from the method.
@@ -78,8 +85,10 @@ def restore_in_strips(
         for name, value in options.items()
     }
     of_frames = frame_motion(of_strips, timing, count, height)
-    of_frames = replace(of_frames, neglected=neglected, strips=len(strips.firsts))
+    of_frames = replace(of_frames, neglected=neglected)
     of_frames.check_fits(height, width)
+    if pass_strips:
+        cut["strips"] = len(strips.firsts)
     restored = method(strips.cut(images), of_frames, **cut)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)
 

@@ -14,7 +14,7 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
-from rsvib_torch.imaging.trajectory import rows_showing
+from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_showing
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
@@ -36,7 +36,6 @@ class FrameMotion:
         frame_starts: (T,) seconds.
         shift: (B, T, 2) whole px, axes (x, y), float64.
         neglected: Standard deviation in px of the differences of the columns, where the motion is that of one of them.
-        strips: Number of neighbouring entries of the batch that are strips of columns of the same frames.
     """
 
     vibration: Motion
@@ -44,7 +43,6 @@ class FrameMotion:
     frame_starts: Tensor
     shift: Tensor
     neglected: float = 0.0
-    strips: int = 1
 
     def frame_rows(self, scene_rows: Tensor) -> Tensor:
         """Frame rows (B, T, S) that contain rows (S,) of the restored frames."""
@@ -86,6 +84,12 @@ class FrameMotion:
     def row_starts(self, frame_rows: Tensor) -> Tensor:
         """Exposure starts of frame rows (B, T, S) in seconds."""
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
+
+    def exposures(self, num_rows: int) -> tuple[Tensor, Tensor]:
+        """Displacement (B, T, R, N, 2) in px of rows 0 ... R - 1 at N nodes of their exposures, and weights (N,)."""
+        rows = torch.arange(num_rows, dtype=torch.float64, device=self.frame_starts.device)
+        starts = self.row_starts(rows).expand(*self.shift.shape[:2], num_rows)
+        return exposure_trajectory(self.vibration, starts, self.timing, "gauss")
 
 
 def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:

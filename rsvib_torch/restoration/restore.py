@@ -92,24 +92,29 @@ class RestorationMethod:
     Attributes:
         function: The method, see the contract above ``METHODS``.
         masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
-        of_mosaic: The method for colour mosaics with the same options and masks, and ``colours``; None for none.
+        strips: Whether it takes ``strips``, and then estimates once what strips of columns of the same frames have in
+            common. Without, every strip is restored as a stack of its own.
+        mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
     """
 
     function: Callable[..., Tensor]
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
-    of_mosaic: Callable[..., Tensor] | None = None
+    strips: bool = False
+    mosaic: "RestorationMethod | None" = None
 
 
 # Restoration methods. A method is called as
 #
 #     function(frames, motion, *, ignore=None, clipped=None, **options) -> Tensor
 #
-#     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite.
-#     motion: FrameMotion of the B stacks.
+#     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite; local means at missing pixels.
+#     motion: FrameMotion of the B stacks, whose displacement depends on the row only: frames with roll or zoom are cut
+#         into strips of columns, which are stacks of one batch.
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
-#         Without ``"ignore"``, missing pixels hold local means; without ``"clipped"``, saturated ones count.
+#         Without ``"ignore"``, the local means count as measured; without ``"clipped"``, saturated pixels do.
+#     strips: number of neighbouring stacks of the batch that are strips of the same frames, passed only if declared.
 #     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; passed
-#         to ``of_mosaic`` only. A method without it has no option ``mosaic``.
+#         to ``mosaic`` only. A method without it has no option ``mosaic``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
@@ -117,10 +122,15 @@ class RestorationMethod:
 # and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
 # and overload of ``restore`` and of ``VibrationRestorer``.
 METHODS: dict[str, RestorationMethod] = {
-    "exact": RestorationMethod(restore_exact, ("ignore", "clipped"), restore_mosaic),
+    "exact": RestorationMethod(
+        restore_exact,
+        masks=("ignore", "clipped"),
+        strips=True,
+        mosaic=RestorationMethod(restore_mosaic, masks=("ignore", "clipped")),
+    ),
     "banded": RestorationMethod(restore_banded),
     "dewarp": RestorationMethod(restore_dewarp),
-    "richardson-lucy": RestorationMethod(restore_richardson_lucy, ("ignore",)),
+    "richardson-lucy": RestorationMethod(restore_richardson_lucy, masks=("ignore",)),
 }
 
 
@@ -276,17 +286,15 @@ def restore_prepared(
     """
     options = dict(options or {})
     check_method_options(method, options)
-    chosen = METHODS[method]
-    function = chosen.function if frames.colours is None else chosen.of_mosaic
-    if function is None:
+    chosen = METHODS[method] if frames.colours is None else METHODS[method].mosaic
+    if chosen is None:
         raise ValueError(f"mosaic goes with method='exact', not with method={method!r}; demosaic the frames before")
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         options["colours"] = frames.colours
-    images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
-    return restore_in_strips(function, images, motion, frames.timing, options)
+    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options, pass_strips=chosen.strips)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:

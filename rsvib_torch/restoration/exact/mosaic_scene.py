@@ -13,8 +13,8 @@ from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
-from rsvib_torch.frames.mosaic import fill_by_colour, interpolated_colours, measures
-from rsvib_torch.restoration.exact.exact import given_level, row_exposures, scene_period
+from rsvib_torch.frames.mosaic import interpolated_colours, measures
+from rsvib_torch.restoration.exact.exact import given_level, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
@@ -173,7 +173,7 @@ def restore_mosaic(
     Where the frames do not determine the colours, as with one frame, ``similar_patches`` interpolates those of each.
 
     Args:
-        frames: (B, T, 1, H, W) in row order.
+        frames: (B, T, 1, H, W) in row order, with local means at missing pixels.
         motion: Motion of the frames.
         colours: (B, T, 1, H, W), the colour that each pixel measures, 0 to 2.
         joint: As in ``restore_exact``.
@@ -198,19 +198,18 @@ def restore_mosaic(
     partition = Partition.of_options(chunk_frequencies, segments)
     stated = None if noise == "auto" else given_level(noise)
     # displacement of each row during its exposure, and the period that it requires
-    displacement, node_weights = row_exposures(motion, frames)
+    displacement, node_weights = motion.exposures(height)
     lengths = [
         scene_period(width, reach, moved) for reach, moved in zip(motion.reaches(height), displacement, strict=True)
     ]
-    filled = frames if ignore is None else fill_by_colour(frames, ignore)
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
-    for stack, mosaic in enumerate(filled):
+    for stack, mosaic in enumerate(frames):
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
         floor = None
         if clipped is not None:
-            floor = torch.where(measured & clipped[stack], frames[stack], -torch.inf)
+            floor = torch.where(measured & clipped[stack], mosaic, -torch.inf)
         if ignore is not None:
             measured = measured & ~ignore[stack]
         if stated is None:  # of colours whose noise was halved by interpolation

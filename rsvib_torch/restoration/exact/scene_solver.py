@@ -28,7 +28,15 @@ from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_freq
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
-__all__ = ["Partition", "SceneProblem", "SceneSolver", "SolversSideBySide", "join_windows", "row_windows"]
+__all__ = [
+    "SIDE_BY_SIDE",
+    "Partition",
+    "SceneProblem",
+    "SceneSolver",
+    "SolversSideBySide",
+    "join_windows",
+    "row_windows",
+]
 
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
@@ -297,7 +305,7 @@ class SceneProblem:
         return SceneSolver(self.observation, self.precision, self.data.shape[-1], self.partition, keep=keep)
 
 
-_SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
+SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
 
 
 class SolversSideBySide:
@@ -322,7 +330,7 @@ class SolversSideBySide:
             alone = len(solver.parts) > 1 or solver.interpolates
             if alone or solver.num_systems > room:
                 self._groups.append([])
-                room = _SIDE_BY_SIDE
+                room = SIDE_BY_SIDE
             self._groups[-1].append(number)
             room = 0 if alone else room - solver.num_systems
         # a scene alone is solved by its solver
