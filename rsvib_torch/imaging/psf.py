@@ -1,9 +1,12 @@
-"""The point spread function of every row as batched sparse kernels.
+"""The point spread function of every row: batched sparse kernels, and transfer functions along the rows.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -12,12 +15,12 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.splines import bspline_weights, spread_taps
+from rsvib_torch.core.splines import bspline_weights, mirrored, spread_taps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["Interpolation", "RowPSF", "row_psf", "trajectory_psf"]
+__all__ = ["Interpolation", "RowPSF", "form_rows", "row_psf", "row_taps", "row_transfer", "trajectory_psf"]
 
 Interpolation = Literal["linear", "cubic"]
 SPLINE_DEGREES: dict[str, int] = {"linear": 1, "cubic": 3}
@@ -148,3 +151,55 @@ def trajectory_psf(displacement: Tensor, node_weights: Tensor, *, interpolation:
     first_y, weights_y = _axis_weights(displacement[..., 1], degree)
     weights = (weights_y * node_weights[:, None]).transpose(-2, -1) @ weights_x
     return RowPSF(torch.stack([first_x, first_y], dim=-1), weights, degree)
+
+
+def row_taps(places: Tensor, node_weights: Tensor, interpolate: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Scene rows between which rows of frames are interpolated.
+
+    Args:
+        places: (..., R, N) scene rows at the nodes of the exposures.
+        node_weights: (N,), sums to 1.
+        interpolate: Weights (..., K) of K neighbouring rows at fractional positions (...).
+
+    Returns:
+        Integer part (..., R) of the lowest place of each row, int64, and weights (..., R, J, N) of J rows from there.
+    """
+    cell = places.detach().floor()
+    first, taps = spread_taps(cell, interpolate(places - cell) * node_weights[:, None])
+    return first, taps.transpose(-2, -1)
+
+
+def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
+    """Kernels (..., R, J, U) of rows after a Fourier transform along them: ``sum_n taps exp(-2 pi i u x_n)``.
+
+    Args:
+        taps: (..., R, J, N) weights of J scene rows, as from ``row_taps``.
+        along: (..., R, N) displacement x_n along the rows in px.
+        frequencies: (U,) u in cycles per px.
+    """
+    angle = (-2 * math.pi) * along[..., None] * frequencies
+    taps = taps.to(angle.dtype)
+    return torch.complex(taps @ angle.cos(), taps @ angle.sin())
+
+
+def form_rows(
+    spectra: Tensor, places: Tensor, along: Tensor, node_weights: Tensor, frequencies: Tensor, degree: int
+) -> Tensor:
+    """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
+
+    Args:
+        spectra: (..., S, U) of the B-spline coefficients of S scene rows.
+        places: (T, R, N) scene rows at the nodes of the exposures of R rows of T frames.
+        along: (T, R, N) displacement along the rows in px.
+        node_weights: (N,), sums to 1.
+        frequencies: (U,) in cycles per px.
+        degree: Degree of the B-spline across rows.
+
+    Returns:
+        Spectra (..., T, R, U).
+    """
+    first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
+    source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)
+    transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
+    # sum over the taps of each row
+    return (spectra[..., mirrored(source, spectra.shape[-2]), :] * transfer).sum(-2)

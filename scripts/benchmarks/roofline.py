@@ -70,8 +70,8 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     moved, weights = motion.exposures(height)
     length = exact.scene_period(width, motion.reach(height), moved)
     kernels = row_kernels(moved[0], weights, torch.ones(1), height, 16)
-    observation = Observation(kernels, height, torch.float32)
-    band = observation.band(ORDER)
+    observation = Observation(kernels, height, length, torch.float32)
+    band = observation.normal(ORDER)
     frequencies = length // 2 + 1
     parts, _ = Partition().divide(
         observation.count, band.width, frequencies, torch.device(device), blurred=kernels.blurred, keep=False

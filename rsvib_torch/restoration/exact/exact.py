@@ -314,7 +314,9 @@ class Scene:
             precision = stack.prior.precision(stack.level.square(), self.strength, stack.period, kernels.reach)
         else:
             precision = stack.prior.of(members).precision(stack.noise_power, self.strength, kernels.reach)
-        problem = SceneProblem(data, observe(kernels, height, data.dtype), precision, stack.level, partition)
+        problem = SceneProblem(
+            data, observe(kernels, height, stack.period, data.dtype), precision, stack.level, partition
+        )
 
         # Values that are missing: the boundary extension of blurred rows, and pixels without data.
         along = stack.shift[members, 0] - stack.shift[self.reference, 0]

@@ -56,22 +56,13 @@ class MosaicSolver:
         observation: Observation operator K of M frames of R rows.
         weights: V, (M, 3, R, L) or (1, 3, R, L).
         precisions: P_k, as from ``PolynomialPrior.precision``.
-        length: L, period of the data.
         partition: Parts solved at a time.
     """
 
     def __init__(
-        self,
-        observation: FinerObservation,
-        weights: Tensor,
-        precisions: list[Tensor],
-        length: int,
-        partition: Partition,
+        self, observation: FinerObservation, weights: Tensor, precisions: list[Tensor], partition: Partition
     ) -> None:
-        self._observation, self._weights, self._length = observation, weights, length
-        self._precisions = precisions
-        self._u = torch.fft.rfftfreq(length, dtype=torch.float64, device=weights.device)
-        self._all = slice(0, len(self._u))
+        self._observation, self._weights, self._precisions = observation, weights, precisions
         inside = (weights > 0).any(1, keepdim=True)
         self._inside = inside.to(weights.dtype)
         squares = weights.new_tensor(_COMPONENTS).square()
@@ -79,18 +70,16 @@ class MosaicSolver:
         self._solvers = []
         for density, precision in zip(self._density.tolist(), precisions, strict=True):
             part = observation.weighted(density * observation.kernels.weight)
-            solver = SceneSolver(part, precision, length, partition)
+            solver = SceneSolver(part, precision, partition)
             keep = not solver.interpolates
-            self._solvers.append(SceneSolver(part, precision, length, partition, keep=True) if keep else solver)
+            self._solvers.append(SceneSolver(part, precision, partition, keep=True) if keep else solver)
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Colours (M, 3, R, L) of noiseless frames of a scene with coefficients (K, 3, U)."""
-        spectra = self._observation.forward(coefficients, self._u, self._all, self._length)
-        return _colours(torch.fft.irfft(spectra, n=self._length))
+        return _colours(self._observation.A(coefficients))
 
     def _adjoint(self, colours: Tensor) -> Tensor:
-        spectra = torch.fft.rfft(_components(colours))
-        return self._observation.adjoint(spectra, self._u, self._all, self._length)
+        return self._observation.A_adjoint(_components(colours))
 
     def _normal(self, coefficients: Tensor) -> Tensor:
         data = self._adjoint(self._weights * self.predict(coefficients))
@@ -114,7 +103,7 @@ class MosaicSolver:
         products = (one.conj() * other).real
         count = torch.full(products.shape[-1:], 2.0, dtype=torch.float64, device=products.device)
         count[0] = 1.0
-        if self._length % 2 == 0:
+        if self._observation.period % 2 == 0:
             count[-1] = 1.0
         return products.sum((0, 1), dtype=torch.float64) @ count
 
@@ -147,7 +136,7 @@ class MosaicSolver:
 
     def scene(self, coefficients: Tensor) -> Tensor:
         """Colours (3, 2 R, 2 L) of the scene at half pixels."""
-        return _colours(self._observation.scene(coefficients, self._length)[None])[0]
+        return _colours(self._observation.scene(coefficients)[None])[0]
 
 
 def restore_mosaic(
@@ -231,7 +220,7 @@ def restore_mosaic(
             if len(members) == 1 or _alike(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height, 16)
-            observation = FinerObservation(kernels, height, frames.dtype)
+            observation = FinerObservation(kernels, height, lengths[stack], frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
     restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
@@ -307,7 +296,7 @@ class _Frames:
         def solver(strength: float) -> MosaicSolver:
             weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
             precisions = self._precisions(full - mean, observation, level, strength)
-            return MosaicSolver(observation, weights, precisions, self.length, partition)
+            return MosaicSolver(observation, weights, precisions, partition)
 
         # Twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight

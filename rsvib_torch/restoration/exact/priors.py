@@ -196,7 +196,7 @@ def _sampled(values: Tensor) -> Tensor:
 
 def _sampled_scene(solver: SceneSolver, coefficients: Tensor) -> Tensor:
     """``E c`` as an image (C, K, L)."""
-    scene: Tensor = torch.fft.irfft(_sampled(coefficients).movedim(1, 0), n=solver.length)
+    scene: Tensor = torch.fft.irfft(_sampled(coefficients).movedim(1, 0), n=solver.observation.period)
     return scene
 
 
