@@ -15,7 +15,7 @@ from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
-from rsvib_torch.imaging.psf import form_rows
+from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.progress import steps
-from rsvib_torch.imaging.blur import RowVaryingBlur
-from rsvib_torch.imaging.psf import RowPSF, trajectory_psf
+from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 

@@ -10,7 +10,7 @@ from scipy.linalg import solveh_banded
 from rsvib_torch.core.banded_solver import skew_band, solve_skewed
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
-from rsvib_torch.restoration.scene_model.row_prior import RowPrior
+from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
 
 
 def solved_in_windows(windows, band, right_side):

@@ -18,9 +18,9 @@ from rsvib_torch.restoration.exact.filling import FILLED_REACH, Extended, Incomp
 from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.priors import PRIORS, Prior, PriorOptions, check_prior
 from rsvib_torch.restoration.exact.scene_solver import SIDE_BY_SIDE, Partition, SceneProblem, SolversSideBySide
-from rsvib_torch.restoration.exact.strength import Strengths, prior_strength
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
+from rsvib_torch.restoration.scene_model.cross_validation import Strengths, prior_strength
 from rsvib_torch.restoration.scene_model.observation import (
     SCALE,
     FinerObservation,
@@ -29,8 +29,13 @@ from rsvib_torch.restoration.scene_model.observation import (
     finer_kernels,
     row_kernels,
 )
-from rsvib_torch.restoration.scene_model.polynomial_prior import PolynomialPrior, fit_polynomial_prior
-from rsvib_torch.restoration.scene_model.row_prior import RowPrior, brightness, fit_prior
+from rsvib_torch.restoration.scene_model.scene_prior import (
+    PolynomialPrior,
+    RowPrior,
+    brightness,
+    fit_polynomial_prior,
+    fit_prior,
+)
 
 __all__ = ["Scene", "StackModel", "given_level", "model_stacks", "restore_exact", "scene_period", "solve_scenes"]
 

@@ -24,7 +24,7 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.scene_model.observation import SCALE, FinerObservation, finer_kernels
-from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
+from rsvib_torch.restoration.scene_model.scene_prior import fit_polynomial_prior
 
 __all__ = ["restore_mosaic"]
 

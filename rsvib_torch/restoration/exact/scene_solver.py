@@ -21,10 +21,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.banded_solver import BandedFactor, extend_system, factor_banded, solve_skewed
+from rsvib_torch.core.banded_solver import (
+    BandedFactor,
+    InterpolatedFactors,
+    extend_system,
+    factor_banded,
+    node_frequencies,
+    solve_skewed,
+)
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from rsvib_torch.core.fourier import shift_phases
 from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre
-from rsvib_torch.imaging.psf import row_taps, row_transfer
+from rsvib_torch.imaging.blur import row_taps, row_transfer
 
 __all__ = [
     "REACH",

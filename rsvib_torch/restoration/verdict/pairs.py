@@ -15,7 +15,7 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extended_length, spline_spectra
 from rsvib_torch.core.splines import correlated
 from rsvib_torch.frames.pixels import detailed_columns
-from rsvib_torch.imaging.psf import form_rows
+from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
