@@ -22,7 +22,7 @@ from rsvib_torch.core.splines import gauss_legendre, mirrored
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
-from rsvib_torch.imaging.psf import Interpolation
+from rsvib_torch.imaging.blur import Interpolation
 from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_frame
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing

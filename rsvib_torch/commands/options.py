@@ -422,7 +422,7 @@ def restoration_options(
 
         check_mosaic(options["mosaic"], info.shape)
     if options.get("optics") is not None:
-        from rsvib_torch.restoration.sharpening import check_optics  # noqa: PLC0415
+        from rsvib_torch.restoration.restore import check_optics  # noqa: PLC0415
 
         check_optics(options["optics"], options.get("method", "exact"))
     return options

@@ -6,6 +6,9 @@ Elimination of one row after the other factors ``A = U^H D U`` with a unit upper
 
 Forward substitution solves ``U^H D y = g``, back substitution ``U x = y``. Every step is one operation for the whole
 batch of matrices.
+
+``InterpolatedFactors`` are those of systems that change smoothly with frequency: some are computed, the others are
+interpolated.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +19,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-__all__ = ["BandedFactor", "extend_system", "factor_banded", "skew_band", "solve_banded", "solve_skewed"]
+__all__ = [
+    "BandedFactor",
+    "InterpolatedFactors",
+    "extend_system",
+    "factor_banded",
+    "node_frequencies",
+    "skew_band",
+    "solve_banded",
+    "solve_skewed",
+]
 
 
 class _Solution(NamedTuple):
@@ -213,3 +225,64 @@ def solve_banded(band: Tensor, right_side: Tensor) -> Tensor:
     """
     skewed = skew_band(band.reshape(*band.shape[:2], -1))
     return solve_skewed(skewed, right_side.reshape(*right_side.shape[:2], -1)).reshape(right_side.shape)
+
+
+def node_frequencies(count: int, step: float, device: torch.device) -> Tensor:
+    """Indices (N,) of the frequencies whose systems are factored, of ``count`` from 0 on.
+
+    Steps increase with the frequency up to ``step``, because priors change most at low frequencies: with steps of a
+    sixth of the frequency, a restored frame of 2048 x 2048 px changes by 2e-5 of full scale (rms).
+
+    Example:
+        >>> node_frequencies(28, 3.0, torch.device("cpu")).tolist()
+        [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 21, 24, 27]
+    """
+    nodes = [0]
+    while nodes[-1] < count - 1:
+        nodes.append(min(count - 1, nodes[-1] + max(1, int(min(step, nodes[-1] / 6)))))
+    return torch.tensor(nodes, device=device)
+
+
+@dataclass(frozen=True, eq=False)
+class InterpolatedFactors:
+    """``A = U^H D U`` of n batches of matrices at a few frequencies, the nodes.
+
+    U and D are as smooth in the frequency as A is. Linear interpolation of both replaces the elimination, whose number
+    of operations is b / 2 times that of solving with the factors.
+
+    Attributes:
+        nodes: (N,) frequencies of the nodes, ascending from the first to the last of all frequencies.
+        upper: (K, b, n, N) as in ``BandedFactor``.
+        inverse: (K, n, N) likewise.
+    """
+
+    nodes: Tensor
+    upper: Tensor
+    inverse: Tensor
+
+    @classmethod
+    def of(cls, skewed: Tensor, nodes: Tensor) -> "InterpolatedFactors":
+        """Factor matrices (K + b, 2 b + 1, n N) as from ``skew_band`` in their own memory."""
+        factor = factor_banded(skewed)
+        upper, inverse = (
+            values.unflatten(-1, (-1, len(nodes))).contiguous() for values in (factor.upper, factor.inverse)
+        )
+        return cls(nodes, upper, inverse)
+
+    def at(self, part: slice, out: BandedFactor | None = None) -> BandedFactor:
+        """Factors of n S matrices at S consecutive frequencies, in the memory of ``out`` if they fit."""
+        chosen = torch.arange(part.start, part.stop, dtype=torch.float64, device=self.nodes.device)
+        ends = torch.searchsorted(self.nodes, chosen[[0, -1]].long(), right=True).clamp(max=len(self.nodes) - 1)
+        near = slice(int(ends[0]) - 1, int(ends[1]) + 1)
+        places = self.nodes[near].to(torch.float64)
+        rising = (chosen - places[:-1, None]) / places.diff()[:, None]
+        one = torch.ones_like(rising[:1])
+        hat = torch.minimum(torch.cat([one, rising]), torch.cat([1 - rising, one])).clamp(min=0)  # (nodes, S)
+        batch = self.inverse.shape[1] * len(chosen)
+        if out is None or out.inverse.shape[-1] != batch:
+            out = BandedFactor(
+                self.upper.new_empty(*self.upper.shape[:2], batch), self.inverse.new_empty(len(self.inverse), batch)
+            )
+        for nodes, values in ((self.upper, out.upper), (self.inverse, out.inverse)):
+            torch.mm(nodes[..., near].flatten(0, -2), hat.to(nodes.dtype), out=values.view(-1, len(chosen)))
+        return out

@@ -1,5 +1,4 @@
-from .blur import RowVaryingBlur, blur_rows, blur_rows_adjoint
-from .psf import RowPSF, row_psf, trajectory_psf
+from .blur import RowPSF, RowVaryingBlur, blur_rows, blur_rows_adjoint, row_psf, trajectory_psf
 from .sensor_model import Optics, SensorNoise
 from .simulate import simulate_frames
 from .trajectory import exposure_nodes, exposure_trajectory, gauss_node_count, rows_showing

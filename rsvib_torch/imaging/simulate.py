@@ -12,9 +12,10 @@ from rsvib_torch.core.arguments import check_pixels, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, as_tensor, channels_appear_last
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
+from rsvib_torch.core.splines import bspline_coefficients
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.sensor_model import SensorNoise
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
@@ -171,15 +172,7 @@ def _form_rows(
     for begin in range(0, num_rows, chunk_rows):
         chunk = rows[begin : begin + chunk_rows]
         displacement, node_weights = exposure_trajectory(motion, starts[:, chunk], timing, "gauss")
-        cell = displacement[..., 1].floor()
-        first, taps = spread_taps(cell, bspline_weights(displacement[..., 1] - cell, _DEGREE) * node_weights[:, None])
-        ramps = torch.polar(
-            torch.ones((), dtype=torch.float64, device=scene.device).expand(*displacement.shape[:-1], len(frequencies)),
-            -2 * math.pi * displacement[..., 0, None] * frequencies,
-        ).to(spectra.dtype)
-        transfer = taps.transpose(-2, -1).to(spectra.dtype) @ ramps  # (T, rows, taps, frequencies)
-        tap = torch.arange(taps.shape[-1], device=scene.device) - _DEGREE // 2
-        source = mirrored(top + chunk[:, None] - first[..., None] - tap, height)  # (T, rows, taps)
-        row_spectra = (spectra[..., source, :] * transfer).sum(-2)
+        places = top + chunk[:, None] - displacement[..., 1]
+        row_spectra = form_rows(spectra, places, displacement[..., 0], node_weights, frequencies, _DEGREE)
         formed.append(torch.fft.irfft(row_spectra, n=length)[..., left : left + width])
     return torch.cat(formed, dim=-2).movedim(-3, 0).contiguous()  # frames before channels

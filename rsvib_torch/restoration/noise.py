@@ -18,9 +18,9 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import squared_modulus, waves
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.scene_model.cross_validation import sample_rows
 from rsvib_torch.restoration.scene_model.observation import row_kernels
-from rsvib_torch.restoration.scene_model.row_prior import RowPrior
-from rsvib_torch.restoration.scene_model.sampled_rows import sample_rows
+from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
 
 __all__ = ["ESTIMATORS", "estimate_noise", "fit_noise", "noise_floor", "noise_levels", "noise_of_blurred_frames"]
 

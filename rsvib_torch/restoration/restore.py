@@ -5,10 +5,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Required, TypedDict, Unpack, overload
 
+import torch
 from torch import Tensor, nn
 
 from rsvib_torch.core.arguments import check_options, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
+from rsvib_torch.core.checks import described
 from rsvib_torch.core.option_types import (
     METHOD_SETTINGS,
     BandedSettings,
@@ -22,7 +24,7 @@ from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
-from rsvib_torch.imaging.sensor_model import Optics
+from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -30,10 +32,9 @@ from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.field_motion import judged_strip, restore_in_strips
+from rsvib_torch.restoration.frame_motion import judged_strip, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.sharpening import check_optics, sharpened
 from rsvib_torch.restoration.verdict.judge import judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
@@ -43,6 +44,7 @@ __all__ = [
     "RestorationMethod",
     "VibrationRestorer",
     "check_method_options",
+    "check_optics",
     "restore",
     "restore_prepared",
     "unchanged_frames",
@@ -92,24 +94,31 @@ class RestorationMethod:
     Attributes:
         function: The method, see the contract above ``METHODS``.
         masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
-        of_mosaic: The method for colour mosaics with the same options and masks, and ``colours``; None for none.
+        strips: Whether it takes ``strips``, and then estimates once what strips of columns of the same frames have in
+            common. Without, every strip is restored as a stack of its own.
+        sharpens: Whether its result estimates the scene after the optics, so that option ``optics`` can sharpen it.
+        mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
     """
 
     function: Callable[..., Tensor]
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
-    of_mosaic: Callable[..., Tensor] | None = None
+    strips: bool = False
+    sharpens: bool = False
+    mosaic: "RestorationMethod | None" = None
 
 
 # Restoration methods. A method is called as
 #
 #     function(frames, motion, *, ignore=None, clipped=None, **options) -> Tensor
 #
-#     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite.
-#     motion: FrameMotion of the B stacks.
+#     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite; local means at missing pixels.
+#     motion: FrameMotion of the B stacks, whose displacement depends on the row only: frames with roll or zoom are cut
+#         into strips of columns, which are stacks of one batch.
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
-#         Without ``"ignore"``, missing pixels hold local means; without ``"clipped"``, saturated ones count.
+#         Without ``"ignore"``, the local means count as measured; without ``"clipped"``, saturated pixels do.
+#     strips: number of neighbouring stacks of the batch that are strips of the same frames, passed only if declared.
 #     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; passed
-#         to ``of_mosaic`` only. A method without it has no option ``mosaic``.
+#         to ``mosaic`` only. A method without it has no option ``mosaic``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
@@ -117,10 +126,16 @@ class RestorationMethod:
 # and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
 # and overload of ``restore`` and of ``VibrationRestorer``.
 METHODS: dict[str, RestorationMethod] = {
-    "exact": RestorationMethod(restore_exact, ("ignore", "clipped"), restore_mosaic),
+    "exact": RestorationMethod(
+        restore_exact,
+        masks=("ignore", "clipped"),
+        strips=True,
+        sharpens=True,
+        mosaic=RestorationMethod(restore_mosaic, masks=("ignore", "clipped")),
+    ),
     "banded": RestorationMethod(restore_banded),
     "dewarp": RestorationMethod(restore_dewarp),
-    "richardson-lucy": RestorationMethod(restore_richardson_lucy, ("ignore",)),
+    "richardson-lucy": RestorationMethod(restore_richardson_lucy, masks=("ignore",)),
 }
 
 
@@ -131,6 +146,35 @@ def check_method_options(method: str, options: Mapping[str, Any]) -> None:
         if name not in valid:
             raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(valid)}")
     check_options(options, METHOD_SETTINGS[method])
+
+
+def check_optics(optics: Optics | Mapping[str, Any] | None, method: str) -> Optics | None:
+    """Optics from their fields, if that is what was given.
+
+    Raises:
+        TypeError: If they are neither ``Optics`` nor their fields.
+        ValueError: If they transmit nothing, or the method does not restore frames that can be sharpened.
+    """
+    if optics is None:
+        return None
+    if not METHODS[method].sharpens:
+        names = " or ".join(repr(name) for name, entry in METHODS.items() if entry.sharpens)
+        raise ValueError(f"optics goes with method={names}, not with method={method!r}")
+    if isinstance(optics, Mapping):
+        unknown = sorted(optics.keys() - Optics.__dataclass_fields__.keys())
+        if unknown:
+            fields = ", ".join(Optics.__dataclass_fields__)
+            raise TypeError(f"optics has no field {unknown[0]!r}; its fields are {fields}")
+        optics = Optics(**optics)
+    if not isinstance(optics, Optics):
+        raise TypeError(f"optics must be rsv.Optics(...) or a mapping of its fields, got {described(optics)}")
+    passed = float(optics.transfer(torch.tensor(0.1, dtype=torch.float64), torch.zeros((), dtype=torch.float64)))
+    if passed < 0.01:
+        raise ValueError(
+            f"optics transmit {passed:.2g} at 0.1 cycles per px, at least 0.01 is needed: there is no detail that can "
+            "be sharpened; check the unit of sigma (px) and of frequencies (cycles per px)"
+        )
+    return optics
 
 
 @overload
@@ -276,17 +320,16 @@ def restore_prepared(
     """
     options = dict(options or {})
     check_method_options(method, options)
-    chosen = METHODS[method]
-    function = chosen.function if frames.colours is None else chosen.of_mosaic
-    if function is None:
-        raise ValueError(f"mosaic goes with method='exact', not with method={method!r}; demosaic the frames before")
+    chosen = METHODS[method] if frames.colours is None else METHODS[method].mosaic
+    if chosen is None:
+        names = " or ".join(repr(name) for name, entry in METHODS.items() if entry.mosaic is not None)
+        raise ValueError(f"mosaic goes with method={names}, not with method={method!r}; demosaic the frames before")
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         options["colours"] = frames.colours
-    images = frames.images if "ignore" in chosen.masks else frames.filled
     motion = _motion_in_row_order(frames, vibration)
-    return restore_in_strips(function, images, motion, frames.timing, options)
+    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options, pass_strips=chosen.strips)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:

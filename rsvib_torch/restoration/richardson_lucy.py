@@ -10,9 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.progress import steps
-from rsvib_torch.frames.pixels import fill_with_means
-from rsvib_torch.imaging.blur import RowVaryingBlur
-from rsvib_torch.imaging.psf import RowPSF, row_psf
+from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
@@ -38,7 +36,7 @@ def restore_richardson_lucy(
     several frames of one scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
 
     Args:
-        frames: (B, T, C, H, W) in row order; negative values count as 0.
+        frames: (B, T, C, H, W) in row order, with local means at missing pixels; negative values count as 0.
         motion: Motion of the frames.
         joint: ``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length
             1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With
@@ -52,12 +50,9 @@ def restore_richardson_lucy(
     iterations = check_whole_number("iterations", iterations, at_least=1, at_most=_MAX_ITERATIONS)
     B, T, _, H, W = frames.shape
     groups = joint_groups(T, joint)
-    starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device))
-    psf = row_psf(motion.vibration, starts.expand(B, T, H), motion.timing, interpolation="cubic", quadrature="gauss")
+    psf = trajectory_psf(*motion.exposures(H), interpolation="cubic")
     weights = psf.weights.to(frames.dtype)[:, :, None]
-    measured = torch.ones_like(frames)
-    if ignore is not None:
-        frames, measured = fill_with_means(frames, ignore), (~ignore).to(frames.dtype)
+    measured = torch.ones_like(frames) if ignore is None else (~ignore).to(frames.dtype)
     counts = frames.clamp(min=0.0)
     dewarped, shift = restore_dewarp(frames, motion), motion.shift.to(torch.int64)
     # degree 1: the kernels act on the coefficients themselves

@@ -9,6 +9,7 @@ import psutil
 
 from rsvib_torch.core.free_memory import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.restoration.exact.priors import PRIORS
 
 __all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", "windows_at_once"]
 
@@ -16,7 +17,7 @@ __all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", 
 # scripts/benchmark.py --only memory, rounded up
 _PROCESS_BYTES, _WINDOW_BYTES = 450 * 10**6, 80 * 10**6
 # bytes per pixel and channel of a window that is detected, restored and judged; same measurement
-_PIXEL_BYTES = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105, "edges": 80}
+_PIXEL_BYTES = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105}
 _MOSAIC_BYTES, _MOSAIC_FRAME_BYTES = 750 * 10**6, 1000  # more for a mosaic: of a window, per pixel of a frame
 _FINER = 4  # times that with scale=2; 3.5 measured for windows of 4 frames of 512 px, see scripts/attacks/memory.py
 
@@ -60,10 +61,9 @@ def memory_needed(
         pixel_bytes = 8  # frames and result as float32; the rest is in the memory of the GPU
     elif restoration is None:
         pixel_bytes = min(_PIXEL_BYTES.values())
-    elif restoration.get("prior", "gaussian") != "gaussian":  # other priors need at most as much as "edges"
-        pixel_bytes = _PIXEL_BYTES["edges"]
     else:
         pixel_bytes = _PIXEL_BYTES.get(restoration.get("method", "exact"), max(_PIXEL_BYTES.values()))
+        pixel_bytes += PRIORS[restoration.get("prior", "gaussian")].pixel_bytes
     mosaic = restoration is not None and restoration.get("mosaic") is not None and not on_gpu
     if mosaic or (restoration is not None and restoration.get("scale", 1) != 1):  # mosaics are solved on the finer grid
         pixel_bytes *= _FINER

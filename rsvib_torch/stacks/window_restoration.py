@@ -17,6 +17,7 @@ from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.io.full_scale import (
     beyond_full_scale,
     check_dtype,
@@ -27,8 +28,7 @@ from rsvib_torch.io.full_scale import (
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
-from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
-from rsvib_torch.restoration.sharpening import check_optics, sharpened
+from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
 

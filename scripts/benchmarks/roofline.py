@@ -22,7 +22,6 @@ from benchmarks.restoration import MARGIN, SEED, TIMED_NOISE, camera, vibration
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
-from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
@@ -68,12 +67,11 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     """Sizes for a frame of that size, camera and vibration."""
     height, width = size
     motion = frame_motion(truth.expanded(1), timing.in_row_order(), 1, height)
-    starts = motion.row_starts(torch.arange(height, dtype=torch.float64)).expand(1, 1, height)
-    moved, weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
+    moved, weights = motion.exposures(height)
     length = exact.scene_period(width, motion.reach(height), moved)
     kernels = row_kernels(moved[0], weights, torch.ones(1), height, 16)
-    observation = Observation(kernels, height, torch.float32)
-    band = observation.band(ORDER)
+    observation = Observation(kernels, height, length, torch.float32)
+    band = observation.normal(ORDER)
     frequencies = length // 2 + 1
     parts, _ = Partition().divide(
         observation.count, band.width, frequencies, torch.device(device), blurred=kernels.blurred, keep=False

@@ -7,8 +7,7 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import skew_band
-from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
+from rsvib_torch.core.banded_solver import InterpolatedFactors, node_frequencies, skew_band
 
 
 def systems(count, width, frequencies, change):

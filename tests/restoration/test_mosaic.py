@@ -25,7 +25,7 @@ from truth import decibel, draw_scene
 import rsvib_torch as rsv
 from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
 from rsvib_torch.restoration.exact import mosaic_scene, similar_patches
-from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
+from rsvib_torch.restoration.scene_model.scene_prior import fit_polynomial_prior
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
 

@@ -339,8 +339,10 @@ def keyword_annotations(function):
 def test_typed_options_are_those_of_the_function(name):
     method = METHODS[name]
     keywords = keyword_annotations(method.function)
-    if method.of_mosaic is not None:
-        assert keyword_annotations(method.of_mosaic) == {"colours": torch.Tensor, **keywords}
+    if method.strips:
+        assert keywords.pop("strips") is int
+    if method.mosaic is not None:
+        assert keyword_annotations(method.mosaic.function) == {"colours": torch.Tensor, **keywords}
     assert set(method.masks) == {"ignore", "clipped"} & set(keywords)
     assert {*method_options(name), *method.masks} == set(keywords)
     for option in method_options(name):

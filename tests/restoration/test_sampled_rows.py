@@ -10,9 +10,9 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.exact import strength
 from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.scene_model import sampled_rows
+from rsvib_torch.restoration.scene_model.cross_validation import Explained, sample_rows
 from rsvib_torch.restoration.scene_model.observation import row_kernels
-from rsvib_torch.restoration.scene_model.row_prior import fit_prior
-from rsvib_torch.restoration.scene_model.sampled_rows import Explained, sample_rows
+from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 NUM_ROWS, WIDTH, NOISE = 264, 240, 0.005
 

@@ -10,7 +10,7 @@ from scipy.linalg import solveh_banded
 from rsvib_torch.core.banded_solver import skew_band, solve_skewed
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
-from rsvib_torch.restoration.scene_model.row_prior import RowPrior
+from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
 
 
 def solved_in_windows(windows, band, right_side):
@@ -64,18 +64,18 @@ def test_observation_operator_is_a_sum_over_taps_and_has_this_adjoint(first):
     weight = torch.rand(1, 90, dtype=torch.float64, generator=generator)
     weight[0, ::7] = 0
     kernels = RowKernels(first[None], taps, middle[..., 0], along, weight)
-    observation = Observation(kernels, 90, torch.float64)
     part, length = slice(2, 13), 40
+    observation = Observation(kernels, 90, length, torch.float64)
     u = torch.arange(part.start, part.stop, dtype=torch.float64) / length
     data = torch.randn(1, 2, 90, 11, dtype=torch.complex128, generator=generator)
     coefficients = torch.randn(observation.count, 2, 11, dtype=torch.complex128, generator=generator)
-    observed = observation.forward(coefficients, u, part, length)
+    observed = observation.forward(coefficients, part)
     turned = kernels.at(u)[0] * torch.exp(-2j * torch.pi * u * middle[0, :, :1])[:, None]
     for row in (0, 8, 44, 89):
         place = int(first[row]) - observation.top
         expected = (turned[row, :, None] * coefficients[place : place + 6]).sum(0)
         torch.testing.assert_close(observed[0, :, row], expected, rtol=1e-9, atol=1e-9)
-    back = observation.adjoint(data, u, part, length)
+    back = observation.adjoint(data, part)
     left = (weight[:, None, :, None] * observed.conj() * data).sum()
     torch.testing.assert_close(left, (coefficients.conj() * back).sum(), rtol=1e-9, atol=1e-9)
 
@@ -89,16 +89,16 @@ def test_fast_path_agrees_with_the_plain_path(reach):
     along = torch.linspace(-reach, reach, 2, dtype=torch.float64).expand(1, rows, 2)
     first = torch.arange(rows)[None] - 2
     kernels = RowKernels(first, taps, torch.zeros(1, rows, dtype=torch.float64), along, torch.ones_like(first).double())
-    observation = Observation(kernels, rows, torch.float64)
+    observation = Observation(kernels, rows, length, torch.float64)
     u = torch.fft.rfftfreq(length, dtype=torch.float64)
     precision = RowPrior.smooth(u).precision(0.01 * (1 + (10 * u).square()), 1.0)
     data = torch.randn(1, 1, rows, length, dtype=torch.float64, generator=generator)
-    fast = SceneSolver(observation, precision, length, Partition(chunk=100)).fit(data)
-    plain = SceneSolver(observation, precision.clone().requires_grad_(), length, Partition(chunk=100)).fit(data)
+    fast = SceneSolver(observation, precision, Partition(chunk=100)).fit(data)
+    plain = SceneSolver(observation, precision.clone().requires_grad_(), Partition(chunk=100)).fit(data)
     assert plain.requires_grad
     difference = (fast - plain.detach()).abs().square().mean().sqrt() / plain.detach().abs().square().mean().sqrt()
     assert 1e-12 < difference < 1e-2  # interpolated, not factored: white noise is the least favourable data
-    repeated = SceneSolver(observation, precision, length, Partition(chunk=100), keep=True)
+    repeated = SceneSolver(observation, precision, Partition(chunk=100), keep=True)
     for _ in range(2):
         torch.testing.assert_close(repeated.fit(data), plain.detach())
 
@@ -109,10 +109,10 @@ def test_gradient_of_the_data_through_interpolated_factors():
     taps = torch.full((1, rows, 6, 1), 1 / 6, dtype=torch.float64)
     zeros = torch.zeros(1, rows, dtype=torch.float64)
     kernels = RowKernels(torch.arange(rows)[None] - 2, taps, zeros, zeros[..., None], zeros + 1)
-    observation = Observation(kernels, rows, torch.float64)
+    observation = Observation(kernels, rows, length, torch.float64)
     u = torch.fft.rfftfreq(length, dtype=torch.float64)
     precision = RowPrior.smooth(u).precision(torch.full_like(u, 0.01), 1.0)
-    solver = SceneSolver(observation, precision, length, Partition(chunk=90))
+    solver = SceneSolver(observation, precision, Partition(chunk=90))
     generator = torch.Generator().manual_seed(5)
     data, other = torch.randn(2, 1, 1, rows, length, dtype=torch.float64, generator=generator)
     data.requires_grad_()

@@ -12,7 +12,7 @@ from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.row_prior import fit_prior
+from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)

@@ -177,7 +177,9 @@ def _with_extension(scenes: Sequence[Extended]) -> list[SceneProblem]:
         flat = scene.problem.precision.flatten(0, 1)[None]
         precision = torch.nn.functional.interpolate(flat, length // 2 + 1, mode="linear", align_corners=True)
         precision = precision[0].unflatten(0, scene.problem.precision.shape[:2])
-        joined.append(Incomplete(replace(scene.problem, data=strip, precision=precision), measured.expand_as(strip)))
+        observation = scene.problem.observation.with_period(length)
+        problem = replace(scene.problem, data=strip, observation=observation, precision=precision)
+        joined.append(Incomplete(problem, measured.expand_as(strip)))
     # the extension is hardly mixed into the frame by a blur below 1 px, on the finer grid: more iterations gain 0.01 dB
     found = _with_values(joined, iterations=40 if reach > FILLED_REACH else 6)
     return [

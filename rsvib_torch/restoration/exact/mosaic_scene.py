@@ -13,8 +13,8 @@ from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
-from rsvib_torch.frames.mosaic import fill_by_colour, interpolated_colours, measures
-from rsvib_torch.restoration.exact.exact import given_level, row_exposures, scene_period
+from rsvib_torch.frames.mosaic import interpolated_colours, measures
+from rsvib_torch.restoration.exact.exact import given_level, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
@@ -24,7 +24,7 @@ from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.scene_model.observation import SCALE, FinerObservation, finer_kernels
-from rsvib_torch.restoration.scene_model.polynomial_prior import fit_polynomial_prior
+from rsvib_torch.restoration.scene_model.scene_prior import fit_polynomial_prior
 
 __all__ = ["restore_mosaic"]
 
@@ -56,22 +56,13 @@ class MosaicSolver:
         observation: Observation operator K of M frames of R rows.
         weights: V, (M, 3, R, L) or (1, 3, R, L).
         precisions: P_k, as from ``PolynomialPrior.precision``.
-        length: L, period of the data.
         partition: Parts solved at a time.
     """
 
     def __init__(
-        self,
-        observation: FinerObservation,
-        weights: Tensor,
-        precisions: list[Tensor],
-        length: int,
-        partition: Partition,
+        self, observation: FinerObservation, weights: Tensor, precisions: list[Tensor], partition: Partition
     ) -> None:
-        self._observation, self._weights, self._length = observation, weights, length
-        self._precisions = precisions
-        self._u = torch.fft.rfftfreq(length, dtype=torch.float64, device=weights.device)
-        self._all = slice(0, len(self._u))
+        self._observation, self._weights, self._precisions = observation, weights, precisions
         inside = (weights > 0).any(1, keepdim=True)
         self._inside = inside.to(weights.dtype)
         squares = weights.new_tensor(_COMPONENTS).square()
@@ -79,18 +70,16 @@ class MosaicSolver:
         self._solvers = []
         for density, precision in zip(self._density.tolist(), precisions, strict=True):
             part = observation.weighted(density * observation.kernels.weight)
-            solver = SceneSolver(part, precision, length, partition)
+            solver = SceneSolver(part, precision, partition)
             keep = not solver.interpolates
-            self._solvers.append(SceneSolver(part, precision, length, partition, keep=True) if keep else solver)
+            self._solvers.append(SceneSolver(part, precision, partition, keep=True) if keep else solver)
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Colours (M, 3, R, L) of noiseless frames of a scene with coefficients (K, 3, U)."""
-        spectra = self._observation.forward(coefficients, self._u, self._all, self._length)
-        return _colours(torch.fft.irfft(spectra, n=self._length))
+        return _colours(self._observation.A(coefficients))
 
     def _adjoint(self, colours: Tensor) -> Tensor:
-        spectra = torch.fft.rfft(_components(colours))
-        return self._observation.adjoint(spectra, self._u, self._all, self._length)
+        return self._observation.A_adjoint(_components(colours))
 
     def _normal(self, coefficients: Tensor) -> Tensor:
         data = self._adjoint(self._weights * self.predict(coefficients))
@@ -114,7 +103,7 @@ class MosaicSolver:
         products = (one.conj() * other).real
         count = torch.full(products.shape[-1:], 2.0, dtype=torch.float64, device=products.device)
         count[0] = 1.0
-        if self._length % 2 == 0:
+        if self._observation.period % 2 == 0:
             count[-1] = 1.0
         return products.sum((0, 1), dtype=torch.float64) @ count
 
@@ -147,7 +136,7 @@ class MosaicSolver:
 
     def scene(self, coefficients: Tensor) -> Tensor:
         """Colours (3, 2 R, 2 L) of the scene at half pixels."""
-        return _colours(self._observation.scene(coefficients, self._length)[None])[0]
+        return _colours(self._observation.scene(coefficients)[None])[0]
 
 
 def restore_mosaic(
@@ -173,7 +162,7 @@ def restore_mosaic(
     Where the frames do not determine the colours, as with one frame, ``similar_patches`` interpolates those of each.
 
     Args:
-        frames: (B, T, 1, H, W) in row order.
+        frames: (B, T, 1, H, W) in row order, with local means at missing pixels.
         motion: Motion of the frames.
         colours: (B, T, 1, H, W), the colour that each pixel measures, 0 to 2.
         joint: As in ``restore_exact``.
@@ -198,19 +187,18 @@ def restore_mosaic(
     partition = Partition.of_options(chunk_frequencies, segments)
     stated = None if noise == "auto" else given_level(noise)
     # displacement of each row during its exposure, and the period that it requires
-    displacement, node_weights = row_exposures(motion, frames)
+    displacement, node_weights = motion.exposures(height)
     lengths = [
         scene_period(width, reach, moved) for reach, moved in zip(motion.reaches(height), displacement, strict=True)
     ]
-    filled = frames if ignore is None else fill_by_colour(frames, ignore)
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
-    for stack, mosaic in enumerate(filled):
+    for stack, mosaic in enumerate(frames):
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
         floor = None
         if clipped is not None:
-            floor = torch.where(measured & clipped[stack], frames[stack], -torch.inf)
+            floor = torch.where(measured & clipped[stack], mosaic, -torch.inf)
         if ignore is not None:
             measured = measured & ~ignore[stack]
         if stated is None:  # of colours whose noise was halved by interpolation
@@ -232,7 +220,7 @@ def restore_mosaic(
             if len(members) == 1 or _alike(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height, 16)
-            observation = FinerObservation(kernels, height, frames.dtype)
+            observation = FinerObservation(kernels, height, lengths[stack], frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
     restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
@@ -308,7 +296,7 @@ class _Frames:
         def solver(strength: float) -> MosaicSolver:
             weights = measured.to(data.dtype).masked_fill(filled, _FILLED)
             precisions = self._precisions(full - mean, observation, level, strength)
-            return MosaicSolver(observation, weights, precisions, self.length, partition)
+            return MosaicSolver(observation, weights, precisions, partition)
 
         # Twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight

@@ -44,12 +44,15 @@ class Prior:
             function where several, as the strips of a frame, are solved together.
         finer_grid: Whether it exists with ``scale=2``, whose solution does not call the function.
         mosaic: Whether it exists for colour mosaics, whose solution does not call the function.
+        pixel_bytes: Memory in bytes per pixel and channel of the frames beyond that of the Gaussian prior; measured by
+            scripts/benchmark.py --only memory.
     """
 
     function: Callable[[SceneProblem, PriorOptions], Tensor]
     is_precision: bool = False
     finer_grid: bool = False
     mosaic: bool = False
+    pixel_bytes: int = 12
 
 
 def gaussian(problem: SceneProblem, options: PriorOptions) -> Tensor:
@@ -99,7 +102,7 @@ def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
 # must be differentiable with respect to the data and the precision, must not write to its arguments, and is called from
 # several threads at a time.
 PRIORS: dict[str, Prior] = {
-    "gaussian": Prior(gaussian, is_precision=True, finer_grid=True, mosaic=True),
+    "gaussian": Prior(gaussian, is_precision=True, finer_grid=True, mosaic=True, pixel_bytes=0),
     "edges": Prior(edges),
 }
 
@@ -193,7 +196,7 @@ def _sampled(values: Tensor) -> Tensor:
 
 def _sampled_scene(solver: SceneSolver, coefficients: Tensor) -> Tensor:
     """``E c`` as an image (C, K, L)."""
-    scene: Tensor = torch.fft.irfft(_sampled(coefficients).movedim(1, 0), n=solver.length)
+    scene: Tensor = torch.fft.irfft(_sampled(coefficients).movedim(1, 0), n=solver.observation.period)
     return scene
 
 

@@ -21,14 +21,28 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.banded_solver import BandedFactor, extend_system, factor_banded, solve_skewed
+from rsvib_torch.core.banded_solver import (
+    BandedFactor,
+    InterpolatedFactors,
+    extend_system,
+    factor_banded,
+    node_frequencies,
+    solve_skewed,
+)
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.interpolated_factors import InterpolatedFactors, node_frequencies
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
-__all__ = ["Partition", "SceneProblem", "SceneSolver", "SolversSideBySide", "join_windows", "row_windows"]
+__all__ = [
+    "SIDE_BY_SIDE",
+    "Partition",
+    "SceneProblem",
+    "SceneSolver",
+    "SolversSideBySide",
+    "join_windows",
+    "row_windows",
+]
 
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
@@ -132,7 +146,6 @@ class SceneSolver:
     Args:
         observation: Observation operator of M frames of R rows.
         precision: P, products (p + 1, p + 1, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
-        length: Period L of the data.
         partition: Parts solved at a time.
         keep: Keep the factors, for solving several times.
 
@@ -141,11 +154,10 @@ class SceneSolver:
     """
 
     def __init__(
-        self, observation: Observation, precision: Tensor, length: int, partition: Partition, *, keep: bool = False
+        self, observation: Observation, precision: Tensor, partition: Partition, *, keep: bool = False
     ) -> None:
-        self.observation, self.precision, self.length = observation, precision, length
-        self.u = torch.fft.rfftfreq(length, dtype=torch.float64, device=precision.device)
-        normal = observation.band(len(precision) - 1)
+        self.observation, self.precision, self.u = observation, precision, observation.u
+        normal = observation.normal(len(precision) - 1)
         self._partition = partition
         self.parts, self._windows = partition.divide(
             observation.count,
@@ -184,7 +196,7 @@ class SceneSolver:
         px along the row do, over 1/(140 r). Above 1.5 px, systems are too close to singular for interpolation.
         """
         reach = self.observation.kernels.reach
-        step = self.length * min(1 / 64, 1 / (140 * max(reach, 1e-9)))
+        step = self.observation.period * min(1 / 64, 1 / (140 * max(reach, 1e-9)))
         nodes = node_frequencies(len(self.u), step, self.precision.device)
         # above a fifth of the frequencies, interpolation takes as long as factoring
         return nodes if reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
@@ -204,7 +216,7 @@ class SceneSolver:
         return torch.cat([self._right_side(spectra, part) for part in self.parts], dim=-1)
 
     def _right_side(self, spectra: Tensor, part: slice) -> Tensor:
-        return self.observation.adjoint(spectra[..., part], self.u[part], part, self.length)
+        return self.observation.adjoint(spectra[..., part], part)
 
     def solve(self, right: Tensor) -> Tensor:
         """Solution (K, C, U) of the normal equations for right sides (K, C, U)."""
@@ -263,15 +275,13 @@ class SceneSolver:
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Noiseless frames (M, C, R, L) of a scene, ``K c``."""
-        spectra = [
-            self.observation.forward(coefficients[..., part], self.u[part], part, self.length) for part in self.parts
-        ]
-        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.length)
+        spectra = [self.observation.forward(coefficients[..., part], part) for part in self.parts]  # less memory
+        images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
         return images
 
     def scene(self, coefficients: Tensor) -> Tensor:
         """Rows of the scene where the frame at rest would observe them, (C, R, L); twice as many on the finer grid."""
-        return self.observation.scene(coefficients, self.length)
+        return self.observation.scene(coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,10 +304,10 @@ class SceneProblem:
 
     def solver(self, *, keep: bool = False) -> SceneSolver:
         """The solver for complete data; ``keep`` its factors, for solving several times."""
-        return SceneSolver(self.observation, self.precision, self.data.shape[-1], self.partition, keep=keep)
+        return SceneSolver(self.observation, self.precision, self.partition, keep=keep)
 
 
-_SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
+SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
 
 
 class SolversSideBySide:
@@ -322,7 +332,7 @@ class SolversSideBySide:
             alone = len(solver.parts) > 1 or solver.interpolates
             if alone or solver.num_systems > room:
                 self._groups.append([])
-                room = _SIDE_BY_SIDE
+                room = SIDE_BY_SIDE
             self._groups[-1].append(number)
             room = 0 if alone else room - solver.num_systems
         # a scene alone is solved by its solver

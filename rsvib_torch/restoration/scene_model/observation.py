@@ -20,14 +20,16 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.fourier import shift_phases
-from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre, spread_taps
+from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre
+from rsvib_torch.imaging.blur import row_taps, row_transfer
 
 __all__ = [
     "REACH",
@@ -187,8 +189,7 @@ class RowKernels:
 
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, J, Q) without the phase of the middle."""
-        angle = (-2 * math.pi) * self.along[..., None] * frequencies
-        return torch.complex(self.taps @ angle.cos(), self.taps @ angle.sin())
+        return row_transfer(self.taps, self.along, frequencies)
 
 
 def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int) -> RowKernels:
@@ -198,9 +199,8 @@ def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_
     """
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = rows[:, None] - displacement[..., 1]
-    cell = place.detach().floor()
-    first, taps = spread_taps(cell, kernel_weights(place - cell) * node_weights[:, None])
-    taps, count, first = taps.transpose(-2, -1), taps.shape[-1], first - (REACH - 1)
+    first, taps = row_taps(place, node_weights, kernel_weights)
+    first, count = first - (REACH - 1), taps.shape[-2]
     near = (first > -margin - count) & (first < num_rows + margin)
     first = first.clamp(-margin - count, num_rows + margin)
     x = displacement[..., 0]
@@ -392,70 +392,89 @@ def normal_matrices(kernels: RowKernels, top: int, count: int, width: int, dtype
 
 
 class Observation:
-    """The observation operator K of M frames of R rows, and all that follows from their kernels alone.
+    """The observation operator K of M frames of R rows, whose rows have the period L, and its normal matrices.
 
-    Attributes:
+    ``A`` and ``A_adjoint`` have images of whole frames; ``forward`` and ``adjoint`` have spectra of some frequencies.
+
+    Args:
         kernels: Kernels of the rows.
         num_rows: R.
+        period: L in px.
         dtype: dtype of the data.
+
+    Attributes:
+        u: (U,) frequencies along the rows in cycles per px.
         top: First scene row that is observed or needed to evaluate the scene, in frame coordinates.
         count: Number of such scene rows, K.
     """
 
-    def __init__(self, kernels: RowKernels, num_rows: int, dtype: torch.dtype) -> None:
-        self.kernels, self.num_rows, self.dtype = kernels, num_rows, dtype
+    def __init__(self, kernels: RowKernels, num_rows: int, period: int, dtype: torch.dtype) -> None:
+        self.kernels, self.num_rows, self.period, self.dtype = kernels, num_rows, period, dtype
+        self.u = torch.fft.rfftfreq(period, dtype=torch.float64, device=kernels.middle.device)
         first, last = kernels.needed(num_rows)
         self.top = min(int(kernels.first.amin()), first)
         last = max(int(kernels.first.amax()) + kernels.taps.shape[-2], last)
         self.count = last - self.top
         self._smooth = smooth_kernels(kernels, dtype)
         self._first = (kernels.first - self.top).flatten()
-        self._bands: dict[int, SmoothBand] = {}
+        self._normal: dict[int, SmoothBand] = {}
 
-    def band(self, order: int) -> SmoothBand:
-        """Normal matrices ``K^H W K`` to which a prior of an order can be added."""
-        if order not in self._bands:
-            self._bands[order] = smooth_band(self.kernels, self.top, self.count, order, self.dtype)
-        return self._bands[order]
+    def normal(self, order: int) -> SmoothBand:
+        """Normal matrices ``K^H W K``, with room for a prior of an order across rows."""
+        if order not in self._normal:
+            self._normal[order] = smooth_band(self.kernels, self.top, self.count, order, self.dtype)
+        return self._normal[order]
 
     def weighted(self, weight: Tensor) -> "Observation":
         """The same with other weights (M, R) of the rows."""
-        return type(self)(replace(self.kernels, weight=weight), self.num_rows, self.dtype)
+        return type(self)(replace(self.kernels, weight=weight), self.num_rows, self.period, self.dtype)
 
-    def adjoint(self, spectra: Tensor, u: Tensor, part: slice, length: int) -> Tensor:
-        """``K^H W g``, (K, C, U).
+    def with_period(self, period: int) -> "Observation":
+        """The same for rows of another period."""
+        other = copy(self)
+        other.period, other.u = period, torch.fft.rfftfreq(period, dtype=torch.float64, device=self.u.device)
+        return other
 
-        Args:
-            spectra: (M, C, R, U) of the rows of the data.
-            u: (U,) frequencies in cycles per px.
-            part: The same in cycles per period.
-            length: Period in px.
-        """
-        phases = shift_phases(self.kernels.middle, length, part, spectra.dtype)
-        rows = (spectra * (phases * self.kernels.weight.to(self.dtype)[..., None])[:, None]).transpose(1, 2)
-        rows = rows.flatten(0, 1)
-        total = rows.new_zeros(self.count, *rows.shape[1:])
-        for tap, kernel in enumerate(self._smooth.taps(u, conjugate=True)):
-            total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
-        return total
+    def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
+        """Frames ``K c`` (M, C, R, L) of a scene with coefficients (K, C, U)."""
+        frames: Tensor = torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
+        return frames
 
-    def forward(self, coefficients: Tensor, u: Tensor, part: slice, length: int) -> Tensor:
-        """``K c``, (M, C, R, U), of coefficients (K, C, U); the other arguments as in ``adjoint``."""
+    def A_adjoint(self, frames: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
+        """``K^H W g`` (K, C, U) of frames (M, C, R, L)."""
+        return self.adjoint(torch.fft.rfft(frames), slice(0, len(self.u)))
+
+    def forward(self, coefficients: Tensor, part: slice) -> Tensor:
+        """``K c``, (M, C, R, S), of coefficients (K, C, S) at the frequencies ``part``."""
+        # sum over the taps of each row of all frames
         rows = coefficients.new_zeros(len(self._first), *coefficients.shape[1:])
-        for tap, kernel in enumerate(self._smooth.taps(u)):
+        for tap, kernel in enumerate(self._smooth.taps(self.u[part])):
             rows = rows + kernel[:, None] * coefficients[self._first + tap]
-        phases = shift_phases(self.kernels.middle, length, part, coefficients.dtype).conj()
+        # displacement of the middle of each row
+        phases = shift_phases(self.kernels.middle, self.period, part, coefficients.dtype).conj()
         observed: Tensor = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
         return observed
 
-    def scene(self, coefficients: Tensor, length: int) -> Tensor:
+    def adjoint(self, spectra: Tensor, part: slice) -> Tensor:
+        """``K^H W g``, (K, C, S), of the spectra (M, C, R, S) of rows at the frequencies ``part``."""
+        # displacement of the middle of each row
+        phases = shift_phases(self.kernels.middle, self.period, part, spectra.dtype)
+        rows = (spectra * (phases * self.kernels.weight.to(self.dtype)[..., None])[:, None]).transpose(1, 2)
+        rows = rows.flatten(0, 1)
+        # each row contributes to the scene rows of its taps
+        total = rows.new_zeros(self.count, *rows.shape[1:])
+        for tap, kernel in enumerate(self._smooth.taps(self.u[part], conjugate=True)):
+            total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
+        return total
+
+    def scene(self, coefficients: Tensor) -> Tensor:
         """Rows of the scene where the frame at rest would observe them, (C, R, L)."""
         first = -SCENE_REACH - self.top
         near = coefficients[first : first + self.num_rows + 2 * SCENE_REACH]
         weights = torch.tensor([scene_weights()], dtype=near.real.dtype, device=near.device)
         sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
         spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
-        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=length)
+        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.period)
         return scene
 
 
@@ -490,9 +509,8 @@ def finer_kernels(
     """Kernels of rows with displacement (M, R, N, 2) px during the exposure, as ``row_kernels`` on the finer grid."""
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = SCALE * (rows[:, None] - displacement[..., 1])
-    cell = place.detach().floor()
-    first, taps = spread_taps(cell, bspline_weights(place - cell, _FINER_DEGREE) * node_weights[:, None])
-    taps, count, first = taps.transpose(-2, -1), taps.shape[-1], first - _FINER_DEGREE // 2
+    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=_FINER_DEGREE))
+    first, count = first - _FINER_DEGREE // 2, taps.shape[-2]
     low, high = -SCALE * margin - count, SCALE * (num_rows + margin)
     near = (first > low) & (first < high)
     x = displacement[..., 0]
@@ -556,9 +574,9 @@ def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
 class FinerObservation(Observation):
     """``Observation`` of a scene on the grid of half pixels; all values count unknowns 2 j + a."""
 
-    def band(self, order: int) -> SmoothBand:
-        """Normal matrices ``K^H W K`` to which a polynomial of an order in the Laplacian can be added."""
-        if order not in self._bands:
+    def normal(self, order: int) -> SmoothBand:
+        """Normal matrices ``K^H W K``, with room for a polynomial of an order in the Laplacian across rows."""
+        if order not in self._normal:
             width = max(self.kernels.taps.shape[-2] - 1, SCALE * order)
             matrices = normal_matrices(self.kernels, self.top, self.count, width, self.dtype)
             powers = _laplacian_powers(self.count // SCALE, order, matrices.device)
@@ -567,10 +585,10 @@ class FinerObservation(Observation):
                 place = slice(width - SCALE * order, width + SCALE * order + 1, SCALE)
                 prior[alias : self.count : SCALE, place, :, alias] = powers
             left = torch.cat([matrices, prior.flatten(2)], dim=-1).to(self.dtype)
-            self._bands[order] = FinerBand(left[:, :, None], 2 * self.kernels.reach, order)
-        return self._bands[order]
+            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.reach, order)
+        return self._normal[order]
 
-    def scene(self, coefficients: Tensor, length: int) -> Tensor:
+    def scene(self, coefficients: Tensor) -> Tensor:
         """The scene at half pixels, (C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
         first = -SCALE * _FINER_SCENE_REACH - self.top
         count = SCALE * self.num_rows
@@ -580,5 +598,5 @@ class FinerObservation(Observation):
         )
         low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
-        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=SCALE * length) * SCALE
+        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=SCALE * self.period) * SCALE
         return scene

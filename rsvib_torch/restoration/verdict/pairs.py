@@ -13,8 +13,9 @@ from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extended_length, spline_spectra
-from rsvib_torch.core.splines import bspline_weights, correlated, mirrored, spread_taps
+from rsvib_torch.core.splines import correlated
 from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
@@ -230,17 +231,13 @@ def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0
     spectra = spline_spectra(scene, degree, length)
 
     place = rows[:, None] - displacement[..., 1]
-    cell = place.floor()
-    first, taps = spread_taps(cell, bspline_weights(place - cell, degree) * node_weights[:, None])
-    angle = displacement[..., 0, None].to(scene.dtype) * (-2 * math.pi * u).to(scene.dtype)
-    taps = taps.transpose(-2, -1).to(scene.dtype)
-    count = taps.shape[-2]
-    source_rows = mirrored((first - degree // 2)[:, None] + torch.arange(count, device=scene.device), height)
-    step = max(1, _ELEMENTS.get(scene.device.type, height * count * len(u)) // (count * len(u)))
-    formed = []
-    for part in runs(height, step):
-        transfer = torch.complex(taps[part] @ angle[part].cos(), taps[part] @ angle[part].sin())  # (R, count, U)
-        formed.append((transfer * spectra[:, source_rows[part]]).sum(-2))
+    along = displacement[..., 0].to(scene.dtype)
+    taps = degree + 1 + math.ceil(float((place.amax(-1) - place.amin(-1)).amax()))
+    step = max(1, _ELEMENTS.get(scene.device.type, height * taps * len(u)) // (taps * len(u)))
+    formed = [
+        form_rows(spectra, place[part], along[part], node_weights, u.to(scene.dtype), degree)
+        for part in runs(height, step)
+    ]
     image: Tensor = torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width]
     return image
 
