@@ -34,7 +34,7 @@ INNER_LAYERS = {
         {"strips"},
         {"tones"},
         {"start"},
-        {"rows", "reliability", "sensitivity"},
+        {"rows", "sensitivity", "verdict"},
         {"assemble", "convergence"},
         {"refinement"},
         {"pipeline"},

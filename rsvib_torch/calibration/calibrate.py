@@ -13,7 +13,8 @@ from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.presentation import JudgedResult
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.io.stack_reading import FramesOrFiles
 
@@ -24,7 +25,7 @@ ScanAxis = Literal[-2, -1, "y", "x"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RowTimeCalibration(
-    Result,
+    JudgedResult,
     units={
         "row_time": "s",
         "row_time_std": "s",
@@ -52,7 +53,7 @@ class RowTimeCalibration(
         candidates: Row times in seconds that explain the motion of the frames, negative for a reverse readout; empty
             for a calibration with flickering light.
         reliable: Whether a single row time explains the frames.
-        reasons: Why not.
+        findings: Each ``Reason`` why not; ``reasons`` has their texts.
         light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
             flickering light.
         fitted_light: (T, H) the bands that were fitted to it.
@@ -78,7 +79,7 @@ class RowTimeCalibration(
     notes: tuple[str, ...]
     candidates: tuple[float, ...] = ()
     reliable: bool = True
-    reasons: tuple[str, ...] = ()
+    findings: tuple[Reason, ...] = ()
     light: Tensor | None = None
     fitted_light: Tensor | None = None
 

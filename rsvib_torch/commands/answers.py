@@ -67,20 +67,23 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
         lines.append("there is no vibration to remove")
-    refused = "its vibration is not reliable"  # for the reasons of the detection, which are printed before
     lines += [
-        f"{note.split()[0]} unchanged: {refused}, see the reasons above" if refused in note else note
-        for note in result.left_alone
+        f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"  # printed before
+        if reason.code == "axis_not_reliable"
+        else str(reason)
+        for reason in result.left_alone
     ]
     return [wrapped(line) for line in lines]
 
 
 def restoration_data(result: RestoredFrames) -> dict[str, Any]:
     """The same as ``restoration_lines`` for JSON."""
+    from rsvib_torch.core.presentation import plain_values  # noqa: PLC0415
+
     return {
         "frames": "restored" if result.restored else "as taken",
         "axes": result.restored_axes(),
-        "left_alone": list(result.left_alone),
+        "left_alone": plain_values(result.left_alone),
         **verdict_data(result.verdict),
     }
 
@@ -111,8 +114,8 @@ def steps_after_detection(
         target = frames.with_name("restored.tif")
         restore = command_text("restore", frames, target, *settings.arguments, "--vibration", vibration)
         lines.append(f"restore the frames:\n  {restore}")
-    reasons = [] if result is None else [reason for axis in result.reasons for reason in axis]
-    if any("model='free'" in reason for reason in reasons):
+    reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
+    if any(reason.kind.free_model for reason in reasons):
         motion = command_text("motion", frames, *settings.arguments, "--out", "motion.csv")
         lines.append(f"detect a motion that is not a steady vibration (model='free'):\n  {motion}")
     if reasons:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -156,8 +157,8 @@ def _trusted(
 
     motion = detected.vibration
     if not force:
-        motion, notes = restoration.trusted_vibration(detected, timing, count, rows)
-        notes = tuple(note.replace("is not restored", "is not exported", 1) for note in notes)
+        motion, reasons = restoration.trusted_vibration(detected, timing, count, rows)
+        notes = [str(replace(one, details={**one.details, "action": "exported"})) for one in reasons]
         if not bool(motion.moving_axes().any()):
             raise ValueError(
                 f"nothing to export: {'; '.join(notes) or 'no vibration'}; --force exports it nevertheless"

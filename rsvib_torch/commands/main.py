@@ -25,7 +25,7 @@ from rsvib_torch.commands.terminal import (
     show_answer,
     warnings_in_one_line,
 )
-from rsvib_torch.core.unexpected import in_one_line
+from rsvib_torch.core.unexpected import in_one_line, system_error
 from rsvib_torch.core.validation import MistakesError
 
 __all__ = ["main", "run_command"]
@@ -227,8 +227,8 @@ def _lines_of(error: Exception) -> Sequence[str]:
         message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
         several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
         return [f"{message}{several}"]
-    line = in_one_line(error)
-    return [f"{line} (--debug prints the traceback)" if line.startswith("unexpected") else line]
+    is_known = isinstance(error, RecursionError) or system_error(error) is not None
+    return [in_one_line(error) if is_known else f"{in_one_line(error)} (--debug prints the traceback)"]
 
 
 def main() -> None:

@@ -287,7 +287,7 @@ def _check_motion(
         for reason in check.reasons:
             error_line(reason, "warning")
     else:
-        _refuse(path, check.reasons or ("the motion does not reduce the offsets of rows between frames",), force)
+        _refuse(path, check.reasons, force)
     return check
 
 

@@ -62,10 +62,10 @@ if TYPE_CHECKING:
 
     from rsvib_torch.detection import DetectionResult
     from rsvib_torch.io import StackInfo
+    from rsvib_torch.motion.detected_vibration import Detected
     from rsvib_torch.motion.motion import Motion
     from rsvib_torch.motion.timing import SensorTiming
     from rsvib_torch.report import Box
-    from rsvib_torch.restoration.verdict.trust import Detected
     from rsvib_torch.stacks import RestoredFrames, StackReport, WindowResult
     from rsvib_torch.stacks.job import RestoreOptions
 

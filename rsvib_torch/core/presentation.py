@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
+from rsvib_torch.core.reason import texts
 from rsvib_torch.core.text import text_table, wrapped
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ __all__ = [
     "AXIS_NAMES",
     "AXIS_UNITS",
     "FIGURES",
+    "JudgedResult",
     "Result",
     "Summarised",
     "axis_head",
@@ -330,3 +332,14 @@ class Result(Summarised):
         picture = io.BytesIO()
         self.plot().savefig(picture, format="png", dpi=70, facecolor="white")
         return f'{text}<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
+
+
+class JudgedResult(Result):
+    """A result with a verdict. Its field ``findings`` has the ``Reason`` objects against it, or against each axis."""
+
+    findings: tuple[Any, ...]
+
+    @property
+    def reasons(self) -> tuple[Any, ...]:
+        """Texts of ``findings``."""
+        return texts(self.findings)

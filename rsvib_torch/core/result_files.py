@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file, write_json
+from rsvib_torch.core.reason import read_findings
 from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
@@ -67,6 +68,8 @@ def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
         raise ValueError(f"{path}: expected a table, got {value!r}")
     # SensorTiming does not import torch, whose Tensor its annotations name
     hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
+    if "findings" in hints:  # files of earlier versions have texts of reasons
+        value = {**value, "findings": read_findings(value.get("findings", value.get("reasons", ())))}
     # files of earlier versions lack fields that were added later with a default
     needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
     if absent := [name for name in needed if name not in value]:

@@ -4,7 +4,18 @@ import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["in_one_line", "unexpected_errors_in_one_line"]
+__all__ = ["in_one_line", "system_error", "unexpected_errors_in_one_line"]
+
+
+def system_error(error: BaseException) -> OSError | None:
+    """The error of the system that exhausted memory or threads stand for, with the remedy; None for others."""
+    text = str(error)
+    if isinstance(error, MemoryError) or "allocate" in text or "out of memory" in text:
+        return OSError(errno.ENOMEM, "not enough memory for a stack of this size: process fewer frames at a time")
+    if "can't start new thread" in text:
+        remedy = "use fewer workers, or raise the limit of processes (ulimit -u)"
+        return OSError(errno.EAGAIN, f"the system cannot start another thread: {remedy}")
+    return None
 
 
 def in_one_line(error: BaseException) -> str:
@@ -16,14 +27,12 @@ def in_one_line(error: BaseException) -> str:
         >>> in_one_line(KeyError("row"))
         "unexpected KeyError: 'row'"
     """
-    text = " ".join(str(error).split())
-    if isinstance(error, MemoryError) or "allocate" in text or "out of memory" in text:
-        return "not enough memory for a stack of this size: process fewer frames at a time"
-    if "can't start new thread" in text:
-        return "the system cannot start another thread: use fewer workers, or raise the limit of processes (ulimit -u)"
+    known = system_error(error)
+    if known is not None:
+        return str(known.strerror)
     if isinstance(error, RecursionError):
         return "the input is nested too deeply"
-    return f"unexpected {type(error).__name__}: {text[:500]}"
+    return f"unexpected {type(error).__name__}: {' '.join(str(error).split())[:500]}"
 
 
 @contextmanager
@@ -32,9 +41,4 @@ def unexpected_errors_in_one_line() -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, LookupError, MemoryError, RuntimeError) as error:
-        message = in_one_line(error)
-        if message.startswith("not enough memory"):
-            raise OSError(errno.ENOMEM, message) from error
-        if message.startswith("the system cannot start"):
-            raise OSError(errno.EAGAIN, message) from error
-        raise ValueError(message) from error
+        raise (system_error(error) or ValueError(in_one_line(error))) from error

@@ -16,7 +16,9 @@ from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, motion_of_fit
+from rsvib_torch.detection.verdict import Findings
 from rsvib_torch.frames.orientation import (
+    findings_from_row_order,
     magnitudes_from_row_order,
     offsets_from_row_order,
     sequence_from_row_order,
@@ -33,7 +35,7 @@ def assembled(
     std: VibrationStd,
     curve: OffsetCurve,
     fitted: Tensor,
-    reasons: Sequence[Sequence[tuple[str, ...]]],
+    findings: Sequence[Findings],
     timing: SensorTiming,
     *,
     scale: FieldScale,
@@ -47,7 +49,7 @@ def assembled(
         std: Their standard deviations, in px.
         curve: The measured offsets (B, P, N, A) in px.
         fitted: (B, P, N, A) px, the offsets that the fit predicts.
-        reasons: For each stack and each axis in row order, the reasons against it.
+        findings: For each stack and each axis in row order, the reasons against it.
         timing: The sensor, in image order.
         scale: Components of the motion.
         num_frames: Frames of a stack.
@@ -60,7 +62,7 @@ def assembled(
     sensitivity = sensitivity.mapped(lambda values: magnitudes_from_row_order(values, timing, -2))
     heights = sequence_from_row_order(curve.heights, timing)
     residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
-    reliable = [[not of_axis for of_axis in of_stack] for of_stack in reasons]
+    reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
     return DetectionResult(
         vibration=vibration,
         std=scale.std(std).from_row_order(timing),
@@ -74,11 +76,11 @@ def assembled(
         gain=vibration.gain(interval),
         residual=magnitudes_from_row_order(residual * units, timing),
         reliable=magnitudes_from_row_order(torch.tensor(reliable, device=fitted.device), timing),
-        reasons=tuple(sequence_from_row_order(of_stack, timing) for of_stack in reasons),
+        findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
         sensitivity=sensitivity,
         assumptions=tuple(
             assumptions(vibration[index], sensitivity[index], row_timing, num_frames, scale.height)
-            for index in range(len(reasons))
+            for index in range(len(findings))
         ),
         timing=timing,
     )

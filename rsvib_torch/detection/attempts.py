@@ -16,11 +16,11 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.detection.assemble import assembled
 from rsvib_torch.detection.diagnosis import other_timings
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.reliability import rotation_possible
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.start import strips_fit
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
+from rsvib_torch.detection.verdict import rotation_possible
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
@@ -111,7 +111,7 @@ def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> 
         found.std,
         found.fitted.offsets,
         found.fitted.predicted,
-        found.reasons,
+        found.findings,
         timing,
         scale=found.scale,
         num_frames=num_frames,
@@ -124,8 +124,7 @@ def _any_rolls(found: Attempt) -> bool:
     rows = found.fitted.rows
     if rows is None:
         return False
-    aspect = found.scale.height / found.scale.width
-    return any(rotation_possible(rows.other_motion[i], rows.uneven[i], aspect) for i in range(len(found.statuses)))
+    return bool(rotation_possible(rows.other_motion, rows.uneven, found.scale.height / found.scale.width).any())
 
 
 def _moving_axes(found: Attempt, least: int) -> int:

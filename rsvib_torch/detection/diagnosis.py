@@ -19,13 +19,14 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.option_types import Registration
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.reliability import contradicted_axes, rotation_found
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, typical_size
+from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -52,22 +53,16 @@ class TimingDiagnosis:
     timing: SensorTiming
 
     @property
-    def reason(self) -> str:
-        """Sentence with both values and the remedy."""
+    def reason(self) -> Reason:
+        """The reason against all axes of a detection with the stated value."""
+        code = f"other_{self.setting}"
+        if isinstance(self.stated, str) or isinstance(self.agreeing, str):
+            return Reason(code, details={"stated": str(self.stated), "agreeing": str(self.agreeing)})
+        details: dict[str, float | str] = {}
         if self.setting == "frame_rows":
-            stated = replace(self.timing, frame_rows=float(self.stated))
-            row_time = stated.row_time * stated.frame_rows / float(self.agreeing)
-            return (
-                f"the frames agree with frame_rows={self.agreeing:.5g}, not with {self.stated:g}: frame_rows counts "
-                "the blanking rows and is not the image height; if the frame rate is known, row_time is 1 / (frame "
-                f"rate x frame_rows), with {stated.frame_rate:.5g} frames/s {row_time:.5g} s"
-            )
-        if self.setting == "row_time":
-            return (
-                f"the frames agree with row_time={self.agreeing:.5g} s, not with {self.stated:g} s, if the start times "
-                "of the frames are right"
-            )
-        return f"the frames agree with {self.setting}={self.agreeing!r}, not with {self.stated!r}"
+            frame_rate = 1 / (self.timing.row_time * self.stated)
+            details = {"frame_rate": frame_rate, "row_time": 1 / (frame_rate * self.agreeing)}
+        return Reason(code, None, self.stated, self.agreeing, details)
 
 
 @outside_graphs
@@ -145,12 +140,11 @@ def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> d
     """
     if found.fitted.rows is None:
         return {}
-    diagnoses = {}
-    for index in range(len(found.statuses)):
-        other = found.fitted.rows.other_motion[index]
-        axes = contradicted_axes(found.vibration[index], other, found.options.max_tones)
+    diagnoses, rotates = {}, halves_move_apart(found.fitted.rows.other_motion).tolist()
+    for index, findings in enumerate(found.findings):
+        axes = contradicted_axes(findings)
         if any(axes):
-            diagnosis = _Diagnosis.of_stack(stacks, timing, found, index, axes).result(rotates=rotation_found(other))
+            diagnosis = _Diagnosis(stacks.one(index), timing, found, index, axes).result(rotates=rotates[index])
             if diagnosis is not None:
                 diagnoses[index] = diagnosis
     return diagnoses
@@ -173,12 +167,6 @@ class _Diagnosis:
     found: Attempt
     index: int
     axes: tuple[bool, bool]
-
-    @classmethod
-    def of_stack(
-        cls, stacks: GreyFrames, timing: SensorTiming, found: Attempt, index: int, axes: tuple[bool, bool]
-    ) -> "_Diagnosis":
-        return cls(stacks.one(index), timing, found, index, axes)
 
     def result(self, *, rotates: bool) -> TimingDiagnosis | None:
         """The setting with the value that the stack agrees with; None if it agrees with no other timing.
@@ -252,7 +240,7 @@ class _Diagnosis:
         other = attempt(stack, timing, self.found.options, hypothesis)
         if other.statuses[0] == "abandoned":
             return False
-        axes = zip(other.reasons[0], self.axes if concerned is None else concerned, strict=True)
+        axes = zip(other.findings[0], self.axes if concerned is None else concerned, strict=True)
         return all(not against or not axis for against, axis in axes)
 
 

@@ -18,7 +18,6 @@ from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine
-from rsvib_torch.detection.reliability import judge
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
 from rsvib_torch.detection.start import BandStart, band_start, field_start
@@ -34,6 +33,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones, robust_fit
 from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
+from rsvib_torch.detection.verdict import BandOffsets, Findings, judged
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
@@ -122,7 +122,7 @@ class Attempt:
         fit: The same with all uncertainties in its covariance.
         vibration: Its vibration, in px.
         std: Standard deviations of the vibration, in px.
-        reasons: For each stack and each axis the reasons against it.
+        findings: For each stack and each axis the reasons against it.
         interval: Seconds between the first two frames.
     """
 
@@ -134,7 +134,7 @@ class Attempt:
     fit: ToneFit
     vibration: Vibration
     std: VibrationStd
-    reasons: tuple[tuple[tuple[str, ...], ...], ...]
+    findings: tuple[Findings, ...]
     interval: float
 
     @property
@@ -185,7 +185,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
 
     # 4. Verdict: for each axis, the reasons against it.
     intervals = compared_intervals(timing, num_frames, method.max_group_frames, frames.device)
-    reasons = _judged(start, fitted, fit, vibration, std, known_std, starts, intervals, timing, options, scale)
+    findings = _judged(start, fitted, fit, vibration, std, known_std, starts, intervals, timing, options, scale)
     return Attempt(
         statuses=_statuses(fitted),
         options=options,
@@ -195,7 +195,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         fit=fit,
         vibration=vibration,
         std=std,
-        reasons=reasons,
+        findings=findings,
         interval=float(intervals[0]),
     )
 
@@ -235,32 +235,27 @@ def _judged(
     timing: RowTiming,
     options: DetectionOptions,
     scale: FieldScale,
-) -> tuple[tuple[tuple[str, ...], ...], ...]:
+) -> tuple[Findings, ...]:
     """For each stack and each axis the reasons against it."""
     tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     moved = tones.mean_displacement(starts.expand(len(fit.centre), -1), timing.exposure_time)
-    curve, predicted = start.curve, start.predicted(fit)
-    # an image motion may carry bands out of the later frame
-    later, half = curve.rows + predicted[..., 1], 0.5 * options.bands.band_rows
-    visible = (later >= half) & (later <= scale.height - 1 - half)
-    verdicts = [
-        judge(
-            vibration[index],
-            std[index],
-            offsets=curve.offsets[index].flatten(0, 1),
-            fitted=predicted[index].flatten(0, 1),
-            visible=visible[index].flatten(),
-            intervals=intervals,
-            displacement=moved[index].std(0, correction=0),
-            own_std=known_std[index],
-            timing=timing,
-            other_motion=None if fitted.rows is None else fitted.rows.other_motion[index],
-            max_tones=options.max_tones,
-            radius=scale.radius,
-        )[1]
-        for index in range(len(fit.centre))
-    ]
-    return tuple(verdicts)
+    if fitted.rows is None:
+        curve, predicted = start.curve, start.predicted(fit)
+        # an image motion may carry bands out of the later frame
+        later, half = curve.rows + predicted[..., 1], 0.5 * options.bands.band_rows
+        visible = (later >= half) & (later <= scale.height - 1 - half)
+        bands = BandOffsets(*(values.flatten(1, 2) for values in (curve.offsets, predicted, visible)))
+    return judged(
+        vibration,
+        std,
+        bands if fitted.rows is None else fitted.rows.other_motion,
+        intervals=intervals,
+        displacement=moved.std(1, correction=0),
+        known_std=known_std,
+        timing=timing,
+        max_tones=options.max_tones,
+        radius=scale.radius,
+    )
 
 
 # Methods of detection

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
+from rsvib_torch.core.presentation import JudgedResult, Result, axis_head, axis_rows, plain_values
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.detected_vibration import detection_summary
@@ -177,13 +178,13 @@ class AttitudeTones(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectionResult(
-    Result,
+    JudgedResult,
     units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
     shapes={
         "gain": "... A K",
         **dict.fromkeys(("residual", "reliable"), "... A"),
         "fitted": "... P N A",
-        **dict.fromkeys(("reasons", "assumptions"), "..."),
+        **dict.fromkeys(("findings", "assumptions"), "..."),
     },
     file_format="rsvib vibration",
 ):
@@ -197,7 +198,8 @@ class DetectionResult(
         gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
-        reasons: Reasons against each axis (x, y) that is not reliable; a tuple of those for a batch.
+        findings: Each ``Reason`` against each axis (x, y) that is not reliable; a tuple of those for a batch.
+            ``reasons`` has their texts.
         sensitivity: Effect of the stated timing on amplitudes and frequencies.
         assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
         timing: The sensor of the frames.
@@ -228,7 +230,7 @@ class DetectionResult(
     gain: Tensor
     residual: Tensor
     reliable: Tensor
-    reasons: tuple[Any, ...]
+    findings: tuple[Any, ...]
     sensitivity: TimingSensitivity
     assumptions: tuple[Any, ...]
     timing: SensorTiming | None = None
@@ -260,12 +262,12 @@ class DetectionResult(
         curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
         return values | curve
 
-    def refused(self, index: int, reason: str) -> "DetectionResult":
+    def refused(self, index: int, reason: Reason) -> "DetectionResult":
         """The results of a batch with a further reason against all axes of one stack."""
-        reliable, reasons = self.reliable.clone(), list(self.reasons)
+        reliable, findings = self.reliable.clone(), list(self.findings)
         reliable[index] = False
-        reasons[index] = tuple((reason, *of_axis) for of_axis in reasons[index])
-        return replace(self, reliable=reliable, reasons=tuple(reasons))
+        findings[index] = tuple((reason, *of_axis) for of_axis in findings[index])
+        return replace(self, reliable=reliable, findings=tuple(findings))
 
     def with_axes(self, count: int) -> "DetectionResult":
         """The result with the first axes of (x, y, roll, zoom) only."""
@@ -281,8 +283,8 @@ class DetectionResult(
             }
             return type(values)(**kept)
 
-        def of_reasons(reasons: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
-            return reasons[:count] if depth == 0 else tuple(of_reasons(part, depth - 1) for part in reasons)
+        def of_findings(findings: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
+            return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
 
         curve = replace(
             self.offsets,
@@ -298,7 +300,7 @@ class DetectionResult(
             gain=self.gain[..., :count, :],
             residual=first(self.residual),
             reliable=first(self.reliable),
-            reasons=of_reasons(self.reasons, batch),
+            findings=of_findings(self.findings, batch),
             sensitivity=of_tones(self.sensitivity),
         )
 

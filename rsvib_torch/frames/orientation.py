@@ -5,17 +5,22 @@ sign of roll. This is the only place outside of motions (``Motion.from_row_order
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 from torch import Tensor
 
+from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.motion.timing import SensorTiming, row_axes
 
 __all__ = [
+    "findings_from_row_order",
     "frames_from_row_order",
     "frames_to_row_order",
     "magnitudes_from_row_order",
     "offsets_from_row_order",
+    "reasons_from_row_order",
     "sequence_from_row_order",
 ]
 
@@ -62,7 +67,7 @@ def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = 
 
 
 def sequence_from_row_order(values: Sequence[Entry], timing: SensorTiming) -> tuple[Entry, ...]:
-    """Turn one entry for each component, e.g. the reasons against it, back to image axes.
+    """Turn one entry for each component, back to image axes.
 
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")
@@ -71,3 +76,17 @@ def sequence_from_row_order(values: Sequence[Entry], timing: SensorTiming) -> tu
     """
     order, _ = row_axes(timing, len(values))
     return tuple(values[axis] for axis in order)
+
+
+def reasons_from_row_order(reasons: Sequence[Reason], timing: SensorTiming) -> tuple[Reason, ...]:
+    """Reasons with the names of their axes in the image."""
+    order, _ = row_axes(timing, len(AXIS_NAMES))
+    names = {AXIS_NAMES[axis]: name for axis, name in zip(order, AXIS_NAMES, strict=True)}
+    return tuple(replace(one, axis=names.get(one.axis or "")) for one in reasons)
+
+
+def findings_from_row_order(
+    findings: Sequence[Sequence[Reason]], timing: SensorTiming
+) -> tuple[tuple[Reason, ...], ...]:
+    """Turn the reasons against each component back to image axes."""
+    return sequence_from_row_order([reasons_from_row_order(reasons, timing) for reasons in findings], timing)

@@ -6,13 +6,14 @@ stands for a value that is unknown or not finite.
 """
 
 import math
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import AliasChoices, Field, PlainSerializer, PlainValidator, model_validator
 from torch import Tensor
 
 from rsvib_torch.core.presentation import plain_values
+from rsvib_torch.core.reason import Reason, read_findings
 from rsvib_torch.core.validation import Section, checked
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration, Detection
@@ -21,6 +22,7 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 __all__ = [
     "DetectionRecord",
+    "ReasonRecord",
     "StdRecord",
     "TimingRecord",
     "VibrationRecord",
@@ -30,6 +32,7 @@ __all__ = [
 
 Tones = list[float] | list[list[float]]
 Numbers = list[float | None]
+ReasonRecord = Annotated[Reason, PlainValidator(read_findings), PlainSerializer(Reason.to_dict)]
 
 
 def _to_tensor(values: Any, missing: float) -> Tensor:
@@ -105,13 +108,6 @@ class VibrationRecord(Section):
         """The record of one vibration (not a batch)."""
         return cls(**{name: plain_values(getattr(vibration, name)) for name in VibrationRecord.model_fields})
 
-    @model_serializer(mode="wrap")
-    def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit an unknown camera and a shift of 0: files written before these fields were added keep their hash."""
-        values: dict[str, Any] = handler(self)
-        is_set = {"camera": self.camera is not None, "image_shift": any(self.image_shift)}
-        return {name: value for name, value in values.items() if is_set.get(name, True)}
-
     def to_vibration(self) -> Vibration:
         """The vibration."""
         values = {name: getattr(self, name) for name in VibrationRecord.model_fields}
@@ -135,12 +131,6 @@ class StdRecord(Section):
         values = {name: getattr(std, name) for name in cls.model_fields}
         return cls(**{name: plain_values(value) for name, value in values.items() if value is not None})
 
-    @model_serializer(mode="wrap")
-    def _without_unknown(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit an unknown ``displacement``: files written before this field was added keep their hash."""
-        values: dict[str, Any] = handler(self)
-        return {name: value for name, value in values.items() if name != "displacement" or value is not None}
-
     def to_std(self) -> VibrationStd:
         """The standard deviations, infinite where unknown."""
         values = {name: getattr(self, name) for name in StdRecord.model_fields}
@@ -157,7 +147,10 @@ class DetectionRecord(Section):
     gain: list[Numbers]
     residual: Numbers
     reliable: list[bool] = Field(min_length=2, max_length=4)
-    reasons: list[list[str]] = Field(min_length=2, max_length=4)
+    # files of earlier versions have the texts of reasons
+    findings: list[list[ReasonRecord]] = Field(
+        validation_alias=AliasChoices("findings", "reasons"), min_length=2, max_length=4
+    )
     assumptions: list[str] = Field(default_factory=list[str])
 
     @classmethod
@@ -169,16 +162,10 @@ class DetectionRecord(Section):
             gain=plain_values(detection.gain),
             residual=plain_values(detection.residual),
             reliable=detection.reliable.tolist(),
-            reasons=[list(axis) for axis in detection.reasons],
+            findings=[list(axis) for axis in detection.findings],
             assumptions=list(detection.assumptions),
             **fields,
         )
-
-    @model_serializer(mode="wrap")
-    def _without_empty(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit empty ``assumptions``: files written before this field was added keep their hash."""
-        values: dict[str, Any] = handler(self)
-        return {name: value for name, value in values.items() if name != "assumptions" or value}
 
     def to_detection(self) -> DetectedVibration:
         """The detection.
@@ -189,15 +176,15 @@ class DetectionRecord(Section):
         vibration, std = self.vibration.to_vibration(), self.std.to_std()
         if any(values.shape != vibration.amplitude.shape for values in (std.amplitude, std.frequency, std.phase)):
             raise ValueError("std must have as many tones as the vibration")
-        if not len(self.reliable) == len(self.reasons) == vibration.num_axes:
-            raise ValueError(f"reliable and reasons must have {vibration.num_axes} entries, one for each axis")
+        if not len(self.reliable) == len(self.findings) == vibration.num_axes:
+            raise ValueError(f"reliable and findings must have {vibration.num_axes} entries, one for each axis")
         return DetectedVibration(
             vibration,
             std,
             _to_tensor(self.gain, math.nan),
             _to_tensor(self.residual, math.nan),
             torch.tensor(self.reliable, device="cpu"),
-            tuple(tuple(axis) for axis in self.reasons),
+            tuple(tuple(axis) for axis in self.findings),
             tuple(self.assumptions),
         )
 

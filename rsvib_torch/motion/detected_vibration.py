@@ -5,29 +5,44 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from rsvib_torch.core.presentation import Result, verdict_table
+from rsvib_torch.core.presentation import JudgedResult, verdict_table
 from rsvib_torch.core.text import wrapped
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
 
-__all__ = ["DetectedVibration", "detection_summary"]
+__all__ = ["Detected", "DetectedVibration", "detection_summary"]
 
 
 @runtime_checkable
-class Detection(Protocol):
-    """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
+class Detected(Protocol):
+    """A vibration in image axes with its standard deviations and a verdict; what restoration needs of a detection."""
 
     @property
-    def vibration(self) -> Vibration: ...
+    def vibration(self) -> Vibration:
+        """The vibration, of batch shape () or (B,)."""
+
     @property
-    def std(self) -> VibrationStd: ...
+    def std(self) -> Any:
+        """Standard deviations ``amplitude``, ``frequency``, ``phase``, ``image_motion``, shaped as the vibration's."""
+
+    @property
+    def reliable(self) -> Any:
+        """(..., A) verdict for each axis."""
+
+    @property
+    def reasons(self) -> tuple[Any, ...]:
+        """Texts of the reasons against each axis; a tuple of those for a batch."""
+
+
+@runtime_checkable
+class Detection(Detected, Protocol):
+    """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
+
     @property
     def gain(self) -> Tensor: ...
     @property
     def residual(self) -> Tensor: ...
     @property
-    def reliable(self) -> Tensor: ...
-    @property
-    def reasons(self) -> tuple[Any, ...]: ...
+    def findings(self) -> tuple[Any, ...]: ...
     @property
     def assumptions(self) -> tuple[Any, ...]: ...
 
@@ -44,7 +59,7 @@ def detection_summary(detection: Detection) -> str:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DetectedVibration(Result):
+class DetectedVibration(JudgedResult):
     """A detection without its offset curve: everything that restoration needs.
 
     Attributes:
@@ -53,7 +68,7 @@ class DetectedVibration(Result):
         gain: (2, K) offset gain of Eq. (7) from displacement to offset.
         residual: (2,) px, mean absolute difference of measured and fitted offsets.
         reliable: (2,) bool, verdict for each axis (x, y).
-        reasons: Why an axis is not reliable, for each axis.
+        findings: Each ``Reason`` against each axis; ``reasons`` has their texts.
         assumptions: What the frames cannot contradict, one sentence for each.
     """
 
@@ -62,7 +77,7 @@ class DetectedVibration(Result):
     gain: Tensor
     residual: Tensor
     reliable: Tensor
-    reasons: tuple[Any, ...]
+    findings: tuple[Any, ...]
     assumptions: tuple[Any, ...] = ()
 
     def summary(self) -> str:

@@ -232,7 +232,7 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
             for name in quantities:
                 line += [getattr(vibration, name)[number][0], getattr(std, name)[number][0]]
             line += [vibration.image_motion[number], detection.reliable[number]]
-        note = record.error or "; ".join(record.left_alone)
+        note = record.error or "; ".join(map(str, record.left_alone))
         lines.append([*line, record.frames, record.outcome, len(record.bad_frames), note])
     _write_csv(path, [*head, "frames", "outcome", "bad_frames", "note"], lines)
 
@@ -257,13 +257,13 @@ def write_restoration(
         "version": 1,
         "frames": "restored" if result.restored else "as taken",
         "options": options,
-        "left_alone": list(result.left_alone),
+        "left_alone": plain_values(result.left_alone),
         "outcome": None if verdict is None else verdict.overall,
         "summary": None if verdict is None else verdict.sentence,
         "not_kept": list(not_kept),
     }
     if verdict is not None:
         pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
-        content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "reasons": list(verdict.reasons)}
+        content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "findings": plain_values(verdict.findings)}
         content["units"] = {"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"}
     write_json(path, content)

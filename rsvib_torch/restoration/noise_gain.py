@@ -10,11 +10,12 @@ from rsvib_torch.core.arrays import Channels
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.detected_vibration import Detected
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
-from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
+from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = ["predict_noise_gain"]
 

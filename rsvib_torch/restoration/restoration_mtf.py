@@ -17,13 +17,14 @@ from rsvib_torch.core.text import text_table
 from rsvib_torch.frames.prepare import Saturation, prepare_frames
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.detected_vibration import Detected
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
-from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
+from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = ["RestorationMtf", "restoration_mtf"]
 

@@ -26,6 +26,7 @@ from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.detected_vibration import Detected
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
@@ -37,7 +38,7 @@ from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import judge_frames
 from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
-from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
+from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = [
     "METHODS",
@@ -290,8 +291,8 @@ def restore(
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
-    for note in left_alone:
-        warn_of_restoration(note)
+    for reason in left_alone:
+        warn_of_restoration(str(reason))
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.get("joint", False), options.get("scale", 1))
     restored = restore_prepared(prepared, vibration, method, options)

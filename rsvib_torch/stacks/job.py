@@ -84,7 +84,7 @@ class WindowResult(Summarised):
         if self.detection is not None:
             lines.append(self.detection.summary())
         if self.restoration is not None:
-            lines += self.restoration.left_alone
+            lines += map(str, self.restoration.left_alone)
             lines += [] if self.restoration.verdict is None else [self.restoration.verdict.sentence]
         lines += [] if self.error is None else [self.error]
         return "\n".join([*lines, *(f"frame {index}: {fault}" for index, fault in self.bad_frames.items())])
@@ -252,7 +252,7 @@ class StackJob:
             "written": written,
             "frames": "restored" if result.restored else "as taken",
             "detection": detection_to_json(result.detection),
-            "left_alone": [] if restoration is None else list(restoration.left_alone),
+            "left_alone": [] if restoration is None else plain_values(restoration.left_alone),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,
             "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),

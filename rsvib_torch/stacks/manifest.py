@@ -16,7 +16,7 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, Summarised
 from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
 from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.io.schema import DetectionRecord, TimingRecord, detection_to_json
+from rsvib_torch.io.schema import DetectionRecord, ReasonRecord, TimingRecord, detection_to_json
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.stacks.job import StackJob
 
@@ -34,7 +34,7 @@ class WindowRecord(Section):
         written: Number of frames written.
         frames: Whether the frames written are restored, or as taken.
         detection: The detection; None if it failed.
-        left_alone: A sentence for each axis that was not restored.
+        left_alone: A reason for each axis that was not restored.
         outcome: ``RestorationVerdict.overall``; None if the frames could not be compared.
         summary: ``RestorationVerdict.sentence``.
         predicted_gain: Mean of ``RestorationVerdict.predicted_gain`` in dB; None if unknown.
@@ -49,7 +49,7 @@ class WindowRecord(Section):
     written: int = Field(ge=0)
     frames: Literal["restored", "as taken"]
     detection: DetectionRecord | None
-    left_alone: list[str]
+    left_alone: list[ReasonRecord]
     outcome: str | None
     summary: str | None
     predicted_gain: float | None = None
@@ -100,9 +100,12 @@ class StackManifest(Summarised, Section):
         """
         windows, found = self.windows, self.detections()
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
-        notes = [(str(record.window), note) for record in windows for note in record.left_alone]
         names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
-        unchanged = {name: {window: note for window, note in notes if note.startswith(name)} for name in names}
+        unchanged: dict[str, dict[str, Any]] = {name: {} for name in names}
+        for record in windows:
+            for reason in record.left_alone:
+                if reason.axis in unchanged:
+                    unchanged[reason.axis][str(record.window)] = reason.to_dict()
         return {
             "windows": len(windows),
             "restored": sum(record.frames == "restored" for record in windows),
@@ -140,7 +143,9 @@ class StackManifest(Summarised, Section):
             if notes:
                 window, note = next(iter(notes.items()))
                 restoration.append(
-                    wrapped(f"{name} unchanged in {number_of(len(notes), 'window')}; in window {window}: {note}")
+                    wrapped(
+                        f"{name} unchanged in {number_of(len(notes), 'window')}; in window {window}: {note['text']}"
+                    )
                 )
         if data["errors"]:
             window, error = next(iter(data["errors"].items()))

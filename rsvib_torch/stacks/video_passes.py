@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.prefetch import prefetched
 from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import number_of
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.frames.pixels import detailed_columns
@@ -169,7 +170,7 @@ class VideoPasses:
             "written": len(tracks),
             "frames": "restored" if any(track.motion.moving_axes().any() for track in known) else "as taken",
             "detection": None if reported is None else detection_to_json(reported.detection),
-            "left_alone": _left_alone(known, None if reported is None else reported.detection),
+            "left_alone": plain_values(_left_alone(known, None if reported is None else reported.detection)),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,
             "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
@@ -178,11 +179,11 @@ class VideoPasses:
         }
 
 
-def _left_alone(tracks: list[FrameTrack], detection: DetectionResult | None) -> list[str]:
-    """A sentence for each axis whose vibration is removed from none of the frames."""
+def _left_alone(tracks: list[FrameTrack], detection: DetectionResult | None) -> list[Reason]:
+    """A reason for each axis whose vibration is removed from none of the frames."""
     notes = []
     for axis, name in enumerate(AXIS_NAMES[:2]):
         if tracks and not any(bool((track.motion.amplitude[axis] > 0).any()) for track in tracks):
-            why = () if detection is None else detection.reasons[axis]
-            notes.append(f"{name} is not restored: its vibration is not reliable ({'; '.join(why) or 'not known'})")
+            why = "; ".join(() if detection is None else detection.reasons[axis]) or "not known"
+            notes.append(Reason("axis_not_reliable", name, details={"action": "restored", "why": why}))
     return notes

@@ -138,6 +138,6 @@ def _tracked(
     detection = tracked.detection if reports and known else None
     if detection is not None:  # an axis is restored if it was reliable in one of the last frames
         reliable = tracked.motion.moving_axes() & (tracked.motion.amplitude > 0).any(-1)
-        reasons = tuple(() if good else why for good, why in zip(reliable.tolist(), detection.reasons, strict=True))
-        detection = replace(detection, reliable=reliable, reasons=reasons)
+        findings = tuple(() if good else why for good, why in zip(reliable.tolist(), detection.findings, strict=True))
+        detection = replace(detection, reliable=reliable, findings=findings)
     return FrameTrack(index, time, tracked.motion, tracked.path.cpu(), known, fault, detection)

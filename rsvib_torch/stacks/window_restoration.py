@@ -14,6 +14,7 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import MAX_NUMBER
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection import detect_vibration
 from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.prepare import prepare_frames
@@ -25,12 +26,13 @@ from rsvib_torch.io.full_scale import (
     frames_to_counts,
     known_full_scale,
 )
+from rsvib_torch.motion.detected_vibration import Detected
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
-from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
+from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted", "without_data"]
 
@@ -42,7 +44,7 @@ class RestoredFrames:
     Attributes:
         frames: Frames to write: restored, or as taken.
         restored: Whether they are restored.
-        left_alone: A sentence for each axis that was not restored.
+        left_alone: A reason for each axis that was not restored.
         verdict: Whether restoration helps; None if frames could not be compared.
         moves: Whether there was a vibration to remove.
         axes: Number of components of the motion: 2, 3 with roll, 4 with roll and zoom.
@@ -50,14 +52,14 @@ class RestoredFrames:
 
     frames: Tensor
     restored: bool
-    left_alone: tuple[str, ...]
+    left_alone: tuple[Reason, ...]
     verdict: RestorationVerdict | None
     moves: bool
     axes: int = 2
 
     def restored_axes(self) -> list[str]:
         """Names of the axes that were restored."""
-        unchanged = {note.split()[0] for note in self.left_alone}
+        unchanged = {reason.axis for reason in self.left_alone}
         return [name for name in AXIS_NAMES[: self.axes] if self.restored and name not in unchanged]
 
 

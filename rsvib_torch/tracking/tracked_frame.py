@@ -13,6 +13,7 @@ from rsvib_torch.detection.assemble import assembled, offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, displacement_std, residual_of, vibration_of_fit
+from rsvib_torch.detection.verdict import Findings
 from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.motion.timing import RowTiming
@@ -39,15 +40,13 @@ class TrackedTones:
         fit: The tones; the time origin is ``time``.
         measurements: Displacements of the rows of the last frame that was measured and of the one before, with the
             same time origin.
-        reasons: Against each axis.
-        contradicted: Whether the rows of each axis move in a way that the tones do not explain.
+        findings: Reasons against each axis.
     """
 
     time: float
     fit: ToneFit
     measurements: Measurements
-    reasons: tuple[tuple[str, ...], ...]
-    contradicted: tuple[bool, bool]
+    findings: Findings
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +130,9 @@ class TrackedFrame:
         weights = robust.weights / measurements.weights.clamp(min=1e-300)
         curve, fitted = offset_curve(robust, fit, weights, [2])
         interval, scale = float(measurements.exposure_starts.diff(dim=-1).mean()), FieldScale(2, width, height)
-        user_timing, reasons = self.frame.image_timing, (self.tones.reasons,)
+        user_timing, findings = self.frame.image_timing, (self.tones.findings,)
         results = assembled(
-            fit, std, curve, fitted, reasons, user_timing, scale=scale, num_frames=self.window, interval=interval
+            fit, std, curve, fitted, findings, user_timing, scale=scale, num_frames=self.window, interval=interval
         )
         return results[0]
 

@@ -26,7 +26,6 @@ from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.reliability import contradicted_axes, judge
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.rows.displacements import FrameGroup, differential_motion, measure_group, stack_spectra
 from rsvib_torch.detection.strips import FieldScale
@@ -40,6 +39,7 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
+from rsvib_torch.detection.verdict import contradicted_axes, judged
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
@@ -332,16 +332,16 @@ class VibrationTracker:
 
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
         residual = measurements.displacements - by_tones - by_drift
-        other = OtherMotion.of(measurements, by_tones, residual, scene.differential)[0]
+        other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
         if not float(other.unexplained.amax()) < _MAX_UNEXPLAINED:
             return replace(state, track=None)
         fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
-        trusted = torch.tensor([not against for against in tones.reasons], device=path.device)
+        trusted = torch.tensor([not against for against in tones.findings], device=path.device)
         trusted_axes = (*track.trusted, trusted)[-self.window :]
         track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
-        if any(tones.contradicted):
+        if any(contradicted_axes(tones.findings)):
             return replace(state, track=track, contradictions=state.contradictions + 1)
         return replace(state, track=track, contradictions=0, attempts=0)
 
@@ -350,27 +350,22 @@ class VibrationTracker:
     ) -> TrackedTones:
         """The tones of a frame, whose first row is the time origin, with the verdict of its rows."""
         exposure_time = self._rows.exposure_time
-        offsets = measurements.displacements[0, :, 1] - measurements.displacements[0, :, 0]
         # Displacement of the rows of the frame by the tones, and its standard deviation.
         vibration, std = vibration_of_fit(fit)
-        starts = self._rows.row_starts(1, frame.images.shape[-2], offsets.device)[:, ::8]
+        starts = self._rows.row_starts(1, frame.images.shape[-2], fit.centre.device)[:, ::8]
         moved = vibration.mean_displacement(starts, exposure_time) - vibration.drift(starts)
-        own_std = displacement_std(fit, starts[0], exposure_time)
-        _, reasons = judge(
-            vibration[0],
-            replace(std, displacement=own_std)[0],
-            offsets=offsets,
-            fitted=offsets,
-            visible=measurements.num_differences[0] > 0,
+        known_std = displacement_std(fit, starts[0], exposure_time)
+        (findings,) = judged(
+            vibration,
+            replace(std, displacement=known_std),
+            other_motion,
             intervals=measurements.exposure_starts.diff(dim=-1).mean((1, 2)),
-            displacement=moved[0].std(0, correction=0),
-            own_std=own_std[0],
+            displacement=moved.std(1, correction=0),
+            known_std=known_std,
             timing=self._rows,
-            other_motion=other_motion,
             max_tones=MAX_TONES,
         )
-        contradicted = contradicted_axes(vibration[0], other_motion, MAX_TONES)
-        return TrackedTones(frame.time, fit, measurements, reasons, contradicted)
+        return TrackedTones(frame.time, fit, measurements, findings)
 
     def _predicted(self, state: _State) -> _State | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
@@ -509,7 +504,7 @@ class VibrationTracker:
             motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half))[0]
             # An axis moves if its tones were reliable in one of the last frames.
             trusted = torch.stack(track.trusted).any(0)
-            followed = ~trusted.new_tensor(tones.contradicted) if self.wobble else trusted
+            followed = ~trusted.new_tensor(contradicted_axes(tones.findings)) if self.wobble else trusted
             motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
             motion = motion.from_row_order(self.timing)
             path = state.path + track.filter.path(state.time + half - track.filter.time)

@@ -138,7 +138,7 @@ def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     assert rsvib("detect", frames, "--config", config, "--out", tmp_path) == 0
     path = tmp_path / "vibration.json"
     data = json.loads(path.read_text())
-    data.update(reliable=[False, False], reasons=[["blind"], ["too short", "noisy"]])
+    data.update(reliable=[False, False], findings=[["blind"], ["too short", "noisy"]])
     path.write_text(json.dumps(data))
     capsys.readouterr()
     assert rsvib("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0

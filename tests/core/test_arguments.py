@@ -10,6 +10,7 @@ import torch
 
 import rsvib_torch as rsv
 from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor, checks_arguments
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.evaluation.scenes import city_and_fields
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
@@ -278,12 +279,12 @@ def test_path_of_starts_that_are_no_tensor(starts):
         VIBRATION.path(starts, torch.zeros(2))
 
 
-@pytest.mark.parametrize(("name", "value"), [("misfit_after", torch.zeros(2)), ("reasons", ())])
+@pytest.mark.parametrize(("name", "value"), [("misfit_after", torch.zeros(2)), ("findings", ())])
 def test_verdicts_of_contradicting_sizes(name, value):
     pair, axes = torch.ones(1), torch.ones(1, 2)
     values = dict.fromkeys(("before", "after", "noise", "chi_square", "predicted_gain"), pair)
     values |= dict.fromkeys(("misfit_before", "misfit_after", "resolution"), axes)
-    values |= {"outcome": ("unknown",), "reasons": ("no contrast",)}
+    values |= {"outcome": ("unknown",), "findings": ((Reason("no_contrast", "x"),),)}
     assert "pair" in rsv.RestorationVerdict(**values).summary()
     with pytest.raises(ValueError, match=f"{name} must have"):
         rsv.RestorationVerdict(**values | {name: value})

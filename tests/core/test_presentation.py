@@ -12,6 +12,7 @@ from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.reason import read_findings
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.report.results import VibrationFile
 
@@ -124,7 +125,7 @@ def test_reasons_tones_and_image_motion_are_printed(detection):
         vibration=vibration,
         std=replace(std, image_motion=torch.tensor([0.1, 0.1])),
         reliable=torch.tensor([True, False]),
-        reasons=((), ("no significant tone " * 8, "blind")),
+        findings=read_findings([[], ["no significant tone " * 8, "blind"]]),
     )
     lines = changed.summary().splitlines()
     assert [line.split()[0] for line in lines[1:4]] == ["x", "x", "y"]
@@ -327,7 +328,7 @@ def test_files_of_earlier_versions_lack_fields_with_a_default(tmp_path):
     path = tmp_path / "calibration.json"
     found.save(path)
     content = json.loads(path.read_text())
-    for name in ("candidates", "reliable", "reasons"):
+    for name in ("candidates", "reliable", "findings"):
         del content[name]
     path.write_text(json.dumps(content))
     again = rsv.RowTimeCalibration.load(path)

@@ -103,7 +103,8 @@ def test_unrelated_recording_is_not_reliable(frames, tmp_path):
     path = log(tmp_path / "other.csv", clock, 3 * np.stack([np.sin(170 * clock), np.cos(230 * clock**1.3)], -1))
     found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
     assert not found.reliable
-    assert any("does not explain" in reason for reason in found.reasons)
+    assert {reason.code for reason in found.findings} == {"recording_incomplete"}
+    assert all(reason.value > reason.limit for reason in found.findings)
 
 
 def test_periodic_motion_has_ambiguous_clock_offsets(tmp_path, scene):
@@ -115,7 +116,7 @@ def test_periodic_motion_has_ambiguous_clock_offsets(tmp_path, scene):
     path = log(tmp_path / "sine.csv", clock, Sine().displacement(clock))
     frames = torch.from_numpy(take_frames(scene, TIMING, Sine(), 3, 0.005)).float()
     found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
-    assert any("the motion repeats" in reason for reason in found.reasons)
+    assert "motion_repeats" in {reason.code for reason in found.findings}
     near = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"), offsets=(0.0, 0.015))
     assert near.reliable
     assert near.offset == pytest.approx(0.0, abs=1e-4)
@@ -224,20 +225,24 @@ def test_correct_motion_explains_the_offsets_and_wrong_motions_do_not(frames):
     times = np.arange(-0.01, 0.1, 5e-4)
     right = rsv.check_motion(frames.numpy(), TIMING, at(times))
     assert right.helps
-    assert right.reasons == ()
+    assert right.findings == ()
     assert (right.after < 0.1).all()
     assert (right.before > 1.0).all()
     curve = rsv.register_bands(frames, TIMING).offsets
     assert (right.before < curve.square().nanmean((0, 1)).sqrt()).all()
     half = rsv.check_motion(frames, TIMING, at(times, 0.4))
     assert half.helps
-    assert all("the motion leaves" in reason for reason in half.reasons)
-    assert len(half.reasons) == 2
+    assert [(reason.code, reason.axis) for reason in half.findings] == [
+        ("motion_leaves_offsets", "x"),
+        ("motion_leaves_offsets", "y"),
+    ]
+    assert [reason.limit for reason in half.findings] == pytest.approx((0.5 * half.before).tolist())
     wrong = rsv.check_motion(frames, TIMING, at(times, -1.0))
     assert not wrong.helps
-    assert all("further apart along" in reason for reason in wrong.reasons)
+    assert {reason.code for reason in wrong.findings} == {"motion_enlarges_offsets"}
     still = rsv.check_motion(frames, TIMING, at(times, 0.0))
     assert not still.helps
+    assert [reason.code for reason in still.findings][-1:] != []
 
 
 def test_axes_are_those_of_the_image(frames):

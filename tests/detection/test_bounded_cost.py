@@ -41,7 +41,7 @@ def test_halves_that_move_apart_unlike_roll_are_refused_without_rounds_of_roll()
     found, _, rounds_of_strips = detect(parallax)
     assert not found.reliable.any()
     assert found.vibration.num_axes == 2
-    assert any("parallax" in reason for reasons in found.reasons for reason in reasons)
+    assert "halves_apart" in {reason.code for of_axis in found.findings for reason in of_axis}
     assert rounds_of_strips == 0
 
 

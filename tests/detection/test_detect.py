@@ -61,7 +61,7 @@ def test_paper_pair(pairs, paper_camera, registration, case):
         assert error < limit
     assert result.vibration.amplitude.shape == (2, 1)
     assert result.reliable.tolist() == [True, True]
-    assert result.reasons == ((), ())
+    assert result.findings == ((), ())
     # 50 Hz has the gain +0.62, 30 Hz the gain -1.46: amplitudes stay positive, the sign is in the phase
     assert result.gain[:, 0].tolist() == pytest.approx([0.626, -1.461], abs=0.03)
     assert bool((result.vibration.amplitude > 0).all())
@@ -107,7 +107,7 @@ def test_no_tone_is_detected_without_vibration(paper_camera, registration, image
     result = detect_bands(noisy_frames(paper_camera, motion, 4, margin=60), paper_camera, registration=registration)
     assert bool((result.vibration.amplitude == 0).all())
     assert result.reliable.tolist() == [False, False]
-    assert all(any("no significant tone" in reason for reason in reasons) for reasons in result.reasons)
+    assert all("no_tone" in {reason.code for reason in of_axis} for of_axis in result.findings)
     assert result.vibration.image_motion.tolist() == pytest.approx(image_motion, abs=2.0)
 
 
@@ -120,7 +120,7 @@ def test_blind_frequency_is_refused(paper_camera, seed, multiple):
     assert not bool(result.reliable[0])
     # along the scan axis, second-order coupling makes a blind tone visible, too weakly for a reliable measurement
     assert not bool(result.reliable[1])
-    assert all(result.reasons)
+    assert all(result.findings)
 
 
 @pytest.mark.parametrize("registration", METHODS)
@@ -169,7 +169,7 @@ def test_batch_equals_single_stacks(paper_camera, registration):
             torch.testing.assert_close(getattr(one.std, name), getattr(alone.std, name), rtol=1e-3, atol=1e-6)
         torch.testing.assert_close(one.offsets.offsets, alone.offsets.offsets, rtol=0, atol=1e-4, equal_nan=True)
         torch.testing.assert_close(one.fitted, alone.fitted, rtol=0, atol=1e-4)
-        assert one.reasons == alone.reasons
+        assert one.findings == alone.findings
         assert one.reliable.tolist() == alone.reliable.tolist()
 
 

@@ -86,7 +86,9 @@ def test_columns_refuse_roll(rolling):
 def test_ignored_roll_is_named_as_the_reason(rolling):
     found = detect_vibration(rolling[1], TIMING, roll=False, zoom=False)
     assert not bool(found.reliable[0])
-    assert "roll='auto'" in " ".join(found.reasons[0])
+    (apart,) = (reason for reason in found.findings[0] if reason.code == "halves_apart")
+    assert apart.value > apart.limit
+    assert apart.details["remedy"] == "'auto'"
 
 
 def test_the_result_is_printed_saved_and_read(detection, tmp_path):
@@ -149,7 +151,8 @@ def test_free_motion_with_roll(rolling):
 def test_free_motion_without_roll_refuses_rolling_frames(rolling):
     found = detect_motion(rolling[1], TIMING)
     assert not bool(found.reliable[0])
-    assert "pass roll=True, zoom=True" in " ".join(found.reasons[0])
+    (apart,) = (reason for reason in found.findings[0] if reason.code == "halves_apart")
+    assert apart.details["remedy"] == "True"
 
 
 def test_free_motion_with_roll_in_other_orientation(rolling):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from truth import draw_scene
 
 import rsvib_torch as rsv
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.recorded.band_vectors import band_vectors
 from rsvib_torch.detection.recorded.rotation_alignment import align_rates
 from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
@@ -163,7 +164,7 @@ def test_dashboard_is_excluded():
 def test_mirrored_axes_are_refused(vectors):
     found = aligned(vectors, recorded(mirrored=-1.0))
     assert not found.reliable
-    assert any("mirrored axes xYZ fit better" in reason for reason in found.reasons)
+    assert Reason("axes_mirrored", details={"axes": "xYZ"}) in found.findings
 
 
 def test_recording_of_another_motion_is_refused(vectors):
@@ -172,13 +173,13 @@ def test_recording_of_another_motion_is_refused(vectors):
     smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in random.T], -1)
     found = aligned(vectors, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
     assert not found.reliable
-    assert any("does not explain" in reason for reason in found.reasons)
+    assert "recording_incomplete" in {reason.code for reason in found.findings}
 
 
 def test_rest_is_refused():
     found = rsv.align_motion(take(TIMING, 0.002), TIMING, recorded(size=0.002), camera=rsv.Camera(FOCAL_LENGTH))
     assert not found.reliable
-    assert any("too little" in reason for reason in found.reasons)
+    assert "recorded_motion_too_small" in {reason.code for reason in found.findings}
 
 
 def test_one_axis_alone_leaves_the_others_open(vectors):
@@ -194,7 +195,7 @@ def test_one_axis_alone_leaves_the_others_open(vectors):
     only_x = replace(vectors, offsets=torch.stack([-FOCAL_LENGTH * yaw, 0 * yaw], -1) + noise)
     found = aligned(only_x, rsv.AngularRates(rates.times, alone), rsv.Camera(FOCAL_LENGTH))
     assert not found.reliable
-    assert any("explain the frames as well: rotate the camera about all axes" in reason for reason in found.reasons)
+    assert "axes_ambiguous" in {reason.code for reason in found.findings}
 
 
 def test_arguments(frames):

@@ -81,7 +81,8 @@ def test_one_tone_has_a_row_time_for_every_number_of_turns(one_tone):
     """f P = k + phi: row times nu P / (k + phi), of which the camera has k = 1."""
     found = rsv.calibrate_row_time_by_motion(one_tone, frame_rate=RATE, row_time=(2e-5, 7.2e-5))
     assert not found.reliable
-    assert "row times explain the frames" in found.reasons[0]
+    assert [reason.code for reason in found.findings] == ["row_times_ambiguous"]
+    assert found.findings[0].value == len(found.candidates)
     turns = 131.0 / RATE
     expected = sorted(
         ROW_TIME * turns / (turns + k) for k in range(-20, 20) if 2e-5 <= abs(ROW_TIME * turns / (turns + k)) <= 7.2e-5
@@ -100,23 +101,23 @@ def test_limits_select_one_of_them(one_tone):
 
 
 @pytest.mark.parametrize(
-    ("frames", "reason"),
+    ("frames", "code"),
     [
-        (lambda moving: moving[:2], "two frames determine the product"),
-        (lambda moving: moving[:1] + 0.005 * torch.randn(4, HEIGHT, WIDTH), "no vibration"),
+        (lambda moving: moving[:2], "too_few_frames_for_row_time"),
+        (lambda moving: moving[:1] + 0.005 * torch.randn(4, HEIGHT, WIDTH), "no_motion_for_row_time"),
     ],
 )
-def test_what_is_not_identifiable_is_refused(two_tones, tmp_path, frames, reason):
+def test_what_is_not_identifiable_is_refused(two_tones, tmp_path, frames, code):
     torch.manual_seed(0)
     found = rsv.calibrate_row_time_by_motion(frames(two_tones), frame_rate=RATE)
     assert not found.reliable
     assert found.row_time is None
-    assert reason in found.reasons[0]
-    assert reason in found.summary()
+    assert [reason.code for reason in found.findings] == [code]
+    assert "not reliable" in found.summary()
     found.save(tmp_path / "row_time.json")
     loaded = rsv.RowTimeCalibration.load(tmp_path / "row_time.json")
     assert loaded.row_time is None
-    assert loaded.reasons == found.reasons
+    assert loaded.findings == found.findings
 
 
 def test_row_time_of_a_hand_held_camera_with_its_gyroscope(two_tones):

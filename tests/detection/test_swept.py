@@ -10,6 +10,7 @@ from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
+from rsvib_torch.core.reason import Reason
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 5
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
@@ -87,7 +88,7 @@ def test_two_frames_are_refused(scene):
     frames = torch.from_numpy(take_frames(scene, timing, steady, 3, 0.002, samples=8)).float()
     two = rsv.detect_swept_tone(frames[:2], timing)
     assert not two.reliable.any()
-    assert all("2 frames do not determine decay and sweep" in reasons[0] for reasons in two.reasons)
+    assert all(of_axis[0].code == "too_few_frames_for_sweep" for of_axis in two.findings)
     three = rsv.detect_swept_tone(frames, timing)
     assert three.reliable.all()
     for name, true in (("amplitude", 1.6), ("frequency", 90.0), ("decay", 0.0), ("chirp", 0.0)):
@@ -137,7 +138,7 @@ def test_axis_without_motion_has_no_tone(scene):
     frames = torch.from_numpy(take_frames(scene, TIMING, MotionAlongX(), 3, 0.005)).float()
     found = rsv.detect_swept_tone(frames, TIMING)
     assert found.amplitude[1] == 0
-    assert found.reasons[1] == ("no tone stands out",)
+    assert found.findings[1] == (Reason("no_tone", "y"),)
     assert found.frequency[0].item() == pytest.approx(45.0, rel=0.02)
 
 
@@ -162,7 +163,7 @@ def test_batch_equals_single_stacks(frames, found):
             assert torch.equal(getattr(one, name), getattr(single, name)), name
         assert all(torch.equal(one.std[name], single.std[name]) for name in single.std)
         assert torch.allclose(one.motion.displacement(times), single.motion.displacement(times), atol=1e-4)
-        assert one.reasons == single.reasons
+        assert one.findings == single.findings
 
 
 def test_command(frames, tmp_path, capsys):

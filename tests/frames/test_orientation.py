@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.frames.orientation import (
+    findings_from_row_order,
     frames_from_row_order,
     frames_to_row_order,
     magnitudes_from_row_order,
@@ -74,6 +76,9 @@ def test_values_without_a_sign_turn_with_the_displacements(scan_axis, direction,
     of_tones = torch.stack([in_rows, 10 * in_rows], -1)
     assert torch.equal(magnitudes_from_row_order(of_tones, camera, axis=-2), torch.stack([in_image, 10 * in_image], -1))
     assert sequence_from_row_order(in_rows[0].tolist(), camera) == tuple(in_image[0].tolist())
-    reasons = [f"component {axis}" for axis in range(num_axes)]
+    components = [f"component {axis}" for axis in range(num_axes)]
     expected = [1, 0, 2, 3] if scan_axis == -1 else [0, 1, 2, 3]
-    assert sequence_from_row_order(reasons, camera) == tuple(reasons[axis] for axis in expected[:num_axes])
+    assert sequence_from_row_order(components, camera) == tuple(components[axis] for axis in expected[:num_axes])
+    names = ("x", "y", "roll", "zoom")[:num_axes]
+    findings = [(Reason("no_tone", name), Reason("fit_not_converged")) for name in names]
+    assert findings_from_row_order(findings, camera) == tuple(findings)  # the first image axis is "x" in every order

@@ -19,6 +19,7 @@ import torch
 from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
 
 from rsvib_torch.commands.main import run_command
+from rsvib_torch.core.reason import Reason, read_findings
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.evaluation import resolution_chart
@@ -56,15 +57,15 @@ def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
         gain,
         torch.zeros(2).double(),
         torch.tensor(reliable),
-        reasons,
+        read_findings(reasons),
         TimingSensitivity(*[gain] * 6),
         (),
     )
 
 
-def verdict_of(outcome, reason=""):
+def verdict_of(outcome, *reasons):
     pair, one = torch.zeros(1, 2), torch.full((1,), 3.0)
-    return RestorationVerdict(one, one, pair, pair, pair, one, one, one, (outcome,), (reason,))
+    return RestorationVerdict(one, one, pair, pair, pair, one, one, one, (outcome,), (reasons,))
 
 
 def report_of(**changes):
@@ -262,10 +263,10 @@ def test_edges_are_measured_in_both_frames():
     ("reliable", "verdict", "restored", "mood", "first"),
     [
         ((True, True), verdict_of("helps"), True, "good", "restoration improves the frames"),
-        ((True, False), verdict_of("partly", "y: apart"), True, "doubt", "removed in part"),
+        ((True, False), verdict_of("partly", Reason("no_contrast", "y")), True, "doubt", "removed in part"),
         (
             (True, True),
-            verdict_of("unknown", "alike"),
+            verdict_of("unknown", Reason("nothing_undone")),
             True,
             "doubt",
             "not sufficient to determine whether",
@@ -273,7 +274,7 @@ def test_edges_are_measured_in_both_frames():
         ((True, True), None, True, "doubt", "not sufficient to determine whether"),
         (
             (True, True),
-            verdict_of("worse", "x: apart"),
+            verdict_of("worse", Reason("no_contrast", "x")),
             False,
             "bad",
             "Restoration does not improve the frames; they are unchanged",
@@ -356,7 +357,7 @@ def test_page_without_restoration_has_no_pairs_but_what_was_tried(tmp_path):
     reasons = (("tone of 71 Hz is nearly blind",), ())
     report = report_of(
         detection=result_of(reliable=(False, True), reasons=reasons),
-        verdict=verdict_of("worse", "y: frames lie 2 px apart, 2 px remain unexplained"),
+        verdict=verdict_of("worse", Reason("motion_remains", "y", 2.0, 1.6, {"before": 2.0})),
         was_restored=False,
         next_steps=(("Inspect the restored frames nevertheless:", "rsvib report a&b.tif out --force"),),
     )

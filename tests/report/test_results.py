@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from rsvib_torch.core.reason import Reason, read_findings
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.motion.timing import SensorTiming
@@ -46,7 +47,7 @@ def draw_result() -> DetectionResult:
     curve = OffsetCurve(torch.tensor([[0, 1], [1, 2]]), rows, times, later, offsets, quality, (32, 32))
     residual = (offsets - fitted).abs().nanmean((0, 1))
     gain = vibration.gain(TIMING.frame_period)
-    reasons = ((), ("only one period is seen",))
+    findings = read_findings([[], ["only one period is seen"]])
     return DetectionResult(
         vibration,
         std,
@@ -55,7 +56,7 @@ def draw_result() -> DetectionResult:
         gain,
         residual,
         torch.tensor([True, False]),
-        reasons,
+        findings,
         TimingSensitivity(*[gain] * 6),
         ("row_time=2e-05 s: assumed",),
     )
@@ -144,19 +145,22 @@ def test_files_that_are_not_vibration_json(tmp_path, text):
 def test_restoration_json(tmp_path):
     pair = torch.tensor([[0.1, math.nan]], dtype=torch.float64)
     one = torch.tensor([math.nan], dtype=torch.float64)
-    verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ("x: frames lie apart",))
+    remains = Reason("motion_remains", "x", 3.0, 1.6, {"before": 2.0})
+    verdict = RestorationVerdict(one, one, pair, pair, pair, one, one, one, ("worse",), ((remains,),))
     options = {"method": "exact", "joint": True}
+    left_alone = Reason("axis_not_reliable", "y", details={"action": "restored", "why": "blind"})
     path = tmp_path / "restoration.json"
     frames = torch.rand(2, 8, 8)
-    write_restoration(path, RestoredFrames(frames, False, ("y is not restored",), verdict, True), options)
+    write_restoration(path, RestoredFrames(frames, False, (left_alone,), verdict, True), options)
     data = json.loads(path.read_text())
     assert data["frames"] == "as taken"
     assert data["options"] == options
-    assert data["left_alone"] == ["y is not restored"]
+    assert data["left_alone"] == [left_alone.to_dict()]
     assert data["outcome"] == "worse"
-    assert data["summary"] == "restored is no better than raw: x: frames lie apart"
+    assert data["summary"] == f"restored is no better than raw: x: {remains}"
     assert data["pairs"]["misfit_before"] == [[0.1, None]]
-    assert data["pairs"]["reasons"] == ["x: frames lie apart"]
+    (found,) = data["pairs"]["findings"][0]
+    assert (found["code"], found["axis"], found["value"], found["limit"]) == ("motion_remains", "x", 3.0, 1.6)
     write_restoration(path, RestoredFrames(frames, True, (), None, True), {})
     assert json.loads(path.read_text())["outcome"] is None
 

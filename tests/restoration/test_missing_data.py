@@ -9,6 +9,7 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.restoration import judge_restoration, restore
 
 SCENE, MOTION, NOISE = draw_scene(272, 240, seed=12), Motion(), 0.01
@@ -105,7 +106,7 @@ def test_pairs_with_a_frame_without_data_are_not_judged():
         found = restore(frames, camera(), MOTION.vibration())
     verdict = judge_restoration(frames, found, camera(), MOTION.vibration())
     assert verdict.outcome == ("helps", "unknown")
-    assert "100 % of the pixels are missing" in verdict.reasons[1]
+    assert verdict.findings[1] == (Reason("pixels_missing", None, 1.0, 0.5),)
 
 
 def test_stacks_of_a_batch_are_independent():

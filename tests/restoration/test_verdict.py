@@ -9,9 +9,10 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration import RestorationWarning, judge_restoration, predict_noise_gain, restore
-from rsvib_torch.restoration.verdict.judge import _outcome
+from rsvib_torch.restoration.verdict.judge import outcome_of_pair
 from rsvib_torch.restoration.verdict.pairs import misfit, pairs_to_judge
 
 HEIGHT, WIDTH, MARGIN = 512, 192, 40
@@ -218,8 +219,7 @@ def test_transposed_frames_have_the_same_verdict_with_swapped_axes(scene):
     verdict, _ = judged(frames.transpose(-2, -1), turned, swapped)
     torch.testing.assert_close(verdict.misfit_after, upright.misfit_after.flip(-1), rtol=1e-3, atol=1e-3)
     assert upright.outcome == verdict.outcome == ("partly",)
-    assert upright.reasons[0].startswith("x: ")
-    assert verdict.reasons[0].startswith("y: ")
+    assert [[reason.axis for reason in one.findings[0]] for one in (upright, verdict)] == [["x"], ["y"]]
 
 
 def test_colour_integers_and_missing_pixels_are_judged(scene):
@@ -344,7 +344,7 @@ def test_invalid_arguments_are_named(change, error, message):
 
 
 def outcome(before, after, gain=5.0, *, resolution=(0.01, 0.01), moves=(True, True), offset=(1.0, 1.0), **options):
-    return _outcome([*before], [*after], [*resolution], [*moves], [*offset], gain, **options)
+    return outcome_of_pair([*before], [*after], [*resolution], [*moves], [*offset], gain, **options)
 
 
 @pytest.mark.parametrize(
@@ -376,9 +376,9 @@ def outcome(before, after, gain=5.0, *, resolution=(0.01, 0.01), moves=(True, Tr
     ],
 )
 def test_outcome_of_a_pair(before, after, options, expected):
-    found, reason = outcome(before, after, **options)
+    found, reasons = outcome(before, after, **options)
     assert found == expected
-    assert (reason == "") == (found == "helps")
+    assert (reasons == ()) == (found == "helps")
 
 
 @pytest.mark.parametrize("noise", [0.005, 0.08])
@@ -394,15 +394,16 @@ def test_the_gain_never_contradicts_the_outcome(scene, noise, factor):
 
 
 def test_reasons_name_the_axes_of_the_outcome():
-    found, reason = outcome((2.0, 2.0), (1.0, 3.0), 0.0)
-    assert (found, reason) == ("worse", "y: frames lie 2 px apart, 3 px remain unexplained")
-    found, reason = outcome((2.0, 2.0), (1.0, 1.1), 0.0)
-    assert (
-        reason
-        == "x: frames lie 2 px apart, 1 px remain unexplained; y: frames lie 2 px apart, 1.1 px remain unexplained"
-    )
-    assert "all are displaced alike" in outcome((0.0, 0.0), (0.0, 0.0), offset=(0.0, 0.0))[1]
-    assert "no contrast" in outcome((0.0, 0.0), (0.0, 0.0), resolution=(math.inf, math.inf))[1]
+    found, reasons = outcome((2.0, 2.0), (1.0, 3.0), 0.0)
+    assert (found, reasons) == ("worse", (Reason("motion_remains", "y", 3.0, 1.6, {"before": 2.0}),))
+    found, reasons = outcome((2.0, 2.0), (1.0, 1.1), 0.0)
+    assert found == "partly"
+    assert [(one.code, one.axis, one.value, one.limit) for one in reasons] == [
+        ("motion_remains", "x", 1.0, 0.7),
+        ("motion_remains", "y", 1.1, 0.7),
+    ]
+    assert {one.code for one in outcome((0.0, 0.0), (0.0, 0.0), offset=(0.0, 0.0))[1]} == {"displaced_alike"}
+    assert {one.code for one in outcome((0.0, 0.0), (0.0, 0.0), resolution=(math.inf, math.inf))[1]} == {"no_contrast"}
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.5, 0.0), (0.0, -1.5), (3.0, 2.0)])

@@ -13,7 +13,8 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.presentation import JudgedResult
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.recorded.band_vectors import band_vectors
@@ -22,10 +23,12 @@ from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment,
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import (
     magnitudes_from_row_order,
     offsets_from_row_order,
+    reasons_from_row_order,
     sequence_from_row_order,
 )
 from rsvib_torch.io.stack_reading import FramesOrFiles
@@ -40,7 +43,7 @@ __all__ = ["ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClockAlignment(
-    Result,
+    JudgedResult,
     units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"},
     shapes={"drift": "2", "unexplained": "2"},
 ):
@@ -56,7 +59,7 @@ class ClockAlignment(
         drift: (2,) px/s that the recording does not contain, as gyroscopes drift.
         unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
         reliable: Whether the recording explains the measurements, at this offset only.
-        reasons: Why not.
+        findings: Each ``Reason`` why not; ``reasons`` has their texts.
 
     Example:
         >>> import torch
@@ -81,7 +84,7 @@ class ClockAlignment(
     drift: Tensor
     unexplained: Tensor
     reliable: bool
-    reasons: tuple[str, ...]
+    findings: tuple[Reason, ...]
 
     def summary(self) -> str:
         """Offset and scale of the clock with standard deviations, gain, drift, and the verdict."""
@@ -270,7 +273,7 @@ def align_motion(
     gradient = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
     offset_std = float((gradient @ covariance[:2, :2] @ gradient / independent).clamp(min=0.0).sqrt())
     rest = measured.unexplained(residual)[0]
-    reasons = _reasons(rest, rms_motion(measured, aligned), other)
+    reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
     drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
     gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
     in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))
@@ -284,7 +287,7 @@ def align_motion(
         drift=drift,
         unexplained=magnitudes_from_row_order(rest, timing),
         reliable=not reasons,
-        reasons=tuple(reasons),
+        findings=reasons_from_row_order(reasons, timing),
     )
 
 
@@ -399,18 +402,3 @@ def fit_clock(
         if bool((change.abs() <= 1e-3 * covariance.diagonal().sqrt()).all()):
             break
     return clock, covariance, row_time
-
-
-def _reasons(unexplained: Tensor, size: Tensor, other: float | None) -> list[str]:
-    """Reasons against an alignment: rms motion ``size`` (2,) too small, residual too large, or another offset."""
-    reasons = []
-    if float(size.amax()) < 0.05:
-        reasons.append(
-            f"the recorded motion moves rows by {float(size.amax()):.2g} px between frames: below 0.05 px, too little"
-        )
-    for axis, name in enumerate(("along the rows", "across the rows")):
-        if float(unexplained[axis]) > max(0.25 * float(size[axis]), 0.05):
-            reasons.append(f"rows move by {float(unexplained[axis]):.3g} px {name} that the recording does not explain")
-    if other is not None:
-        reasons.append(f"an offset of {other:.6g} s explains the frames as well: the motion repeats")
-    return reasons

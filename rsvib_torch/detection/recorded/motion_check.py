@@ -12,7 +12,8 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
@@ -32,7 +33,7 @@ _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionCheck(
-    Result,
+    JudgedResult,
     units={"before": "px", "after": "px", "times": "s", "offsets": "px", "residual": "px"},
     shapes={"before": "2", "after": "2", "times": "N", "offsets": "N 2", "residual": "N 2"},
 ):
@@ -43,7 +44,7 @@ class MotionCheck(
             best: the others may be clouds or registration errors.
         after: (2,) px, the same of the offsets less those of the motion.
         helps: Whether the motion reduces the offsets, both axes together.
-        reasons: Reasons against the motion.
+        findings: Each ``Reason`` against the motion; ``reasons`` has their texts.
         times: (N,) s, exposure starts of the registered row bands in the earlier frame of their pair.
         offsets: (N, 2) px, offsets of these bands, axes (x, y).
         residual: (N, 2) px, these offsets less those of the motion.
@@ -64,7 +65,7 @@ class MotionCheck(
     before: Tensor
     after: Tensor
     helps: bool
-    reasons: tuple[str, ...]
+    findings: tuple[Reason, ...]
     times: Tensor
     offsets: Tensor
     residual: Tensor
@@ -142,18 +143,18 @@ def check_motion(
     residual = offsets - _offsets(_averaged(turned, measured))
     used = measured.weights[0].amin(-1) > 0
     before, after = (offsets_from_row_order(_rms(values[used]), timing).abs() for values in (offsets, residual))
-    reasons = []
-    for axis, name in enumerate("xy"):
-        moved, rest = float(before[axis]), float(after[axis])
-        if rest > moved + _MIN_CHANGE:
-            reasons.append(
-                f"rows are further apart along {name} without the motion: {rest:.3g} px instead of {moved:.3g} px"
-            )
-        elif rest > max(0.5 * moved, _MIN_CHANGE) and moved > 2 * _MIN_CHANGE:
-            reasons.append(f"the motion leaves {rest:.3g} px of the {moved:.3g} px that rows move along {name}")
+    findings = []
+    for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
+        largest, expected = moved + _MIN_CHANGE, max(0.5 * moved, _MIN_CHANGE)
+        if rest > largest:
+            findings.append(Reason("motion_enlarges_offsets", name, rest, largest, {"moved": moved}))
+        elif rest > expected and moved > 2 * _MIN_CHANGE:
+            findings.append(Reason("motion_leaves_offsets", name, rest, expected, {"moved": moved}))
     of_bands = (offsets_from_row_order(values[used], timing) for values in (offsets, residual))
-    helps = float(after.norm()) < float(before.norm())
-    return MotionCheck(before, after, helps, tuple(reasons), measured.exposure_starts[0, used, 0], *of_bands)
+    rest, moved = float(after.norm()), float(before.norm())
+    if rest >= moved and not findings:
+        findings.append(Reason("offsets_not_reduced", None, rest, moved))
+    return MotionCheck(before, after, rest < moved, tuple(findings), measured.exposure_starts[0, used, 0], *of_bands)
 
 
 def _offsets(displacements: Tensor) -> Tensor:

@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.presentation import JudgedResult
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.detection.recorded.band_vectors import BandVectors
 from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
 from rsvib_torch.detection.recorded.rotation_search import OrientationSearch, orientation_matrix, search_orientations
+from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
@@ -23,10 +25,12 @@ from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["RotationAlignment", "align_rates"]
 
+_MAX_FOCAL_LENGTH_STD, _MAX_ROW_TIME_STD = 0.05, 0.2  # of the value; less accurate ones are not determined
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RotationAlignment(
-    Result,
+    JudgedResult,
     units={
         "offset": "s",
         "offset_std": "s",
@@ -75,7 +79,7 @@ class RotationAlignment(
         measured: (P, 3) px, px, rad: X, Y and roll between consecutive frames, from the images.
         predicted: (P, 3) The same by the gyroscope.
         reliable: Whether the gyroscope explains the frames, with this clock and these axes only.
-        reasons: Why not.
+        findings: Each ``Reason`` why not; ``reasons`` has their texts.
 
     Example:
         >>> import torch
@@ -115,7 +119,7 @@ class RotationAlignment(
     measured: Tensor
     predicted: Tensor
     reliable: bool
-    reasons: tuple[str, ...]
+    findings: tuple[Reason, ...]
 
     def summary(self) -> str:
         """Clock, axes, bias and focal length with standard deviations, what is not explained, and the verdict."""
@@ -205,12 +209,12 @@ def _result(
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
-    if float(steps[inside].amax()) > 4 * float(steps.median()):
-        reasons.append(f"the recording has a gap of {float(steps[inside].amax()):.3g} s within the frames")
-    if row_time * height > float(starts.diff().amin()):
-        reasons.append(
-            f"the readout of {height} rows of {1e6 * row_time:.4g} us is longer than the interval between frames"
-        )
+    longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
+    if longest > allowed:
+        reasons.append(Reason("gap_in_recording", None, longest, allowed))
+    readout, shortest = row_time * height, float(starts.diff().amin())
+    if readout > shortest:
+        reasons.append(Reason("readout_too_long", None, readout, shortest, {"rows": height}))
     return RotationAlignment(
         motion=_motion(fit, clock),
         orientation=model.orientation,
@@ -232,7 +236,7 @@ def _result(
         measured=predicted + fit.effects * units,
         predicted=predicted,
         reliable=not reasons,
-        reasons=tuple(reasons),
+        findings=tuple(reasons),
     )
 
 
@@ -258,39 +262,25 @@ def _reasons(
     moved: Tensor,
     unexplained: Tensor,
     std: Tensor,
-) -> list[str]:
+) -> list[Reason]:
     """Reasons against an alignment."""
-    reasons = []
-    if float(moved[:2].amax()) < 0.05:
-        reasons.append(
-            f"the recorded rotation moves the image by {float(moved[:2].amax()):.2g} px between frames, too little"
-        )
-    for axis, name in enumerate(("X", "Y")):
-        if float(unexplained[axis]) > max(0.25 * float(moved[axis]), 0.05):
-            reasons.append(
-                f"frames move by {float(unexplained[axis]):.2g} px along {name.lower()} that the gyroscope does not "
-                f"explain, and by {float(moved[axis]):.2g} px that it does"
-            )
+    reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), search.other_offset)
     if search.mirrored is not None:
-        reasons.append(
-            f"the mirrored axes {search.mirrored} fit better than every rotation: the frames are mirrored, or the "
-            "recording has left-handed axes"
-        )
-    if search.other_offset is not None:
-        reasons.append(f"an offset of {search.other_offset:.6g} s explains the frames as well: the motion repeats")
+        reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
     others = _other_axes(fit, search, free)
     if others:
-        reasons.append(f"the axes {', '.join(others)} explain the frames as well: rotate the camera about all axes")
-    if float(std[5]) > 0.05 * float(fit.parameters[5]):
+        reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(others)}))
+    focal_length, row_time = fit.parameters[5:7].tolist()
+    focal_length_std, row_time_std = std[5:7].tolist()
+    if focal_length_std > _MAX_FOCAL_LENGTH_STD * focal_length:
+        allowed = _MAX_FOCAL_LENGTH_STD * focal_length
         reasons.append(
-            f"the focal length is not determined, {float(fit.parameters[5]):.4g} ± {float(std[5]):.2g} px: give camera="
+            Reason("focal_length_uncertain", None, focal_length_std, allowed, {"focal_length": focal_length})
         )
-    if free[6] and float(std[6]) > 0.2 * float(fit.parameters[6]):
-        reasons.append(
-            f"the row time is not determined, {1e6 * float(fit.parameters[6]):.3g} ± {1e6 * float(std[6]):.2g} us"
-        )
+    if free[6] and row_time_std > _MAX_ROW_TIME_STD * row_time:
+        reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
     if not math.isfinite(float(std.sum())):
-        reasons.append("the fit does not converge")
+        reasons.append(Reason("fit_not_converged"))
     return reasons
 
 

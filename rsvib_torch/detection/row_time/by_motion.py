@@ -12,12 +12,14 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
 from rsvib_torch.detection.row_time.by_recording import row_time_of_recording
 from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, rows_of_frames
 from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -26,6 +28,7 @@ from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOpti
 __all__ = ["calibrate_row_time_by_motion"]
 
 MAX_RELATIVE_STD = 0.01  # of the row time; frequencies and the distortion of frames have the same relative error
+_MIN_FRAMES = 3  # two frames determine the product of row time and frequency only
 SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 
 
@@ -86,7 +89,7 @@ def calibrate_row_time_by_motion(
 
     Returns:
         Row time with its standard deviation, readout direction, and the exposure where it is known. ``reliable`` is
-        False, with ``reasons``, if the row time is not determined; it is None if nothing is known about it.
+        False, with ``findings``, if the row time is not determined; it is None if nothing is known about it.
 
     Raises:
         TypeError: If an argument is not a number, or frames are not.
@@ -103,8 +106,8 @@ def calibrate_row_time_by_motion(
         >>> f"{1e6 * found.row_time:.2f} us, {found.readout_direction}"
         '60.00 us, forward'
         >>> two = rsv.calibrate_row_time_by_motion(frames[:2], frame_rate=timing.frame_rate)
-        >>> two.reliable, two.reasons[0]
-        (False, 'two frames determine the product of row time and frequency only: use three or more')
+        >>> two.reliable, two.findings[0].code
+        (False, 'too_few_frames_for_row_time')
     """
     period = 1 / check_number("frame_rate", frame_rate, above=0.0)
     if readout_direction is not None:
@@ -139,28 +142,20 @@ def calibrate_row_time_by_motion(
         places = _measured_freely(stack, clock, options, curve)
         turned = recorded.to_row_order(sensor).to(stack.images.device)
         found = row_time_of_recording(places, turned, clock, num_frames, offsets=offsets, fit_gain=fit_gain)
-        return _result(found, clock, notes)
-    if num_frames < 3:
-        found = _undetermined("two frames determine the product of row time and frequency only: use three or more")
-        return _result(found, clock, notes)
-    by_tones = row_time_of_tones(stack, clock, options, bands)
-    if by_tones is not None and not by_tones.reasons:
-        return _result(by_tones, clock, notes)
-    places = _measured_freely(stack, clock, options, curve)
-    spline = row_time_of_splines(places, num_rows, low, high, directions)
-    if spline is not None and spline.std < MAX_RELATIVE_STD * abs(spline.row_time):
-        notes.append(f"the motion is no sum of few tones: a spline with knots {1e3 * spline.spacing:.3g} ms apart")
-        return _result(RowTimeFit(spline.row_time, spline.std, spline.others, None, None, ()), clock, notes)
-    if by_tones is not None:
-        return _result(by_tones, clock, notes)
-    return _result(
-        _undetermined(
-            "no vibration, and no motion that is smooth over the blanking time, determines the row time: shake the "
-            "camera while it records, and use more frames"
-        ),
-        clock,
-        notes,
-    )
+    elif num_frames < _MIN_FRAMES:
+        found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
+    else:
+        by_tones = row_time_of_tones(stack, clock, options, bands)
+        found = by_tones or _undetermined(Reason("no_motion_for_row_time"))
+        if found.findings:
+            places = _measured_freely(stack, clock, options, curve)
+            spline = row_time_of_splines(places, num_rows, low, high, directions)
+            if spline is not None and spline.std < MAX_RELATIVE_STD * abs(spline.row_time):
+                notes.append(
+                    f"the motion is no sum of few tones: a spline with knots {1e3 * spline.spacing:.3g} ms apart"
+                )
+                found = RowTimeFit(spline.row_time, spline.std, spline.others, None, None, ())
+    return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)
 
 
 def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) -> tuple[float, float]:
@@ -200,26 +195,20 @@ def _measured_freely(
     return rows_of_frames(measured, clock.period, timing.row_time, clock.num_rows)
 
 
-def _undetermined(reason: str) -> RowTimeFit:
+def _undetermined(reason: Reason) -> RowTimeFit:
     return RowTimeFit(math.nan, math.nan, (), None, None, (reason,))
 
 
 def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:
     """The calibration with its verdict."""
-    reasons = list(found.reasons)
+    findings = list(found.findings)
     known = math.isfinite(found.row_time)
     if found.others:
         listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in found.others[:8])
-        reasons.append(
-            f"{len(found.others) + 1} row times explain the frames: {1e6 * found.row_time:.4f} us as well as {listed} "
-            "us (negative: reverse readout); pass row_time=(low, high) with limits around the right one, or use frames "
-            "with vibrations of other, unrelated frequencies"
-        )
+        details: dict[str, float | str] = {"row_time": 1e6 * found.row_time, "others": listed}
+        findings.append(Reason("row_times_ambiguous", None, len(found.others) + 1, 1, details))
     if known and found.std > MAX_RELATIVE_STD * abs(found.row_time):
-        reasons.append(
-            f"the standard deviation is {found.std / abs(found.row_time):.2g} of the row time, and "
-            f"{MAX_RELATIVE_STD:g} is allowed: the motion is too small, or nearly the same in all frames"
-        )
+        findings.append(Reason("row_time_uncertain", None, found.std / abs(found.row_time), MAX_RELATIVE_STD))
     exposure, exposure_std = (found.exposure_time, found.exposure_std) if known else (None, None)
     if clock.exposure_time is not None:
         exposure, exposure_std = clock.exposure_time, 0.0
@@ -239,6 +228,6 @@ def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeC
         exposure_time_std=exposure_std,
         notes=tuple(notes),
         candidates=tuple(sorted((found.row_time, *(one.row_time for one in found.others)))) if known else (),
-        reliable=not reasons,
-        reasons=tuple(reasons),
+        reliable=not findings,
+        findings=tuple(findings),
     )

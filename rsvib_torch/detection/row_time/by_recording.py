@@ -6,12 +6,14 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from dataclasses import replace
 
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.recorded.alignment import FittedClock, best_offset, fit_clock
 from rsvib_torch.detection.recorded.clock_range import offset_range
 from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces
 from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion
+from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.motion.spline import FreeMotion
 
 __all__ = ["row_time_of_recording"]
@@ -69,7 +71,7 @@ def row_time_of_recording(
             size = float(weighted.square(residual).sum() / weighted.num_measurements.sum().clamp(min=1.0))
             found.append((size, Candidate(row_time, std, 0.0), fitted))
     if not found:
-        return RowTimeFit(math.nan, math.nan, (), None, None, ("the recording does not explain the frames",))
+        return RowTimeFit(math.nan, math.nan, (), None, None, (Reason("recording_explains_nothing"),))
     found.sort(key=lambda one: one[0])
     size, best, fitted = found[0]
     known = float(places.measurements.num_measurements.sum())
@@ -82,13 +84,5 @@ def row_time_of_recording(
     _, other = best_offset(measured, recorded, low, high, timing)
     aligned = fitted.motion(recorded)
     rest, moved = measured.unexplained(residual_of_motion(measured, aligned))[0], rms_motion(measured, aligned)
-    reasons = [
-        f"rows move by {float(rest[axis]):.2g} px {name} that the recording does not explain"
-        for axis, name in enumerate(("along the rows", "across the rows"))
-        if float(rest[axis]) > max(0.25 * float(moved[axis]), 0.05)
-    ]
-    if float(moved.amax()) < 0.05:
-        reasons.append(f"the recorded motion moves rows by {float(moved.amax()):.2g} px between frames, too little")
-    if other is not None:
-        reasons.append(f"an offset of {other:.6g} s explains the frames as well: the motion repeats")
+    reasons = recording_reasons(moved.tolist(), rest.tolist(), other)
     return RowTimeFit(best.row_time, best.std, others, None, None, tuple(reasons))

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.refinement import refine
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_frames
@@ -25,6 +27,7 @@ from rsvib_torch.detection.rows.measured_rows import whole_rows
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of, shrunk_motion
 from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
+from rsvib_torch.detection.verdict import residual_reasons
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration import OffsetCurve, RegistrationOptions
@@ -75,7 +78,7 @@ class RowTimeFit:
         others: Other row times that explain the frames as well.
         exposure_time: In s, measured from the blur; None if it was not.
         exposure_std: Its standard deviation.
-        reasons: Why the row time is not certain.
+        findings: Reasons why the row time is not certain.
     """
 
     row_time: float
@@ -83,7 +86,7 @@ class RowTimeFit:
     others: tuple[Candidate, ...]
     exposure_time: float | None
     exposure_std: float | None
-    reasons: tuple[str, ...]
+    findings: tuple[Reason, ...]
 
 
 def turned(stack: GreyFrames, direction: float) -> GreyFrames:
@@ -144,9 +147,9 @@ def row_time_of_tones(
             results.pop()
             if all(abs(possible[0].row_time / one - 1) > 0.01 for one in tried):
                 starts.insert(0, possible[0].row_time)
-        elif not results[-1].reasons:
+        elif not results[-1].findings:
             return results[-1]
-    return min(results, key=lambda one: len(one.reasons), default=None)
+    return min(results, key=lambda one: len(one.findings), default=None)
 
 
 def _possible(tones: list[RowTones], clock: CameraClock, direction: float = 1.0) -> list[Candidate]:
@@ -189,17 +192,14 @@ class _Direct:
         """The row time with the reasons against it."""
         measured = self.places.timed(abs(self.row_time))
         residual = residual_of(measured, self.fit)
-        unexplained, correlated = measured.unexplained(residual)[0], measured.correlated(residual)[0]
-        reasons = []
-        for axis in range(2):
-            size = float(self.other_motion.size[0, axis])
-            # limits of the verdict on a vibration (docs/verdicts.md)
-            if float(unexplained[axis]) > max(0.05, 0.006 * size) or float(correlated[axis]) > max(0.01, 0.0025 * size):
-                reasons.append(
-                    f"rows move by {float(unexplained[axis]):.2g} px along {'xy'[axis]} that no tone explains"
-                )
-            if int(self.fit.active[0, axis].sum()) >= MAX_TONES:
-                reasons.append(f"{MAX_TONES} tones along {'xy'[axis]}: the motion is not a sum of few tones")
+        other = {"unexplained": measured.unexplained(residual)[0], "correlated": measured.correlated(residual)[0]}
+        other |= {"size": self.other_motion.size[0], "permitted": self.other_motion.permitted[0]}
+        reasons: list[Reason] = []
+        for axis, name in enumerate(AXIS_NAMES[:2]):
+            reasons += residual_reasons(name, {quantity: float(values[axis]) for quantity, values in other.items()})
+            count = int(self.fit.active[0, axis].sum())
+            if count >= MAX_TONES:
+                reasons.append(Reason("too_many_tones", name, count, MAX_TONES))
         others = tuple(
             one
             for one in (_as_good_as_the_first(possible) if possible else [])

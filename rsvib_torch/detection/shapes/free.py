@@ -20,20 +20,21 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
-from rsvib_torch.core.presentation import Result, axis_rows, verdict_table
+from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.reliability import against_rotation
 from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
 from rsvib_torch.detection.rows.measured_rows import MeasuredRows, RowRecord, StripRows, strip_rows
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
+from rsvib_torch.detection.verdict import rotation_reasons
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
+    findings_from_row_order,
     magnitudes_from_row_order,
     offsets_from_row_order,
-    sequence_from_row_order,
 )
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.field import ColumnMotion
@@ -52,13 +53,15 @@ __all__ = [
     "residual_of_motion",
     "rms_motion",
     "start_curve",
-    "unexplained_reason",
+    "unexplained_reasons",
 ]
+
+_MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionDetection(
-    Result,
+    JudgedResult,
     units={
         "times": "s",
         **dict.fromkeys(("displacement", "std", "std_seen", "unseen", "unexplained"), "px; of roll rad, of zoom 1"),
@@ -67,7 +70,7 @@ class MotionDetection(
         "times": "T R",
         **dict.fromkeys(("displacement", "std"), "... T R A"),
         **dict.fromkeys(("std_seen", "unseen", "unexplained", "reliable"), "... A"),
-        "reasons": "...",
+        "findings": "...",
     },
 ):
     """A motion of any shape with its uncertainty. A batch of stacks leads all tensors but ``times``.
@@ -88,7 +91,8 @@ class MotionDetection(
         unseen: (..., 2) px, rms standard deviation of that mean, the warp.
         unexplained: (..., 2) px, rms displacement of rows that the motion does not explain, beyond their noise.
         reliable: (..., 2) bool, whether the motion explains the measurements.
-        reasons: Why not, for each axis (x, y); a tuple of those for a batch.
+        findings: Each ``Reason`` why not, for each axis (x, y); a tuple of those for a batch. ``reasons`` has their
+            texts.
 
     Example:
         >>> import torch
@@ -113,7 +117,7 @@ class MotionDetection(
     unseen: Tensor
     unexplained: Tensor
     reliable: Tensor
-    reasons: tuple[Any, ...]
+    findings: tuple[Any, ...]
 
     def summary(self) -> str:
         """Size of the motion of each axis with its standard deviations, and the verdict."""
@@ -372,7 +376,7 @@ def rms_motion(measured: Measurements, motion: Motion) -> Tensor:
     return moved.square().sum(1).div(measured.num_differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
 
 
-def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> tuple[list[str], list[str]]:
+def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the offsets of row bands contradict.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
@@ -388,20 +392,14 @@ def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75
     count = math.ceil(counted * len(rest))
     residual = rest.abs().sort(dim=0).values[:count].mean(0).tolist()
     allowed = [max(0.1, 0.3 * axis) for axis in size]  # px; smaller ones are errors of registration, as for tones
-    first, second = (
-        [f"the offsets of row bands differ by {rest:.3g} px from it, {most:.3g} px are allowed: noise hides the scene"]
-        if rest > most
-        else []
-        for rest, most in zip(residual, allowed, strict=True)
-    )
-    return first, second
+    compared = zip(AXIS_NAMES, residual, allowed, strict=False)
+    return [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
 
 
-def unexplained_reason(residual: Tensor, moved: Tensor, model: str) -> list[str]:
-    """Reason against a fit whose rms ``residual`` in px exceeds 15 % of the rms motion ``moved``, and 0.03 px."""
-    if float(residual) <= max(0.15 * float(moved), 0.03):
-        return []
-    return [f"rows move by {float(residual):.3g} px that no {model} explains"]
+def unexplained_reasons(axis: str, residual: float, moved: float, model: str) -> list[Reason]:
+    """Reasons against a fit whose rms ``residual`` in px exceeds 15 % of the rms motion ``moved``, and 0.03 px."""
+    allowed = max(0.15 * moved, 0.03)  # px
+    return [Reason("motion_unexplained", axis, residual, allowed, {"model": model})] if residual > allowed else []
 
 
 def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
@@ -599,7 +597,7 @@ def _report(
     timing: SensorTiming,
     starts: Tensor,
     scale: FieldScale,
-    of_bands: list[list[str]],
+    of_bands: list[list[Reason]],
     apart: Tensor,
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at up to 32 rows of every frame.
@@ -632,17 +630,15 @@ def _report(
     value = motion.displacement(times)
     value = value - value.mean((0, 1))
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
-    reasons = []
-    for axis in range(scale.axes):
-        against = unexplained_reason(rest[axis], moved[axis], "smooth motion") + of_bands[axis]
+    findings = []
+    for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
+        against = unexplained_reasons(name, float(rest[axis]), float(moved[axis]), "smooth motion") + of_bands[axis]
         size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
-        against += against_rotation(apart, size, axis, scale.axes, remedy="True")
-        if float(std_seen[axis]) > 0.3:
-            against.append(
-                f"the motion is determined to {float(std_seen[axis]):.3g} px only: the frames may show different scenes"
-            )
-        reasons.append(tuple(against))
-    reliable = torch.tensor([not against for against in reasons], device=rest.device)
+        against += rotation_reasons(axis, scale.axes, apart.tolist(), size, remedy="True")
+        if float(std_seen[axis]) > _MAX_STD_SEEN:
+            against.append(Reason("motion_uncertain", name, float(std_seen[axis]), _MAX_STD_SEEN))
+        findings.append(tuple(against))
+    reliable = torch.tensor([not against for against in findings], device=rest.device)
     units = scale.units(value)
     return MotionDetection(
         motion=scale.free_motion(motion).from_row_order(timing),
@@ -653,7 +649,7 @@ def _report(
         unseen=magnitudes_from_row_order(unseen * units, timing),
         unexplained=magnitudes_from_row_order(rest * units, timing),
         reliable=magnitudes_from_row_order(reliable, timing),
-        reasons=sequence_from_row_order(reasons, timing),
+        findings=findings_from_row_order(findings, timing),
     )
 
 

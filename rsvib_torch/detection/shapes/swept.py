@@ -12,7 +12,8 @@ from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
-from rsvib_torch.core.presentation import Result, axis_rows, verdict_lines, verdict_table
+from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
@@ -23,14 +24,15 @@ from rsvib_torch.detection.shapes.free import (
     residual_of_motion,
     rms_motion,
     start_curve,
-    unexplained_reason,
+    unexplained_reasons,
 )
 from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
+    findings_from_row_order,
     magnitudes_from_row_order,
     offsets_from_row_order,
-    sequence_from_row_order,
 )
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
@@ -51,7 +53,7 @@ _STD_SHAPES = dict.fromkeys(("amplitude", *(f"std[{name!r}]" for name in _TONE))
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SweptTone(
-    Result,
+    JudgedResult,
     units={
         "amplitude": "px",
         "frequency": "Hz",
@@ -62,7 +64,7 @@ class SweptTone(
         "unexplained": "px",
     },
     shapes=dict.fromkeys((*_TONE, "image_motion", "unexplained", "reliable"), "... 2")
-    | {"std": "...", "reasons": "..."},
+    | {"std": "...", "findings": "..."},
 ):
     """One tone an axis that decays and sweeps: ``A exp(-g t) sin(2 pi (f t + c t^2 / 2) + phi) + v t``.
 
@@ -80,7 +82,7 @@ class SweptTone(
         motion: The motion, as ``restore`` and ``simulate_frames`` take it.
         unexplained: (..., 2) px, rms displacement of rows that it does not explain, beyond their noise.
         reliable: (..., 2) bool.
-        reasons: Why not, for each axis; a tuple of those for a batch.
+        findings: Each ``Reason`` why not, for each axis; a tuple of those for a batch. ``reasons`` has their texts.
 
     Example:
         >>> import torch
@@ -105,7 +107,7 @@ class SweptTone(
     motion: FreeMotion
     unexplained: Tensor
     reliable: Tensor
-    reasons: tuple[Any, ...]
+    findings: tuple[Any, ...]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -219,7 +221,7 @@ class _Fitted:
     moved: Tensor
     unexplained: Tensor
     uncertain: Tensor
-    against: tuple[list[str], list[str]]
+    against: list[list[Reason]]
     others: list[Tensor | None]
     frames: int
 
@@ -452,7 +454,7 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     """Parameters at the time origin and in image axes, with standard deviations and verdict."""
     middle = 0.5 * (fitted.record[0] + fitted.record[1])
     reverse = timing.readout_direction == "reverse"
-    values, stds, reasons = [], [], []
+    values, stds, findings = [], [], []
     for axis, (fit, covariance) in enumerate(zip(fitted.fits, fitted.covariances, strict=True)):
         present = bool(fit[:2].abs().sum() > 0)
         value = _at_origin(fit, middle)
@@ -463,24 +465,21 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         value[4] = torch.remainder(value[4] + turned + math.pi, 2 * math.pi) - math.pi
         values.append(value if present else 0 * value)
         stds.append(std if present else 0 * std)
-        against = [] if present else ["no tone stands out"]
+        name = AXIS_NAMES[axis]
+        against = [] if present else [Reason("no_tone", name)]
         if present and fitted.frames < _MIN_FRAMES:
-            against.append(
-                f"{fitted.frames} frames do not determine decay and sweep of a tone: several swept tones fit; use "
-                f"{_MIN_FRAMES} or more frames, or a steady tone (detect_vibration)"
-            )
+            against.append(Reason("too_few_frames_for_sweep", name, fitted.frames, _MIN_FRAMES))
         elif present and (other := fitted.others[axis]) is not None:
-            against.append(
-                f"another tone fits the rows as well: {float(other[2]):.4g} Hz with a decay of {float(other[3]):.3g} "
-                "/s in the middle of the record; use more frames"
-            )
+            details = {"frequency": float(other[2]), "decay": float(other[3])}
+            against.append(Reason("other_swept_tone", name, details=details))
         uncertain, size = float(fitted.uncertain[axis]), float(fitted.moved[axis])
-        if present and uncertain > 0.25 * size:  # as in reliability.py
-            against.append(f"the displacement of the rows is uncertain: {size:.2g} ± {uncertain:.2g} px")
+        if present and uncertain > MAX_DISPLACEMENT_STD * size:
+            allowed = MAX_DISPLACEMENT_STD * size
+            against.append(Reason("displacement_uncertain", name, uncertain, allowed, {"size": size}))
         against += fitted.against[axis] if present else []
-        against += unexplained_reason(fitted.unexplained[axis], fitted.moved[axis], "swept tone")
-        reasons.append(tuple(against))
-    reliable = torch.tensor([not against for against in reasons], device=fitted.fits.device)
+        against += unexplained_reasons(name, float(fitted.unexplained[axis]), size, "swept tone")
+        findings.append(tuple(against))
+    reliable = torch.tensor([not against for against in findings], device=fitted.fits.device)
     parameters, deviations = (magnitudes_from_row_order(torch.stack(x, -1), timing) for x in (values, stds))
     return SweptTone(
         **dict(zip(_TONE, parameters, strict=True)),
@@ -489,5 +488,5 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         motion=_motion(fitted.fits, fitted.record, step).from_row_order(timing),
         unexplained=magnitudes_from_row_order(fitted.unexplained, timing),
         reliable=magnitudes_from_row_order(reliable, timing),
-        reasons=sequence_from_row_order(reasons, timing),
+        findings=findings_from_row_order(findings, timing),
     )

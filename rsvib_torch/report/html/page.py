@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
@@ -50,7 +51,7 @@ class Report:
         timing: The sensor.
         detection: The detection (not a batch).
         verdict: Comparison of pairs of frames; None if they could not be compared.
-        left_alone: A sentence for each axis that was not restored.
+        left_alone: A reason for each axis that was not restored.
         options: Options of ``restore``.
         version: Version of the package.
         next_steps: What to do next, and the command that does it, or an empty text.
@@ -67,7 +68,7 @@ class Report:
     timing: SensorTiming
     detection: DetectionResult
     verdict: RestorationVerdict | None
-    left_alone: tuple[str, ...]
+    left_alone: tuple[Reason, ...]
     options: dict[str, Any]
     version: str
     next_steps: tuple[tuple[str, str], ...] = ()

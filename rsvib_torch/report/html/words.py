@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import Any, Literal
 
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
@@ -130,7 +131,7 @@ def verdict_sentences(
     num_rows: int,
     *,
     restored: bool,
-    left_alone: Sequence[str],
+    left_alone: Sequence[Reason],
     verdict: RestorationVerdict | None,
 ) -> list[str]:
     """The verdict: one sentence for the overall result, followed by the details.
@@ -141,7 +142,7 @@ def verdict_sentences(
         timing: The sensor.
         num_rows: Rows of a frame.
         restored: Whether the frames were restored, or are unchanged.
-        left_alone: A sentence for each axis that was not restored.
+        left_alone: A reason for each axis that was not restored.
         verdict: Comparison of pairs of frames; None if they could not be compared.
     """
     sentences = [_first_sentence(mark_of(result, verdict, restored), restored, verdict)]
@@ -157,7 +158,7 @@ def verdict_sentences(
         )
     sentences += _blind_sentences(result, timing)
     if bool(result.reliable.all()):  # otherwise the reasons are given above
-        sentences += [_sentence(note) for note in left_alone]
+        sentences += [_sentence(str(reason)) for reason in left_alone]
     if verdict is not None:
         sentences.append(_sentence(verdict.sentence))
     elif restored:

@@ -1,13 +1,13 @@
 """Verdict on a restoration without the true scene: agreement between frames of one scene.
 
 A restored frame, blurred by the motion of the next frame, should equal that next frame. The residual displacement
-between the two and the estimated gain in PSNR determine the outcome of every pair of frames, see ``_outcome``.
+between the two and the estimated gain in PSNR determine the outcome of every pair of frames, see ``outcome_of_pair``.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -15,18 +15,21 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
+from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
+from rsvib_torch.motion.detected_vibration import Detected
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups, judged_strip
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
-from rsvib_torch.restoration.verdict.trust import Detected, vibration_to_undo
+from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = [
     "Outcome",
@@ -35,6 +38,7 @@ __all__ = [
     "judge_frames",
     "judge_prepared",
     "judge_restoration",
+    "outcome_of_pair",
 ]
 
 Outcome = Literal["helps", "unknown", "partly", "worse"]
@@ -50,7 +54,7 @@ _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of fl
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestorationVerdict(
-    Result,
+    JudgedResult,
     units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
     shapes={
         **dict.fromkeys(("before", "after", "noise", "chi_square", "predicted_gain"), "P"),
@@ -76,7 +80,7 @@ class RestorationVerdict(
         outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
             ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
             frequency; frames without contrast; too many missing pixels).
-        reasons: The reason for each pair; empty where restoration helps.
+        findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -99,13 +103,18 @@ class RestorationVerdict(
     chi_square: Tensor
     predicted_gain: Tensor
     outcome: tuple[Outcome, ...]
-    reasons: tuple[str, ...]
+    findings: tuple[Any, ...]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("outcome", "reasons"):
+        for name in ("outcome", "findings"):
             if len(getattr(self, name)) != len(self.before):
                 raise ValueError(f"{name} must have {len(self.before)} entries, one for each pair of frames")
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """For each pair, the texts of its ``findings``."""
+        return tuple("; ".join(reason.with_axis for reason in of_pair) for of_pair in self.findings)
 
     @property
     def helped(self) -> Tensor:
@@ -146,14 +155,11 @@ class RestorationVerdict(
         if timing.scan_axis == -2:
             return self
         swapped = {name: getattr(self, name).flip(-1) for name in ("misfit_before", "misfit_after", "resolution")}
-        other = {"x: ": "y: ", "y: ": "x: "}
-        reasons = tuple(
-            "; ".join(other.get(part[:3], part[:3]) + part[3:] for part in why.split("; ")) for why in self.reasons
-        )
-        return replace(self, reasons=reasons, **swapped)
+        findings = tuple(reasons_from_row_order(of_pair, timing) for of_pair in self.findings)
+        return replace(self, findings=findings, **swapped)
 
 
-def _outcome(
+def outcome_of_pair(
     before: list[float],
     after: list[float],
     resolution: list[float],
@@ -164,8 +170,8 @@ def _outcome(
     one_image: bool = False,
     finest: float = 0.03,
     crosstalk: float = 0.05,
-) -> tuple[Outcome, str]:
-    """Outcome of one pair, and the reason.
+) -> tuple[Outcome, tuple[Reason, ...]]:
+    """Outcome of one pair, and the reasons for it; none if restoration helps.
 
     Scores are the residual displacement relative to that of the raw frames, and the estimated gain. The gain decides
     where the residual is small, because it is valid only where the motion is right.
@@ -181,35 +187,40 @@ def _outcome(
         finest: Misfit in px that is negligible in any image.
         crosstalk: Error of ``after`` along one axis, relative to the displacement along the other.
     """
-    found: list[tuple[Outcome, str]] = []
+    found: list[tuple[Outcome, Reason | None]] = []
     motion_is_complete = True
     for axis, name in enumerate("xy"):
-        least = max(resolution[axis], finest)
+        least, size, rest = max(resolution[axis], finest), before[axis], after[axis]
         if not moves[axis]:
-            motion_is_complete &= before[axis] <= least
+            motion_is_complete &= size <= least
             continue
-        residual = f"{name}: frames lie {before[axis]:.2g} px apart, {after[axis]:.2g} px remain unexplained"
+        visible = max(size, offset[axis])
+        details = {"before": size}
         if math.isinf(least):
-            found.append(("unknown", f"{name}: the frames have no contrast"))
-        elif after[axis] <= max(least, crosstalk * before[1 - axis]):
-            visible = max(before[axis], offset[axis]) > least
-            alike = f"{name}: frames lie less than {least:.2g} px apart, all are displaced alike"
-            found.append(("helps", "") if visible else ("unknown", alike))
-        elif after[axis] > _WORSE_RESIDUAL * before[axis]:
+            found.append(("unknown", Reason("no_contrast", name)))
+        elif rest <= max(least, crosstalk * before[1 - axis]):
+            is_visible = visible > least
+            found.append(
+                ("helps", None) if is_visible else ("unknown", Reason("displaced_alike", name, visible, least))
+            )
+        elif rest > _WORSE_RESIDUAL * size:
             # less noise may outweigh a motion that was not undone, but not a motion that does not exist
-            outweighed = before[axis] > least and gain > _GAIN_ERROR and not one_image
-            found.append(("partly" if outweighed else "worse", residual))
+            outweighed = size > least and gain > _GAIN_ERROR and not one_image
+            remains = Reason("motion_remains", name, rest, _WORSE_RESIDUAL * size, details)
+            found.append(("partly" if outweighed else "worse", remains))
+        elif rest > _PARTLY_RESIDUAL * size:
+            found.append(("partly", Reason("motion_remains", name, rest, _PARTLY_RESIDUAL * size, details)))
         else:
-            found.append(("partly", residual) if after[axis] > _PARTLY_RESIDUAL * before[axis] else ("helps", ""))
+            found.append(("helps", None))
     if not found:
-        return "unknown", "no vibration was undone"
+        return "unknown", (Reason("nothing_undone"),)
     outcome = max((outcome for outcome, _ in found), key=_OUTCOMES.index)
-    reason = "; ".join(why for kind, why in found if kind == outcome and why)
+    reasons = tuple(reason for kind, reason in found if kind == outcome and reason is not None)
     if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
-        return outcome, reason
+        return outcome, reasons
     if gain < -_GAIN_ERROR:
-        return "worse", f"noise and artefacts outweigh the restored sharpness (estimated improvement {gain:.1f} dB)"
-    return "unknown", reason or f"the estimated improvement of {gain:.1f} dB is within its error of {_GAIN_ERROR:g} dB"
+        return "worse", (Reason("noise_outweighs", None, gain, -_GAIN_ERROR),)
+    return "unknown", reasons or (Reason("improvement_uncertain", None, gain, -_GAIN_ERROR),)
 
 
 def _mean_square(difference: Tensor) -> Tensor:
@@ -237,12 +248,12 @@ def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing:
     gain = 10.0 * torch.log10(raw_error / error.clamp(min=_MIN_NOISE**2))
     misfits = (misfit_before.tolist(), misfit_after.tolist(), resolution.tolist())
     one_image = pair.restored_later is None
-    outcome, why = _outcome(*misfits, moves, pair.offset.tolist(), float(gain), one_image=one_image)
+    outcome, reasons = outcome_of_pair(*misfits, moves, pair.offset.tolist(), float(gain), one_image=one_image)
     if (outcome == "worse" and gain > 0) or (outcome in ("helps", "partly") and gain < 0):
         gain = torch.full_like(gain, math.nan)
     missing = 0.0 if pair.missing is None else float(pair.missing.any(0).double().mean())
     if missing > max_missing:
-        outcome, why = "unknown", f"{100 * missing:.0f} % of the pixels are missing"
+        outcome, reasons = "unknown", (Reason("pixels_missing", None, missing, max_missing),)
     return RestorationVerdict(
         before=_mean_square(pair.later - pair.earlier).sqrt()[None],
         after=after.sqrt()[None],
@@ -253,7 +264,7 @@ def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing:
         chi_square=(unexplained / noise)[None],
         predicted_gain=gain[None],
         outcome=(outcome,),
-        reasons=(why,),
+        findings=(reasons,),
     )
 
 
@@ -290,10 +301,10 @@ def judge_frames(
     joined = {
         field.name: torch.cat([getattr(verdict, field.name) for verdict in verdicts])
         for field in fields(RestorationVerdict)
-        if field.name not in ("outcome", "reasons")
+        if field.name not in ("outcome", "findings")
     }
     outcome = tuple(verdict.outcome[0] for verdict in verdicts)
-    return RestorationVerdict(**joined, outcome=outcome, reasons=tuple(verdict.reasons[0] for verdict in verdicts))
+    return RestorationVerdict(**joined, outcome=outcome, findings=tuple(verdict.findings[0] for verdict in verdicts))
 
 
 @checks_arguments

@@ -1,7 +1,7 @@
 """The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,32 +9,13 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reason import Reason
+from rsvib_torch.motion.detected_vibration import Detected
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["Detected", "displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
-
-
-@runtime_checkable
-class Detected(Protocol):
-    """A vibration with its standard deviations and a verdict, as ``detect_vibration`` returns it."""
-
-    @property
-    def vibration(self) -> Vibration:
-        """The vibration in image axes, of batch shape () or (B,)."""
-
-    @property
-    def std(self) -> Any:
-        """Standard deviations ``amplitude``, ``frequency``, ``phase``, ``image_motion``, shaped as the vibration's."""
-
-    @property
-    def reliable(self) -> Any:
-        """(..., 2) verdict for each axis."""
-
-    @property
-    def reasons(self) -> tuple[Any, ...]:
-        """Why not, for each axis (x, y); a tuple of those for a batch."""
+__all__ = ["displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
 
 
 def displacement_uncertainty(
@@ -75,7 +56,7 @@ def displacement_uncertainty(
 @checks_arguments
 def trusted_vibration(
     detected: Detected, timing: SensorTiming, num_frames: int, num_rows: int
-) -> tuple[Vibration, tuple[str, ...]]:
+) -> tuple[Vibration, tuple[Reason, ...]]:
     """The part of a detected vibration that is accurate enough to be undone.
 
     The amplitude and the image motion of an axis are set to zero if the axis is not reliable, or if the variance of its
@@ -90,7 +71,7 @@ def trusted_vibration(
         num_rows: Rows of a frame, along the scan axis.
 
     Returns:
-        The vibration, and one sentence for each axis that is not restored.
+        The vibration, and a ``Reason`` for each axis that is not restored.
 
     Example:
         >>> from types import SimpleNamespace
@@ -99,9 +80,9 @@ def trusted_vibration(
         >>> names = ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration")
         >>> small = SimpleNamespace(**{name: 0.01 * torch.ones_like(getattr(found, name)) for name in names})
         >>> doubtful = SimpleNamespace(vibration=found, std=small, reliable=(True, False), reasons=((), ("blind",)))
-        >>> vibration, notes = trusted_vibration(doubtful, timing, 2, 512)
-        >>> vibration.amplitude.flatten().tolist(), notes
-        ([3.0, 0.0], ('y is not restored: its vibration is not reliable (blind)',))
+        >>> vibration, (reason,) = trusted_vibration(doubtful, timing, 2, 512)
+        >>> vibration.amplitude.flatten().tolist(), str(reason)
+        ([3.0, 0.0], 'y is not restored: its vibration is not reliable (blind)')
     """
     check_whole_number("num_frames", num_frames, at_least=1)
     check_whole_number("num_rows", num_rows, at_least=1)
@@ -112,29 +93,26 @@ def trusted_vibration(
     )
     accurate = error.square() <= 0.5 * size.square()
     batched = len(vibration.batch_shape) > 0
-    notes = []
+    left_alone = []
     for index in range(vibration.batch_shape[0] if batched else 1):
         at = (index,) if batched else ()
         reasons = detected.reasons[index] if batched else detected.reasons
-        where = f"stack {index}: " if batched else ""
+        where: dict[str, float | str] = {"action": "restored"} | ({"stack": index} if batched else {})
         for axis, name in enumerate(AXIS_NAMES[: vibration.num_axes]):
             here = (*at, axis)
             if not bool(reliable[here]):
-                why = "; ".join(reasons[axis])
-                notes.append(f"{where}{name} is not restored: its vibration is not reliable ({why})")
+                left_alone.append(Reason("axis_not_reliable", name, details=where | {"why": "; ".join(reasons[axis])}))
             elif not bool(accurate[here]):
-                unit = ("px", "px", "rad", "(zoom)")[axis]
-                notes.append(
-                    f"{where}{name} is not restored: its displacement of {float(size[here]):.2g} {unit} has a standard "
-                    f"deviation of {float(error[here]):.2g} {unit}; detect it from more frames"
-                )
-    return vibration.scaled(reliable & accurate), tuple(notes)
+                value, moved, unit = float(error[here]), float(size[here]), ("px", "px", "rad", "(zoom)")[axis]
+                details = where | {"size": moved, "unit": unit}
+                left_alone.append(Reason("axis_not_accurate", name, value, math.sqrt(0.5) * moved, details))
+    return vibration.scaled(reliable & accurate), tuple(left_alone)
 
 
 def vibration_to_undo(
     vibration: Motion | Detected, timing: SensorTiming, num_frames: int, num_rows: int
-) -> tuple[Motion, tuple[str, ...]]:
-    """A given motion unchanged; of a detection the accurate part, and one sentence for each axis not restored.
+) -> tuple[Motion, tuple[Reason, ...]]:
+    """A given motion unchanged; of a detection the accurate part, and a reason for each axis not restored.
 
     Raises:
         TypeError: If it is neither.

@@ -1,0 +1,353 @@
+"""The verdict on detected vibrations: the reasons against each axis.
+
+``core/reason.py`` has their texts, docs/verdicts.md the measurements that the limits were chosen with.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reason import Reason
+from rsvib_torch.detection.result import OtherMotion
+from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
+from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
+from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+
+__all__ = [
+    "MAX_DISPLACEMENT_STD",
+    "BandOffsets",
+    "Findings",
+    "contradicted_axes",
+    "halves_move_apart",
+    "judged",
+    "recording_reasons",
+    "residual_reasons",
+    "rotation_possible",
+    "rotation_reasons",
+]
+
+Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
+
+_MIN_MEASURED = 0.5  # of the visible rows or bands
+MAX_DISPLACEMENT_STD = 0.25  # of the displacement of the rows
+_MAX_WITHIN_ROW_TIME = 0.1  # px; condition (24) of the paper
+_MIN_MOTION = 0.05  # px between frames; offsets of bands have errors of this size
+_OF_STACK = ("measured", "bands", "differential", "blur")  # quantities without an entry for each axis
+
+
+@dataclass(frozen=True, eq=False)
+class BandOffsets:
+    """Offsets of M row bands of B stacks.
+
+    Attributes:
+        offsets: (B, M, A) px, NaN where a band could not be registered.
+        fitted: (B, M, A) px, offsets predicted by the vibration.
+        visible: (B, M) bool, bands that both frames contain.
+    """
+
+    offsets: Tensor
+    fitted: Tensor
+    visible: Tensor
+
+
+def judged(
+    vibration: Vibration,
+    std: VibrationStd,
+    measured: OtherMotion | BandOffsets,
+    *,
+    intervals: Tensor,
+    displacement: Tensor,
+    known_std: Tensor,
+    timing: RowTiming,
+    max_tones: float = math.inf,
+    radius: float = 0.0,
+) -> tuple[Findings, ...]:
+    """Reasons against the vibrations of B stacks, for each of their A axes in row order.
+
+    Args:
+        vibration: The detected vibrations.
+        std: Their standard deviations.
+        measured: The measurements that they were fitted to: the motion of the rows that they do not explain, or the
+            offsets of row bands.
+        intervals: Times between the frames that were compared, s.
+        displacement: (B, A) px, displacement of the rows by the tones without its mean, rms over the rows.
+        known_std: (B, A) px, standard deviation of the displacement if the number of tones is right.
+        timing: The sensor, in row order.
+        max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
+        radius: Distance from the centre, in px, at which roll and zoom are displacements in px.
+    """
+    # 1. The compared quantities of all stacks and axes, on the device.
+    quantities = {
+        "amplitude": vibration.amplitude,
+        "amplitude_std": std.amplitude,
+        "frequency": vibration.frequency,
+        "frequency_std": std.frequency,
+        "gain": offset_gain(vibration.frequency, intervals),
+        "displacement": displacement,
+        "known_std": known_std,
+        "std": known_std if std.displacement is None else std.displacement,
+    }
+    if isinstance(measured, OtherMotion):
+        quantities |= {**vars(measured), "permitted": measured.permitted}
+    else:
+        # Condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed.
+        tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+        quantities |= {**_compared_bands(measured), "within_row_time": tones.displacement_within(timing.row_time)}
+
+    # 2. One transfer to the CPU, and the comparisons with the limits.
+    findings = []
+    for stack in _numbers_of_stacks(quantities):
+        against = _reasons_against_stack(stack, timing, max_tones)
+        # A displacement by roll or zoom depends on the distance from the centre.
+        for axis, reasons in enumerate(against):
+            if axis >= 2:
+                reasons[:] = [
+                    replace(one, details={**one.details, "radius": radius}) if one.kind.unit == "px" else one
+                    for one in reasons
+                ]
+        findings.append(tuple(map(tuple, against)))
+    return tuple(findings)
+
+
+def _numbers_of_stacks(quantities: dict[str, Tensor]) -> list[dict[str, Any]]:
+    """For each stack, quantities (B, ...) as numbers and nested lists of numbers, by one transfer to the CPU."""
+    parts = [values.to(torch.float64).reshape(len(values), -1) for values in quantities.values()]
+    split = torch.cat(parts, 1).cpu().split([part.shape[1] for part in parts], 1)
+    numbers = [part.reshape(of.shape).tolist() for part, of in zip(split, quantities.values(), strict=True)]
+    return [dict(zip(quantities, stack, strict=True)) for stack in zip(*numbers, strict=True)]
+
+
+def _compared_bands(bands: BandOffsets) -> dict[str, Tensor]:
+    """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them."""
+    good = torch.isfinite(bands.offsets).all(-1) & bands.visible
+    number, good = good.sum(1, keepdim=True), good[..., None]
+    offsets = bands.offsets.where(good, torch.nan)
+    # Clouds may cover the other quarter.
+    residuals = (offsets - bands.fitted).abs().nan_to_num(nan=math.inf).sort(dim=1).values
+    counted = (0.75 * number.to(residuals.dtype)).ceil()
+    best = torch.arange(residuals.shape[1], device=residuals.device)[:, None] < counted[:, None]
+    return {
+        "measured": number[:, 0] / bands.visible.sum(1).clamp(min=1),
+        "bands": bands.visible.sum(1),
+        "residual": residuals.where(best, 0.0).sum(1) / counted,
+        "size": (offsets - offsets.nanmean(1, keepdim=True)).abs().nanmean(1),
+    }
+
+
+def _reasons_against_stack(stack: dict[str, Any], timing: RowTiming, max_tones: float) -> list[list[Reason]]:
+    """Reasons against each axis of one stack, from the numbers of its compared quantities."""
+    by_rows, axes = "bands" not in stack, len(stack["amplitude"])
+    of_all = _measurement_reasons(stack)
+    if by_rows:
+        of_all += _exposure_reasons(timing, *stack["blur"])
+    against = []
+    for axis, name in enumerate(AXIS_NAMES[:axes]):
+        numbers = {quantity: values[axis] for quantity, values in stack.items() if quantity not in _OF_STACK}
+        tones = [tone for tone, amplitude in enumerate(numbers["amplitude"]) if amplitude > 0]
+        reasons = of_all.copy()
+        if not tones:
+            reasons.append(Reason("no_tone", name))
+        if len(tones) >= max_tones:
+            reasons.append(Reason("too_many_tones", name, len(tones), max_tones))
+        for tone in tones:
+            reasons += _tone_reasons(name, numbers, tone, len(tones), timing)
+        reasons += _displacement_reasons(name, numbers, len(tones))
+        if by_rows:
+            reasons += rotation_reasons(axis, axes, stack["differential"], numbers["size"])
+            reasons += residual_reasons(name, numbers)
+        else:
+            reasons += _band_reasons(name, numbers)
+        against.append(reasons)
+    return against
+
+
+def _measurement_reasons(stack: dict[str, Any]) -> list[Reason]:
+    """Reasons from the fraction of the visible rows or bands that were measured."""
+    if stack["measured"] >= _MIN_MEASURED:
+        return []
+    what = f"{stack['bands']:g} row bands" if "bands" in stack else "the rows"
+    return [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
+
+
+def _tone_reasons(axis: str, numbers: dict[str, Any], tone: int, num_tones: int, timing: RowTiming) -> list[Reason]:
+    """Reasons against one tone."""
+    names = ("amplitude", "amplitude_std", "frequency", "frequency_std", "gain")
+    size, size_std, hertz, hertz_std, gain = (numbers[name][tone] for name in names)
+    turns = math.pi * hertz * timing.exposure_time
+    offset = size * gain * abs(math.sin(turns) / turns if turns else 1.0)
+    details: dict[str, float | str] = {"frequency": hertz}
+    reasons = []
+    if not (0 < size_std < math.inf and 0 < hertz_std < math.inf):
+        reasons.append(Reason("tone_uncertainty_unknown", axis, details=details))
+    elif size < MIN_SIGNIFICANCE * size_std and num_tones == 1:
+        needed = MIN_SIGNIFICANCE * size_std
+        reasons.append(Reason("tone_not_significant", axis, size, needed, details | {"std": size_std}))
+    elif offset < MIN_OFFSET:
+        reasons.append(Reason("tone_too_small", axis, offset, MIN_OFFSET, details))
+    if gain < MIN_GAIN:
+        # A wrong frame_rows also causes tones whose frequency is a multiple of the frame rate.
+        multiple = round(hertz * timing.frame_period)
+        distance, hint = abs(hertz - multiple * timing.frame_rate), details
+        if timing.frame_start_times is None and multiple and distance <= max(3 * hertz_std, 1e-3 * hertz):
+            times = "" if multiple == 1 else f"{multiple} times "
+            hint = details | {"multiple": times, "frame_rate": timing.frame_rate}
+        reasons.append(Reason("tone_blind", axis, gain, MIN_GAIN, hint))
+    if hertz * timing.exposure_time > 1.0:
+        reasons.append(Reason("tone_averaged_out", axis, hertz, 1 / timing.exposure_time))
+    return reasons
+
+
+def _displacement_reasons(axis: str, numbers: dict[str, Any], num_tones: int) -> list[Reason]:
+    """Reasons from the displacement of the rows by all tones and its standard deviations, rms over the rows.
+
+    ``known_std`` holds if the number of tones is right, ``std`` allows for a further tone. The limits and their effect
+    are listed in docs/verdicts.md; of 18 simulated axes with several tones above 4 %, 3 were known within 2 %.
+    """
+    size, std, known_std = numbers["displacement"], numbers["std"], numbers["known_std"]
+    allowed = max(0.04 * size, 0.01)  # px
+    if num_tones and std > allowed and (num_tones > 1 or std > 1.5 * known_std):
+        return [Reason("displacement_ambiguous", axis, std, allowed, {"size": size})]
+    if num_tones and std > MAX_DISPLACEMENT_STD * size:
+        return [Reason("displacement_uncertain", axis, std, MAX_DISPLACEMENT_STD * size, {"size": size})]
+    return []
+
+
+def _band_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
+    """Reasons from the residual of the bands, and from condition (24)."""
+    reasons = []
+    residual, size, within = numbers["residual"], numbers["size"], numbers["within_row_time"]
+    allowed = max(0.05, 0.3 * size)  # px; smaller residuals are errors of registration
+    if residual > allowed:
+        reasons.append(Reason("bands_unexplained", axis, residual, allowed, {"size": size}))
+    if within > _MAX_WITHIN_ROW_TIME:
+        reasons.append(Reason("motion_within_row_time", axis, within, _MAX_WITHIN_ROW_TIME))
+    return reasons
+
+
+def residual_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
+    """Reasons from motion of the rows along an axis that no vibration explains; ``numbers`` of ``OtherMotion`` in px.
+
+    docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.
+    """
+    if numbers["unexplained"] > numbers["permitted"]:
+        return [Reason("rows_unexplained", axis, numbers["unexplained"], numbers["permitted"])]
+    allowed = max(0.01, 0.0025 * numbers["size"])  # px
+    if numbers["correlated"] > allowed:
+        return [Reason("neighbours_unexplained", axis, numbers["correlated"], allowed)]
+    return []
+
+
+def contradicted_axes(findings: Findings) -> tuple[bool, bool]:
+    """Whether the measured rows contradict the tones of each axis, so that another timing may be the cause."""
+    codes = {"too_many_tones", "rows_unexplained", "neighbours_unexplained"}
+    first, second = (any(reason.code in codes for reason in of_axis) for of_axis in findings[:2])
+    return first, second
+
+
+# Roll and zoom
+
+
+def _max_apart(size: Any) -> Any:
+    """Largest permitted difference in px of the displacements along a row, for an axis with offsets of size px rms."""
+    return (0.009 * size).clamp(min=0.035) if isinstance(size, Tensor) else max(0.035, 0.009 * size)
+
+
+def halves_move_apart(other: OtherMotion) -> Tensor:
+    """(B,) whether the halves of the rows move apart, as roll and zoom cause it."""
+    apart: Tensor = (other.differential.flip(-1) > _max_apart(other.size)).any(-1)
+    return apart
+
+
+# Limits of roll and zoom as the cause. Of 15 recordings with either, 0.057 px of the differences along a row were not
+# linear in the column, and the rows moved by 4 times the difference of their halves; clouds, parallax and objects had
+# 0.12 px and more, motions that are no sums of tones 10 times and more.
+_MAX_UNEVEN, _MAX_MOVED = 3.0, 8.0  # of the permitted difference of the halves, of the difference of the halves
+
+
+def rotation_possible(other: OtherMotion, uneven: Tensor, aspect: float) -> Tensor:
+    """(B,) whether roll or zoom may be all that the fit of a stack does not explain.
+
+    Args:
+        other: Motion of the rows that the fit does not explain.
+        uneven: (B, 2) px, differences of the displacements along a row that are not linear in the column.
+        aspect: Rows of a frame over its columns.
+    """
+    apart = other.differential.flip(-1)
+    is_uneven = (uneven.flip(-1) > _MAX_UNEVEN * _max_apart(other.size)).any(-1)
+    moved = torch.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * apart)
+    possible: Tensor = halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
+    return possible
+
+
+def rotation_reasons(
+    axis: int, axes: int, differential: Sequence[float], size: float, remedy: str = "'auto'"
+) -> list[Reason]:
+    """Reasons against an axis from rotation and zoom, which move the halves of a row apart along the other axis.
+
+    A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
+    ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
+
+    Args:
+        axis: The axis, in row order.
+        axes: Number of components of the motion.
+        differential: (2,) px, rms difference of the displacements along a row that the motion does not explain.
+        size: px, rms offset along the axis.
+        remedy: Value of ``roll`` and ``zoom`` with which they are measured.
+    """
+    apart, allowed = max(differential) if axes > 2 else differential[1 - axis], _max_apart(size)
+    if apart <= allowed:
+        return []
+    if axes > 2:
+        return [Reason("strips_apart", AXIS_NAMES[axis], apart, allowed)]
+    return [Reason("halves_apart", AXIS_NAMES[axis], apart, allowed, {"remedy": remedy})]
+
+
+# Exposure
+
+
+def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) -> list[Reason]:
+    """Reasons against all axes from the difference of the blur between frames.
+
+    Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). Interpolation
+    errors increase it by about 0.005 / size, so that high ratios count only if the excess is 0.02 of the detail, and
+    sizes below 0.002 do not count; above 0.25 the second order is not enough. Negative ratios are caused by another
+    error, because no exposure time gives them.
+    """
+    low, high = 0.6, 2.5
+    is_low = -0.3 < ratio < low and 1 - ratio > 3 * std
+    is_high = ratio > high and ratio - 1 > 5 * std and (ratio - 1) * size > 0.02
+    if not 0.002 < size < 0.25 or not (is_low or is_high):
+        return []
+    details: dict[str, float | str] = {"exposure_rows": timing.exposure_rows}
+    if ratio > 0:
+        details["likely"] = timing.exposure_rows * math.sqrt(ratio)
+    return [Reason("blur_contradicts_exposure", None, ratio, low if is_low else high, details)]
+
+
+# Recorded motions
+
+
+def recording_reasons(moved: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
+    """Reasons against a recorded motion.
+
+    Args:
+        moved: px, rms motion of the rows by the recording, for each axis.
+        unexplained: px, rms motion that it does not explain.
+        other: Another offset of its clock in s that explains the frames as well.
+    """
+    reasons, largest = [], max(moved)
+    if largest < _MIN_MOTION:
+        reasons.append(Reason("recorded_motion_too_small", None, largest, _MIN_MOTION))
+    for name, size, rest in zip(AXIS_NAMES, moved, unexplained, strict=False):
+        allowed = max(0.25 * size, 0.05)  # px
+        if rest > allowed:
+            reasons.append(Reason("recording_incomplete", name, rest, allowed))
+    if other is not None:
+        reasons.append(Reason("motion_repeats", details={"offset": other}))
+    return reasons
