@@ -83,7 +83,7 @@ SECTIONS = {
         "measuring.md",
         "gallery.md",
     ),
-    "Method": ("method.md", "conventions.md", "verdicts.md", "bound.md", "accuracy.md", "benchmarks.md"),
+    "Method": ("method.md", "conventions.md", "verdicts.md", "reasons.md", "bound.md", "accuracy.md", "benchmarks.md"),
     "Development": ("architecture.md", "ablation.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
 }
 DOCUMENTATION = ROOT / "scripts" / "documentation"  # extensions of the builder, and files of the site

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Write docs/configuration.md (all keys of the TOML file) and docs/commands.md (all commands).
+"""Write docs/configuration.md (all keys of the TOML file), docs/commands.md (all commands) and docs/reasons.md.
 
 Types and defaults come from the sections of the configuration and the parameters of the commands, descriptions from
-docstrings and help texts. A test fails if the pages are out of date.
+docstrings and help texts, reasons from their table in core/reason.py. A test fails if the pages are out of date.
 """
 
 import argparse
@@ -17,6 +17,7 @@ import typer
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import app
 from rsvib_torch.config import Simulation, file_section, simulation_section
+from rsvib_torch.core.reason import GROUPS
 from rsvib_torch.core.validation import expected_text
 from rsvib_torch.restoration.restore import METHODS
 
@@ -42,6 +43,16 @@ COMMANDS = f"""{NOTE}
 
 `rsvib COMMAND --help` prints the same. A time is in seconds, with a unit (`14.6us`, `2ms`) or as a fraction (`1/500`).
 Exit code 0: done; 2: an error of the input or the options, one line on standard error; 130: stopped by Ctrl-C.
+"""
+REASONS_PAGE = f"""{NOTE}
+
+# Reasons
+
+`findings` of a result has a `Reason` for everything that contradicts it: of detections in one tuple for each axis, of
+a restoration in one for each pair of frames. A reason has a `code`, an `axis` (`"x"`, `"y"`, `"roll"`, `"zoom"`, or
+None for all), the compared `value`, its `limit` in the same unit, and `details`, the other numbers of its text.
+`reasons` has the texts. JSON files and `--json` contain both. The values in braces below are filled in, and parts in
+square brackets are omitted where they do not apply. [Verdicts](verdicts.md) explains how the limits were chosen.
 """
 
 
@@ -167,10 +178,27 @@ def command_page() -> str:
     return "\n".join(lines)
 
 
+def reasons_page() -> str:
+    """Markdown of the table of reasons."""
+    lines = [REASONS_PAGE]
+    for title, kinds in GROUPS.items():
+        heads = ("code", "value, limit", "unit", "refuses", "text", "remedy")
+        rows = [
+            [f"`{code}`", kind.compares, kind.unit, kind.refuses, kind.sentence, kind.remedy]
+            for code, kind in kinds.items()
+        ]
+        lines += [f"## {title}", "", *table(heads, rows)]
+    return "\n".join(lines)
+
+
 def pages() -> dict[Path, str]:
     """Text of the pages, by path."""
     docs = ROOT / "docs"
-    return {docs / "configuration.md": configuration_page(), docs / "commands.md": command_page()}
+    return {
+        docs / "configuration.md": configuration_page(),
+        docs / "commands.md": command_page(),
+        docs / "reasons.md": reasons_page(),
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
+from rsvib_torch.core.reason import REASONS
 from rsvib_torch.evaluation.scenes import resolution_chart
 from rsvib_torch.io import formats
 from rsvib_torch.registration.methods import BAND_METHODS
@@ -67,12 +68,12 @@ def test_quick_start_page(tmp_path, monkeypatch, capsys):
 
 
 def test_recipes_of_the_architecture_page(tmp_path, monkeypatch):
-    """The recipes add a minimal registration method, prior and file format, which are used and removed."""
+    """The recipes add a minimal registration method, prior, file format and reason, which are used and removed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
-    tables = [(BAND_METHODS, dict(BAND_METHODS)), (PRIORS, dict(PRIORS))]
+    tables = [(table, dict(table)) for table in (BAND_METHODS, PRIORS, REASONS)]
     try:
-        names = run_page("architecture.md", 4)
+        names = run_page("architecture.md", 5)
     finally:
         for table, entries in tables:
             table.clear()

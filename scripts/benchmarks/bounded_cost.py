@@ -186,8 +186,8 @@ def _timed(frames: torch.Tensor, timing: rsv.SensorTiming) -> tuple[float, float
     except ValueError as error:
         return 0.0, None, f"error: {error}"
     restoration = seconds_of(lambda: rsv.restore(frames, timing, found[0]))
-    reasons = [reason for reasons in found[0].reasons for reason in reasons]
-    return detection, restoration, "" if not reasons else reasons[0].partition(":")[0]
+    codes = [reason.code for of_axis in found[0].findings for reason in of_axis]
+    return detection, restoration, codes[0] if codes else ""
 
 
 def measure(task: Input, runs: int) -> dict[str, Any]:

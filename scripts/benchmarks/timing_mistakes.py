@@ -45,52 +45,52 @@ class Mistake:
         state: From the correct timing to the stated one.
         setting: The mistaken setting, which an assumption must name. The ratio of frame period and row time is
             ``frame_rows``, also if it is wrong because of ``row_time``.
-        name: Text of a reason that names this setting as the cause.
+        code: Code of the reason that names this setting as the cause; empty for none.
     """
 
     state: Callable[[rsv.SensorTiming], rsv.SensorTiming]
     setting: str
-    name: str
+    code: str
 
 
-def scaled(setting: str, name: str, **factors: float) -> Mistake:
+def scaled(setting: str, code: str, **factors: float) -> Mistake:
     """Times that are stated as multiples of the correct ones."""
 
     def state(timing: rsv.SensorTiming) -> rsv.SensorTiming:
         return replace(timing, **{name: getattr(timing, name) * factor for name, factor in factors.items()})
 
-    return Mistake(state, setting, name)
+    return Mistake(state, setting, code)
 
 
 def wrong_frame_rows(factor: float) -> Mistake:
     """Other row times from frame to frame."""
-    return scaled("frame_rows", "agree with frame_rows", frame_rows=factor)
+    return scaled("frame_rows", "other_frame_rows", frame_rows=factor)
 
 
 def wrong_row_time(factor: float) -> Mistake:
     """Another row time, with the correct frame rate and exposure time in seconds."""
     factors = {"row_time": factor, "frame_rows": 1 / factor, "exposure_rows": 1 / factor}
-    return scaled("frame_rows", "agree with frame_rows", **factors)
+    return scaled("frame_rows", "other_frame_rows", **factors)
 
 
 def wrong_times(factor: float) -> Mistake:
     """Another row time, with the correct ratios: all times are wrong by the same factor."""
-    return scaled("row_time", "agree with row_time", row_time=factor)
+    return scaled("row_time", "other_row_time", row_time=factor)
 
 
 MISTAKES: dict[str, Mistake] = {
-    "none": Mistake(lambda timing: timing, "none", "the frames agree with"),
+    "none": Mistake(lambda timing: timing, "none", ""),
     **{
         f"row_time {error:+.0%}, frame rate correct": wrong_row_time(1 + error)
         for error in (-0.10, -0.03, -0.01, 0.01, 0.03, 0.10)
     },
     **{f"frame_rows {error:+.1%}": wrong_frame_rows(1 + error) for error in (-0.02, -0.005, 0.005, 0.02)},
-    "exposure x 0.5": scaled("exposure_rows", "check exposure_rows", exposure_rows=0.5),
-    "exposure x 2": scaled("exposure_rows", "check exposure_rows", exposure_rows=2.0),
+    "exposure x 0.5": scaled("exposure_rows", "blur_contradicts_exposure", exposure_rows=0.5),
+    "exposure x 2": scaled("exposure_rows", "blur_contradicts_exposure", exposure_rows=2.0),
     "readout reversed": Mistake(
-        lambda timing: replace(timing, readout_direction="reverse"), "readout direction", "agree with readout_direction"
+        lambda timing: replace(timing, readout_direction="reverse"), "readout direction", "other_readout_direction"
     ),
-    "scan axis exchanged": Mistake(lambda timing: replace(timing, scan_axis="x"), "scan axis", "agree with scan_axis"),
+    "scan axis exchanged": Mistake(lambda timing: replace(timing, scan_axis="x"), "scan axis", "other_scan_axis"),
     "frame_rows = image height": wrong_frame_rows(1 / BLANKING),
     # all times are wrong by one factor; every other factor gives the same result, with frequencies over this factor
     "row_time = 1 / (frame rate x height)": wrong_times(BLANKING),
@@ -137,7 +137,8 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
         else:
             outcome = "right"
         case["outcomes"].append(outcome)
-        case["named"].append(outcome == "detected" and any(mistake.name in text for text in reasons))
+        codes = [reason.code for reason in found.findings[axis]]
+        case["named"].append(outcome == "detected" and mistake.code in codes)
         case["reasons"].append(reasons)
     case["warnings"], case["assumptions"] = warned, list(found.assumptions)
     case["restored_db"] = psnr(restored.double().numpy(), first, stills)
