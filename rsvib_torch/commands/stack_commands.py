@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
     from rsvib_torch.detection import DetectionResult
     from rsvib_torch.io import StackInfo
-    from rsvib_torch.motion.detected_vibration import Detected
+    from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.motion.motion import Motion
     from rsvib_torch.motion.timing import SensorTiming
     from rsvib_torch.report import Box
@@ -151,7 +151,7 @@ def _detect(stack: Stack, config: Config) -> DetectionResult:
 
 
 def _restore(
-    stack: Stack, motion: Motion | Detected, options: dict[str, Any], force: bool, output: str = "frames"
+    stack: Stack, motion: Motion | DetectedVibration, options: dict[str, Any], force: bool, output: str = "frames"
 ) -> RestoredFrames:
     """Restore frames, and judge the result on eight pairs of frames; ``output`` names what will be written."""
     with working("restoring and judging"):
@@ -163,7 +163,7 @@ def _restore(
 def restore_and_save(
     path: Path,
     stack: Stack,
-    motion: Motion | Detected,
+    motion: Motion | DetectedVibration,
     options: dict[str, Any],
     force: bool,
     report: Path | None = None,

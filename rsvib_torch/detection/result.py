@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.presentation import JudgedResult, Result, axis_head, axis_rows, plain_values
+from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.motion.detected_vibration import detection_summary
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
@@ -178,14 +178,9 @@ class AttitudeTones(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectionResult(
-    JudgedResult,
+    DetectedVibration,
     units={**Vibration.units, "residual": "px", "gain": "px of offset per px of displacement", "offsets": "s and px"},
-    shapes={
-        "gain": "... A K",
-        **dict.fromkeys(("residual", "reliable"), "... A"),
-        "fitted": "... P N A",
-        **dict.fromkeys(("findings", "assumptions"), "..."),
-    },
+    shapes={**DetectedVibration.shapes, "fitted": "... P N A"},
     file_format="rsvib vibration",
 ):
     """A detected vibration with its uncertainty and verdict. Batches of stacks or windows lead all tensors.
@@ -193,15 +188,15 @@ class DetectionResult(
     Attributes:
         vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
         std: Standard deviations of its parameters.
-        offsets: The measured offset curve.
-        fitted: (..., P, N, 2) px, offsets of the same bands predicted by the vibration.
         gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
         findings: Each ``Reason`` against each axis (x, y) that is not reliable; a tuple of those for a batch.
             ``reasons`` has their texts.
-        sensitivity: Effect of the stated timing on amplitudes and frequencies.
         assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
+        offsets: The measured offset curve.
+        fitted: (..., P, N, 2) px, offsets of the same bands predicted by the vibration.
+        sensitivity: Effect of the stated timing on amplitudes and frequencies.
         timing: The sensor of the frames.
 
     ``save`` writes a ``vibration.json`` as the program does, which ``rsvib restore`` and ``read_vibration`` read.
@@ -223,32 +218,10 @@ class DetectionResult(
         >>> detection = rsv.DetectionResult.load("vibration.json")  # doctest: +SKIP
     """
 
-    vibration: Vibration
-    std: VibrationStd
     offsets: OffsetCurve
     fitted: Tensor
-    gain: Tensor
-    residual: Tensor
-    reliable: Tensor
-    findings: tuple[Any, ...]
     sensitivity: TimingSensitivity
-    assumptions: tuple[Any, ...]
     timing: SensorTiming | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        shape = tuple(self.batch_shape)
-        if (tuple(self.std.batch_shape), tuple(self.reliable.shape[:-1])) != (shape, shape):
-            raise ValueError(
-                f"vibration, std and reliable must have the same batch dimensions, got {shape}, "
-                f"{tuple(self.std.batch_shape)} and {tuple(self.reliable.shape[:-1])}"
-            )
-        if not shape and not all(isinstance(sentence, str) for sentence in self.assumptions):
-            raise TypeError("assumptions must be texts")
-
-    def summary(self) -> str:
-        """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
-        return detection_summary(self)
 
     @property
     def attitude(self) -> AttitudeTones | None:
@@ -274,34 +247,28 @@ class DetectionResult(
         batch = len(self.batch_shape)
 
         def first(values: Tensor) -> Tensor:
-            return values[..., :count]
-
-        def of_tones(values: Any) -> Any:
-            kept = {
-                name: (v[..., :count, :] if v.ndim == batch + 2 else v[..., :count]) if isinstance(v, Tensor) else v
-                for name, v in vars(values).items()
-            }
-            return type(values)(**kept)
+            """The first axes of values (..., A), or (..., A, K) of tones."""
+            return values[..., :count, :] if values.ndim == batch + 2 else values[..., :count]
 
         def of_findings(findings: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
             return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
 
-        curve = replace(
-            self.offsets,
-            offsets=first(self.offsets.offsets),
-            std=None if self.offsets.std is None else first(self.offsets.std),
-        )
+        std = self.offsets.std
         return replace(
             self,
-            vibration=of_tones(self.vibration),
-            std=of_tones(self.std),
-            offsets=curve,
-            fitted=first(self.fitted),
-            gain=self.gain[..., :count, :],
+            vibration=self.vibration.mapped(first),
+            std=self.std.mapped(first),
+            gain=first(self.gain),
             residual=first(self.residual),
             reliable=first(self.reliable),
             findings=of_findings(self.findings, batch),
-            sensitivity=of_tones(self.sensitivity),
+            offsets=replace(
+                self.offsets,
+                offsets=self.offsets.offsets[..., :count],
+                std=None if std is None else std[..., :count],
+            ),
+            fitted=self.fitted[..., :count],
+            sensitivity=self.sensitivity.mapped(first),
         )
 
     def with_tones(self, count: int) -> "DetectionResult":

@@ -16,7 +16,7 @@ from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.reason import Reason, read_findings
 from rsvib_torch.core.validation import Section, checked
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.detected_vibration import DetectedVibration, Detection
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
@@ -154,7 +154,7 @@ class DetectionRecord(Section):
     assumptions: list[str] = Field(default_factory=list[str])
 
     @classmethod
-    def from_detection(cls, detection: Detection, **fields: Any) -> Self:
+    def from_detection(cls, detection: DetectedVibration, **fields: Any) -> Self:
         """The record of a detection (not a batch); ``fields`` are those of a derived record."""
         return cls(
             vibration=VibrationRecord.from_vibration(detection.vibration),
@@ -189,7 +189,7 @@ class DetectionRecord(Section):
         )
 
 
-def detection_to_json(detection: Detection | None) -> dict[str, Any] | None:
+def detection_to_json(detection: DetectedVibration | None) -> dict[str, Any] | None:
     """Content of the ``DetectionRecord`` of a detection; None for None."""
     return None if detection is None else DetectionRecord.from_detection(detection).model_dump()
 

@@ -1,7 +1,7 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from torch import Tensor
 
@@ -9,67 +9,29 @@ from rsvib_torch.core.presentation import JudgedResult, verdict_table
 from rsvib_torch.core.text import wrapped
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
 
-__all__ = ["Detected", "DetectedVibration", "detection_summary"]
-
-
-@runtime_checkable
-class Detected(Protocol):
-    """A vibration in image axes with its standard deviations and a verdict; what restoration needs of a detection."""
-
-    @property
-    def vibration(self) -> Vibration:
-        """The vibration, of batch shape () or (B,)."""
-
-    @property
-    def std(self) -> Any:
-        """Standard deviations ``amplitude``, ``frequency``, ``phase``, ``image_motion``, shaped as the vibration's."""
-
-    @property
-    def reliable(self) -> Any:
-        """(..., A) verdict for each axis."""
-
-    @property
-    def reasons(self) -> tuple[Any, ...]:
-        """Texts of the reasons against each axis; a tuple of those for a batch."""
-
-
-@runtime_checkable
-class Detection(Detected, Protocol):
-    """The attributes of ``DetectedVibration``; a ``DetectionResult`` that is not a batch has them as well."""
-
-    @property
-    def gain(self) -> Tensor: ...
-    @property
-    def residual(self) -> Tensor: ...
-    @property
-    def findings(self) -> tuple[Any, ...]: ...
-    @property
-    def assumptions(self) -> tuple[Any, ...]: ...
-
-
-def detection_summary(detection: Detection) -> str:
-    """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
-    vibration, std = detection.vibration, detection.std
-    rows = [cells for _, cells in tone_rows(vibration, std)]
-    head = tone_head(axes=vibration.num_axes)
-    table, *verdict = verdict_table(head, rows, vibration.batch_shape, detection.reliable, detection.reasons)
-    if not vibration.batch_shape:
-        verdict += [wrapped(f"assumed: {text}") for text in detection.assumptions]
-    return "\n".join([table, *image_motion_line(vibration, std), *verdict])
+__all__ = ["DetectedVibration"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DetectedVibration(JudgedResult):
-    """A detection without its offset curve: everything that restoration needs.
+class DetectedVibration(
+    JudgedResult,
+    shapes={
+        "gain": "... A K",
+        **dict.fromkeys(("residual", "reliable"), "... A"),
+        **dict.fromkeys(("findings", "assumptions"), "..."),
+    },
+):
+    """A detection without its offset curve: everything that restoration needs. A batch leads all tensors.
 
     Attributes:
-        vibration: The vibration in image axes.
+        vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
         std: Standard deviations of its parameters, infinite where unknown.
-        gain: (2, K) offset gain of Eq. (7) from displacement to offset.
-        residual: (2,) px, mean absolute difference of measured and fitted offsets.
-        reliable: (2,) bool, verdict for each axis (x, y).
-        findings: Each ``Reason`` against each axis; ``reasons`` has their texts.
-        assumptions: What the frames cannot contradict, one sentence for each.
+        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
+        residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
+        reliable: (..., 2) bool, verdict for each axis (x, y).
+        findings: Each ``Reason`` against each axis that is not reliable; a tuple of those for a batch. ``reasons`` has
+            their texts.
+        assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
     """
 
     vibration: Vibration
@@ -78,8 +40,24 @@ class DetectedVibration(JudgedResult):
     residual: Tensor
     reliable: Tensor
     findings: tuple[Any, ...]
-    assumptions: tuple[Any, ...] = ()
+    assumptions: tuple[Any, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shape = tuple(self.batch_shape)
+        if (tuple(self.std.batch_shape), tuple(self.reliable.shape[:-1])) != (shape, shape):
+            raise ValueError(
+                f"vibration, std and reliable must have the same batch dimensions, got {shape}, "
+                f"{tuple(self.std.batch_shape)} and {tuple(self.reliable.shape[:-1])}"
+            )
+        if not shape and not all(isinstance(sentence, str) for sentence in self.assumptions):
+            raise TypeError("assumptions must be texts")
 
     def summary(self) -> str:
-        """Tones of each axis with standard deviations, then the verdict."""
-        return detection_summary(self)
+        """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
+        rows = [cells for _, cells in tone_rows(self.vibration, self.std)]
+        head = tone_head(axes=self.vibration.num_axes)
+        table, *verdict = verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons)
+        if not self.batch_shape:
+            verdict += [wrapped(f"assumed: {text}") for text in self.assumptions]
+        return "\n".join([table, *image_motion_line(self.vibration, self.std), *verdict])

@@ -34,7 +34,7 @@ from rsvib_torch.detection import (
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
-from rsvib_torch.motion.detected_vibration import Detection
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -224,7 +224,10 @@ def offset_figure(result: DetectionResult) -> Figure:
 
 @checks_arguments
 def windows_figure(
-    times: Sequence[float], detections: Sequence[Detection | None], *, time_label: str = "start of the window (s)"
+    times: Sequence[float],
+    detections: Sequence[DetectedVibration | None],
+    *,
+    time_label: str = "start of the window (s)",
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 
@@ -259,7 +262,7 @@ def windows_figure(
         ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
     for index, found in enumerate(detections):
-        if found is not None and not isinstance(found, Detection):
+        if found is not None and not isinstance(found, DetectedVibration):
             raise TypeError(f"detections[{index}] must be a detection or None, got {described(found)}")
     figure = _Drawing(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, squeeze=False)

@@ -10,7 +10,7 @@ from rsvib_torch.core.arrays import Channels
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
-from rsvib_torch.motion.detected_vibration import Detected
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.noise import estimate_noise
@@ -24,7 +24,7 @@ __all__ = ["predict_noise_gain"]
 def predict_noise_gain(
     frames: FramesOrFiles,
     timing: SensorTiming,
-    vibration: Motion | Detected,
+    vibration: Motion | DetectedVibration,
     *,
     method: str = "exact",
     columns: int = 256,

@@ -17,7 +17,7 @@ from rsvib_torch.core.text import text_table
 from rsvib_torch.frames.prepare import Saturation, prepare_frames
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.io.stack_reading import FramesOrFiles
-from rsvib_torch.motion.detected_vibration import Detected
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -124,7 +124,7 @@ def _inner(image: Tensor, points: int) -> slice:
 def restoration_mtf(
     frames: FramesOrFiles,
     timing: SensorTiming,
-    vibration: Motion | Detected,
+    vibration: Motion | DetectedVibration,
     *,
     full_scale: float | None = None,
     channels: Channels = None,

@@ -26,7 +26,7 @@ from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.io.stack_reading import FramesOrFiles
-from rsvib_torch.motion.detected_vibration import Detected
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.banded import restore_banded
@@ -180,23 +180,26 @@ def check_optics(optics: Optics | Mapping[str, Any] | None, method: str) -> Opti
 
 @overload
 def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[ExactOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, **options: Unpack[ExactOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[BandedOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, **options: Unpack[BandedOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[DewarpOptions]
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, **options: Unpack[DewarpOptions]
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, **options: Unpack[RichardsonLucyOptions]
+    frames: FramesOrFiles,
+    timing: SensorTiming,
+    vibration: Motion | DetectedVibration,
+    **options: Unpack[RichardsonLucyOptions],
 ) -> Tensor: ...
 @overload
 def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | Detected, *, method: str, **options: Any
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, *, method: str, **options: Any
 ) -> Tensor: ...
 @outside_graphs
 @full_precision
@@ -204,7 +207,7 @@ def restore(
 def restore(
     frames: FramesOrFiles,
     timing: SensorTiming,
-    vibration: Motion | Detected,
+    vibration: Motion | DetectedVibration,
     *,
     method: str = "exact",
     full_scale: float | None = None,
@@ -455,6 +458,8 @@ class VibrationRestorer(nn.Module):
         self.options = {"method": method, **common, **camera, **options}
 
     @checks_arguments
-    def forward(self, frames: FramesOrFiles, vibration: Motion | Detected, ignore: ArrayLike | None = None) -> Tensor:
+    def forward(
+        self, frames: FramesOrFiles, vibration: Motion | DetectedVibration, ignore: ArrayLike | None = None
+    ) -> Tensor:
         """Restore a stack of frames."""
         return restore(frames, self.timing, vibration, ignore=ignore, **self.options)

@@ -26,7 +26,7 @@ from rsvib_torch.io.full_scale import (
     frames_to_counts,
     known_full_scale,
 )
-from rsvib_torch.motion.detected_vibration import Detected
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
@@ -66,7 +66,7 @@ class RestoredFrames:
 def restore_trusted(
     frames: Tensor,
     timing: SensorTiming,
-    motion: Motion | Detected,
+    motion: Motion | DetectedVibration,
     options: Mapping[str, Any],
     *,
     force: bool = False,

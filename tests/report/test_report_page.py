@@ -52,14 +52,14 @@ def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
     return DetectionResult(
         vibration,
         std,
-        curve,
-        offsets,
         gain,
         torch.zeros(2).double(),
         torch.tensor(reliable),
         read_findings(reasons),
-        TimingSensitivity(*[gain] * 6),
         (),
+        curve,
+        offsets,
+        TimingSensitivity(*[gain] * 6),
     )
 
 

@@ -51,14 +51,14 @@ def draw_result() -> DetectionResult:
     return DetectionResult(
         vibration,
         std,
-        curve,
-        fitted,
         gain,
         residual,
         torch.tensor([True, False]),
         findings,
-        TimingSensitivity(*[gain] * 6),
         ("row_time=2e-05 s: assumed",),
+        curve,
+        fitted,
+        TimingSensitivity(*[gain] * 6),
     )
 
 

@@ -22,7 +22,7 @@ from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
-from rsvib_torch.motion.detected_vibration import Detected
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups, judged_strip
@@ -312,7 +312,7 @@ def judge_restoration(
     frames: FramesOrFiles,
     restored: FramesOrFiles,
     timing: SensorTiming,
-    vibration: Motion | Detected,
+    vibration: Motion | DetectedVibration,
     *,
     joint: bool | int = False,
     full_scale: float | None = None,

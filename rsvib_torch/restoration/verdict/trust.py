@@ -10,7 +10,7 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.motion.detected_vibration import Detected
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -55,7 +55,7 @@ def displacement_uncertainty(
 
 @checks_arguments
 def trusted_vibration(
-    detected: Detected, timing: SensorTiming, num_frames: int, num_rows: int
+    detected: DetectedVibration, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Vibration, tuple[Reason, ...]]:
     """The part of a detected vibration that is accurate enough to be undone.
 
@@ -110,7 +110,7 @@ def trusted_vibration(
 
 
 def vibration_to_undo(
-    vibration: Motion | Detected, timing: SensorTiming, num_frames: int, num_rows: int
+    vibration: Motion | DetectedVibration, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Motion, tuple[Reason, ...]]:
     """A given motion unchanged; of a detection the accurate part, and a reason for each axis not restored.
 
@@ -119,7 +119,7 @@ def vibration_to_undo(
     """
     if isinstance(vibration, Motion):
         return vibration, ()
-    if not all(hasattr(vibration, name) for name in ("vibration", "std", "reliable", "reasons")):
+    if not isinstance(vibration, DetectedVibration):
         remedy = "; pass its .motion" if hasattr(vibration, "motion") else ""
         raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}{remedy}")
     return trusted_vibration(vibration, timing, num_frames, num_rows)
