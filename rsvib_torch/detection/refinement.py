@@ -354,7 +354,8 @@ def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
     weighted = measurements.reweighted(residual)
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
     weighted = replace(weighted, independent=share)
-    fit = fit_tones(weighted, fit, fit.active, fit.model)
+    exact = fit_tones(weighted, fit, fit.active, fit.model)
+    fit = select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)  # the exact fit may diverge
     tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
     other = OtherMotion.of(measurements, tones, residual, record.differential())
     return FittedRows(
