@@ -1,22 +1,22 @@
 import threading
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from exact_steps import FixedStrength, solved, stack_of
 from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
-import rsvib_torch.restoration.exact.exact as exact_module
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
 from rsvib_torch.evaluation.scenes import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
-from rsvib_torch.restoration.exact import scene_solver
+from rsvib_torch.restoration.exact.exact import model_stacks, solve_scenes
 from rsvib_torch.restoration.exact.filling import Extended
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior
+from rsvib_torch.restoration.exact.priors import PRIORS, Prior, PriorOptions
 from rsvib_torch.restoration.exact.scene_solver import Partition
+from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -31,20 +31,6 @@ def short():
     motion = Motion()
     scene = draw_scene(336, 288, seed=12)
     return crop(scene), take_frames(scene, TIMING, motion, 2), motion
-
-
-@pytest.fixture
-def prior_fitted_once(monkeypatch):
-    """Reuse the prior of the first call, so that results depend on the frames only through the solution."""
-    fitted = []
-
-    def fit_once(*arguments):
-        if not fitted:
-            fitted.append(original(*arguments))
-        return fitted[0]
-
-    original = exact_module.fit_prior
-    monkeypatch.setattr(exact_module, "fit_prior", fit_once)
 
 
 def with_noise(frames, noise, seed=5, dtype=torch.float32):
@@ -112,16 +98,15 @@ def test_flat_scene_stays_flat_and_flux_is_conserved():
     assert (restored - 0.2).sum().item() == pytest.approx((lamp - 0.2).sum().item(), rel=5e-3)
 
 
-def test_boundaries_are_not_periodic(short, prior_fitted_once):
+def test_boundaries_are_not_periodic(short):
     _, frames, motion = short
     frames = as_tensor(frames)
     other = frames.clone()
     other[:, :8] = 1.0
     other[:, :, :8] = 1.0
-    options = {"noise": 0.01, "regularisation": 1.0}
-    change = restore(other, TIMING, motion.vibration(), **options) - restore(
-        frames, TIMING, motion.vibration(), **options
-    )
+    stack, changed = (stack_of(images, TIMING, motion.vibration(), noise=0.01) for images in (frames, other))
+    # with one prior, so that results depend on the frames only through the solution
+    change = solved(changed, prior=stack.prior, strengths=FixedStrength()) - solved(stack, strengths=FixedStrength())
     assert change[:, :4, :4].abs().max() > 0.1
     assert change[:, 64:, -32:].abs().max() < 0.01
     assert change[:, -32:, 64:].abs().max() < 0.01
@@ -151,13 +136,13 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     options = {"joint": joint, "check": False}
     found = []
     parts = []
-    gaussian = PRIORS["gaussian"]
+    gaussian = PRIORS["gaussian"].function
 
     def recorded_prior(problem, options):
         parts.append((threading.current_thread(), torch.is_grad_enabled()))
-        return gaussian.function(problem, options)
+        return gaussian(problem, options)
 
-    monkeypatch.setitem(PRIORS, "gaussian", replace(gaussian, function=recorded_prior))
+    monkeypatch.setitem(PRIORS, "gaussian", Prior(recorded_prior))  # solves one scene at a time
     try:
         for threads, workers in ((2, 2), (1, 1)):
             parts.clear()
@@ -279,7 +264,7 @@ def test_bad_input(options, error, message):
 
 
 @pytest.mark.parametrize("joint", [False, True])
-def test_results_do_not_depend_on_segments(short, joint, monkeypatch):
+def test_results_do_not_depend_on_segments(short, joint):
     _, frames, motion = short
     frames = with_noise(frames, 0.02)[..., :64]
     frames = torch.cat([frames, frames.flip(-2)], dim=-2).requires_grad_()
@@ -296,34 +281,22 @@ def test_results_do_not_depend_on_segments(short, joint, monkeypatch):
                 frames, TIMING, motion.vibration(), segments=3, chunk_frequencies=chunk, check=False, joint=joint
             )
             torch.testing.assert_close(again, whole.detach(), rtol=0, atol=2e-5)
-    windows = scene_solver.row_windows
-    monkeypatch.setattr(scene_solver, "row_windows", lambda rows, count: windows(rows, count, overlap=2))
-    too_small_overlap = restore(frames, TIMING, motion.vibration(), segments=3, check=False, joint=joint)
-    assert (too_small_overlap - whole).abs().max() > 1e-3
 
 
 @pytest.mark.parametrize("exposure", [20, 300])
-def test_segments_are_used_only_without_blur(exposure, monkeypatch):
+def test_segments_are_used_only_without_blur(exposure):
     """At 300 rows of exposure and no noise, errors of segments would exceed the brightness of the scene."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure, frame_rows=2048)
     vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
     scene = city_and_fields(1200 + 96, 64 + 96, seed=4)
     frames = simulate_frames(scene, timing, vibration, 1, frame_size=(1200, 64))
-    counts = []
-    divide = Partition.divide
-
-    def counted_call(*arguments, **options):
-        parts, windows = divide(*arguments, **options)
-        counts.append(len(windows))
-        return parts, windows
-
-    monkeypatch.setattr(Partition, "divide", counted_call)
+    blurred = stack_of(frames, timing, vibration, noise=0.01).kernels([0], 0).blurred
+    assert blurred == (exposure == 300)
     whole = restore(frames, timing, vibration, segments=1, check=False)
-    assert set(counts) == {1}
-    for options in ({}, {"segments": 4}):
-        counts.clear()
-        restored = restore(frames, timing, vibration, check=False, **options)
-        assert max(counts) == (1 if exposure == 300 else options.get("segments", 2))
+    for segments, windows in ((1, 1), (None, 2), (4, 4)):
+        _, used = Partition(segments=segments).divide(1220, 7, 50, frames.device, blurred=blurred, keep=False)
+        assert len(used) == (1 if blurred else windows)
+        restored = restore(frames, timing, vibration, check=False, segments=segments)
         torch.testing.assert_close(restored, whole, rtol=0, atol=2e-5)
     inner = (0, slice(48, -48), slice(16, -16))
     assert psnr(whole[inner], scene[48:-48, 48:-48][inner[1:]], 1.0) > (35 if exposure == 300 else 50)
@@ -345,55 +318,49 @@ def test_gradients_through_filled_pixels_and_ends(joint):
     assert torch.autograd.gradcheck(run, values, fast_mode=True)
 
 
-def test_only_strips_at_the_ends_of_the_rows_are_filled(monkeypatch):
+def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
     timing = SensorTiming(row_time=1e-4, exposure_rows=75, frame_rows=400)
-    motion = Vibration([1.5, 1.2, 2.6e-3], [53.0, 65.0, 41.0], [0.4, 1.3, 0.2])
+    motion, still = (Vibration(size, [53.0, 65.0], [0.4, 1.3]) for size in ([3.0, 1.2], [0.0, 0.0]))
     scene = city_and_fields(256, 400, seed=5)
     noise = 0.005 * torch.randn(192, 336, generator=torch.Generator().manual_seed(5))
-    still = Vibration([0.0, 0.0], [1.0, 1.0])
     frame, expected = (simulate_frames(scene, timing, each, 1, frame_size=(192, 336)) for each in (motion, still))
-    fill, extended = exact_module.filled, []
+    stack = stack_of(frame + noise, timing, motion, noise=0.005)
 
     def at_ends(images):
         return torch.cat([images[..., 24:-24, :24], images[..., 24:-24, -24:]], -1)
 
-    def restored(extension):
-        def replaced(scenes):
-            extended.append([isinstance(scene, Extended) for scene in scenes])
-            return extension(scenes)
-
-        monkeypatch.setattr(exact_module, "filled", replaced)
-        return restore_by_any_method(frame + noise, timing, motion, noise=0.005)
-
-    quality = psnr(at_ends(restored(fill)), at_ends(expected), 1.0)
-    assert extended == [[True, False, False, False, True]]
-    not_filled = restored(lambda scenes: [getattr(scene, "problem", scene) for scene in scenes])
-    assert quality > psnr(at_ends(not_filled), at_ends(expected), 1.0) + 0.5
+    filled, not_filled = (
+        psnr(at_ends(solved(stack, fills_ends=fills)), at_ends(expected), 1.0) for fills in (True, False)
+    )
+    assert filled > not_filled + 0.5
+    of_frames = frame_motion(motion.expanded(5), timing.in_row_order(), 1, 192)
+    strips = (frame + noise).unfold(-1, 80, 64).movedim(-2, 0)[:, :, None]  # (5, 1, 1, 192, 80)
+    problems = [
+        scene.problem(Partition())
+        for strip in model_stacks(strips, of_frames, noise=0.005, strips=5)
+        for scene in strip.scenes([([0], 0)], 1.0)
+    ]
+    assert [isinstance(problem, Extended) for problem in problems] == [True, False, False, False, True]
 
 
 @pytest.mark.parametrize(("amplitude", "shapes"), [(3.0, 1), (8.0, 2)])
-def test_scenes_filled_together_equal_single_ones(monkeypatch, amplitude, shapes):
+def test_scenes_filled_together_equal_single_ones(amplitude, shapes):
     """Two stacks of three frames; larger amplitudes need longer periods."""
     timing = SensorTiming(row_time=1e-4, exposure_rows=75, frame_rows=200)
     motions = [Vibration([size, 1.2], [53.0, 65.0], [0.4, 1.3]) for size in (3.0, amplitude)]
     scene = city_and_fields(176, 176, seed=5)
     frames = torch.stack([simulate_frames(scene, timing, motion, 3, frame_size=(96, 96)) for motion in motions])
-    frames = (frames + 0.01 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(5)))[:, :, None]
-    motion = Vibration([[[3.0], [1.2]], [[amplitude], [1.2]]], [[53.0], [65.0]], [[0.4], [1.3]])
-    fill, together = exact_module.filled, []
-
-    def counted(scenes):
-        together.append(len({scene.problem.data.shape for scene in scenes}))
-        return fill(scenes)
-
-    monkeypatch.setattr(exact_module, "filled", counted)
-    monkeypatch.setattr(exact_module.Partition, "threads", staticmethod(lambda device: 1))
-    monkeypatch.setattr(exact_module, "_FILLED_TOGETHER", 6)
-    found = restore_by_any_method(frames, timing, motion, noise=0.01)
-    assert together == [shapes]
-    monkeypatch.setattr(exact_module, "_FILLED_TOGETHER", 1)
-    single = restore_by_any_method(frames, timing, motion, noise=0.01)
-    assert len(together) == 7
+    frames = frames + 0.01 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(5))
+    scenes = [
+        scene
+        for images, motion in zip(frames, motions, strict=True)
+        for scene in stack_of(images, timing, motion, noise=0.01).scenes(joint_groups(3, False), 1.0)
+    ]
+    assert len({scene.problem(Partition()).problem.data.shape for scene in scenes}) == shapes
+    found, single = (
+        solve_scenes(scenes, PRIORS["gaussian"], PriorOptions(), Partition(), filled_together=count)[0]
+        for count in (6, 1)
+    )
     torch.testing.assert_close(found, single, rtol=0, atol=2e-5)
 
 

@@ -7,10 +7,8 @@ from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration.exact import strength
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model import sampled_rows
-from rsvib_torch.restoration.scene_model.cross_validation import Explained, sample_rows
+from rsvib_torch.restoration.scene_model.cross_validation import Explained, sample_rows, select_strength
 from rsvib_torch.restoration.scene_model.observation import row_kernels
 from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
@@ -63,10 +61,9 @@ def dense(frames, kernels, u, products, rows):
 
 
 @pytest.mark.parametrize("slab", [1000, 128, 80])
-def test_slabs_are_fitted_independently(slab_data, monkeypatch, slab):
+def test_slabs_are_fitted_independently(slab_data, slab):
     frames, kernels, chosen, precision = slab_data
-    monkeypatch.setattr(sampled_rows, "_SLAB", slab)
-    found = sample_rows(frames, kernels, chosen).explain([precision, 0.25 * precision])
+    found = sample_rows(frames, kernels, chosen, slab).explain([precision, 0.25 * precision])
     number = max(1, NUM_ROWS // slab)
     height = NUM_ROWS // number
     assert found.count == 2 * number * height
@@ -101,5 +98,5 @@ def test_weak_priors_are_tried_only_if_the_third_is_selected(errors, expected, c
         power = torch.tensor([errors[int(number)] for number in some], dtype=torch.float64)[:, None].exp()
         return Explained(power, torch.zeros_like(power), 100)
 
-    assert strength.select_strength(strengths, precisions, explain) == expected
+    assert select_strength(strengths, precisions, explain) == expected
     assert tried == calls

@@ -1,17 +1,19 @@
 """Strength of the prior estimated from the data, compared with the best of several strengths."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from exact_steps import FixedStrength, solved, stack_of
 from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore as restore_by_any_method
-from rsvib_torch.restoration.exact import exact
-from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
+from rsvib_torch.restoration.scene_model.cross_validation import Strengths
 from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
@@ -32,16 +34,19 @@ SCENES = {
 }
 
 
-@pytest.fixture
-def without_choice(monkeypatch):
-    """Restore with the strength that follows from the noise level, times a factor."""
+class CountedStrengths(Strengths):
+    """Counts the strengths that are selected from the frames."""
 
-    def run(frames, timing, **options):
-        with monkeypatch.context() as patch:
-            patch.setattr(exact, "prior_strength", lambda *arguments, **named: 1.0)
-            return restore(frames, timing, MOTION.vibration(), **options)
+    def __init__(self):
+        super().__init__()
+        self.selected = 0
 
-    return run
+    def of(self, noise, choose):
+        def counted():
+            self.selected += 1
+            return choose()
+
+        return super().of(noise, counted)
 
 
 @pytest.mark.parametrize(
@@ -56,14 +61,15 @@ def without_choice(monkeypatch):
         ("dense texture", 20, 0.001, 2, True, -0.1, 0.3),
     ],
 )
-def test_estimated_strength_is_close_to_the_best(without_choice, name, rows, noise, given, joint, least, within):
+def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint, least, within):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     scene = SCENES[name]()
     clean = take_frames(scene, timing, MOTION, 2, samples=64)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()[:given]
     found = decibel(restore(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
+    stack = stack_of(frames, timing, MOTION.vibration())
     by_hand = {
-        factor: decibel(without_choice(frames, timing, joint=joint, regularisation=factor)[0], crop(scene))
+        factor: decibel(solved(stack, joint=joint, regularisation=factor, strengths=FixedStrength())[0], crop(scene))
         for factor in (0.03, 0.1, 0.3, 1.0, 3.0)
     }
     assert found > max(by_hand.values()) - within
@@ -90,19 +96,15 @@ def test_interpolation_error_depends_on_the_blur_of_each_frame():
 @pytest.mark.parametrize(
     ("name", "rows", "noise", "choices"), [("buildings", 20, 0.005, 1), ("dense texture", 100, 0.001, 2)]
 )
-def test_frames_of_the_same_noise_share_a_strength(monkeypatch, name, rows, noise, choices):
+def test_frames_of_the_same_noise_share_a_strength(name, rows, noise, choices):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     clean = take_frames(SCENES[name](), timing, MOTION, 2, samples=48)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
-    made = []
-    choose = exact.prior_strength
-    monkeypatch.setattr(
-        exact, "prior_strength", lambda *arguments, **named: made.append(choose(*arguments, **named)) or made[-1]
-    )
-    restore(frames, timing, MOTION.vibration())
-    assert len(made) == choices
-    restore(frames, timing, MOTION.vibration(), joint=True)
-    assert len(made) == choices + 1
+    stack = stack_of(frames, timing, MOTION.vibration())
+    for joint, expected in ((False, choices), (True, 1)):
+        counted = replace(stack, strengths=CountedStrengths())
+        counted.scenes(joint_groups(2, joint), 1.0)
+        assert counted.strengths.selected == expected
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -367,8 +367,8 @@ def solve_scenes(
     """
     stack = scenes[0].stack
 
-    def solve(task: list[Scene], problems: list[SceneProblem]) -> list[tuple[Tensor, Misfit | None]]:
-        """Images and misfits of the scenes of a task, without missing values."""
+    def solve(problems: list[SceneProblem]) -> list[tuple[Tensor, Misfit | None]]:
+        """Deviations of scenes from their brightness, and misfits, for data without missing values."""
         solved: list[tuple[Tensor, Misfit | None]]
         if stack.scale != 1:
             solved = [finer_scene(problem, stack.frames.shape[-1], neglected) for problem in problems]
@@ -378,24 +378,28 @@ def solve_scenes(
         else:
             solved = [(prior.function(problem, options), None) for problem in problems]
         width = stack.scale * stack.frames.shape[-1]
-        return [
-            (image[..., :width] + scene.stack.mean, misfit) for scene, (image, misfit) in zip(task, solved, strict=True)
-        ]
+        return [(image[..., :width], misfit) for image, misfit in solved]
 
     # With gradients, one scene after the other.
     given = (value for scene in scenes for value in (scene.stack.frames, scene.stack.displacement))
     if torch.is_grad_enabled() and any(value.requires_grad for value in given):
-        results = [result for scene in scenes for result in solve([scene], filled([scene.problem(partition)]))]
-        return torch.stack([image for image, _ in results]), [misfit for _, misfit in results if misfit is not None]
+        results = [result for scene in scenes for result in solve(filled([scene.problem(partition)]))]
+        deviations = zip(scenes, results, strict=True)
+        restored = torch.stack([image + scene.stack.mean for scene, (image, _) in deviations])
+        return restored, [misfit for _, misfit in results if misfit is not None]
 
-    # Scenes of few frequencies are solved together in one task, as many as two threads leave for each.
+    # Scenes of few frequencies are solved together in one task, as many as two threads leave for each. Those in the
+    # coordinates of the same frame have systems of about one size, and need no extension.
     device = stack.frames.device
     threads = Partition.threads(device)
     together = 1
     if prior.is_precision and stack.scale == 1:
         frequencies = max(scene.stack.period for scene in scenes) // 2 + 1
         together = max(1, min(SIDE_BY_SIDE // frequencies, -(-len(scenes) // threads)))
-    tasks = [scenes[place] for place in runs(len(scenes), together)]
+    tasks: list[list[int]] = []
+    for reference in sorted({scene.reference for scene in scenes}):
+        same = [number for number, scene in enumerate(scenes) if scene.reference == reference]
+        tasks += [same[place] for place in runs(len(same), together)]
     threads = min(threads, len(tasks))
     # each thread has its own memory
     partitions = [partition, *(Partition(partition.chunk, partition.segments) for _ in range(threads - 1))]
@@ -405,23 +409,22 @@ def solve_scenes(
     misfits: list[Misfit] = []
     advance = steps(len(tasks), "frames")
 
-    def solve_share(thread: int, share: list[tuple[int, list[SceneProblem]]]) -> None:
+    def solve_share(thread: int, share: list[tuple[list[int], list[SceneProblem]]]) -> None:
         """Solve the tasks of a thread."""
-        for number, problems in share:
-            in_own_memory = [replace(problem, partition=partitions[thread]) for problem in problems]
-            for place, (image, misfit) in enumerate(solve(tasks[number], in_own_memory), number * together):
-                images[place] = image
+        for task, problems in share:
+            solved = solve([replace(problem, partition=partitions[thread]) for problem in problems])
+            for number, (image, misfit) in zip(task, solved, strict=True):
+                images[number] = image + scenes[number].stack.mean
                 if misfit is not None:
                     misfits.append(misfit)
             advance()
 
     # Some tasks at a time: their problems are built, missing values are filled, and the systems are solved.
     for block in runs(len(tasks), filled_together):
-        numbers = range(block.start, block.stop)
-        built = in_parallel(lambda number: [scene.problem(partition) for scene in tasks[number]], numbers, device)
+        built = in_parallel(lambda task: [scenes[number].problem(partition) for number in task], tasks[block], device)
         with torch.no_grad():
             complete = iter(filled([problem for problems in built for problem in problems]))
-        problems = [(number, [next(complete) for _ in tasks[number]]) for number in numbers]
+        problems = [(task, [next(complete) for _ in task]) for task in tasks[block]]
         in_parallel(
             lambda thread: solve_share(thread, problems[thread::threads]),  # noqa: B023 - called in this round
             range(threads),

@@ -26,7 +26,7 @@ from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.scene_model.observation import SCALE, FinerObservation, finer_kernels
 from rsvib_torch.restoration.scene_model.scene_prior import fit_polynomial_prior
 
-__all__ = ["restore_mosaic"]
+__all__ = ["MosaicSolver", "restore_mosaic"]
 
 # Luminance, red - blue, and magenta - green. Orthonormal, so that white noise stays white; the three components of a
 # scene are nearly independent, those of the colours are not.

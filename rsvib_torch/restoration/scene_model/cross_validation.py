@@ -14,7 +14,7 @@ from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior
 
 __all__ = ["Explained", "SampledRows", "Strengths", "prior_strength", "sample_rows", "select_strength"]
 
-_SLAB = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
+_SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +88,16 @@ class SampledRows:
         return Explained(power, freedom, int((self.weight > 0).sum()))
 
 
-def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor) -> SampledRows:
+def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor, slab_rows: int = _SLAB_ROWS) -> SampledRows:
     """Spectra of tapered rows at a few frequencies, in slabs of rows.
 
     Args:
         images: (M, C, R, W); of up to n - 1 rows more than n slabs of equal height have, none is used.
         kernels: Kernels of their rows.
         chosen: (F,) whole numbers of cycles in W px.
+        slab_rows: Rows of a slab.
     """
-    slabs = max(1, images.shape[-2] // _SLAB)
+    slabs = max(1, images.shape[-2] // slab_rows)
     height, width = images.shape[-2] // slabs, images.shape[-1]
     count = slabs * height
     images, kernels = images[..., :count, :], kernels.rows(0, count)
