@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from benchmarks.measure import in_turns, seconds_of, shown_seconds
 from benchmarks.restoration import MARGIN, SEED, TIMED_NOISE, camera, vibration
-from rsvib_torch.restoration.scene_model.row_prior import ORDER
+from rsvib_torch.restoration.scene_model.scene_prior import ORDER
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
