@@ -7,7 +7,6 @@ measured displacements of the rows. ``other_timings`` confirms it by a detection
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Literal
@@ -51,6 +50,17 @@ class TimingDiagnosis:
     stated: float | str
     agreeing: float | str
     timing: SensorTiming
+
+    @classmethod
+    def between(cls, stated: SensorTiming, agreeing: SensorTiming) -> "TimingDiagnosis":
+        """The setting in which two timings differ; another row time also changes what is counted in rows."""
+        if stated.readout_direction != agreeing.readout_direction:
+            return cls("readout_direction", stated.readout_direction, agreeing.readout_direction, agreeing)
+        if stated.scan_axis != agreeing.scan_axis:
+            return cls("scan_axis", *(("y", "x") if stated.scan_axis == -2 else ("x", "y")), agreeing)
+        if stated.row_time != agreeing.row_time:
+            return cls("row_time", stated.row_time, agreeing.row_time, agreeing)
+        return cls("frame_rows", stated.frame_rows, agreeing.frame_rows, agreeing)
 
     @property
     def reason(self) -> Reason:
@@ -144,104 +154,64 @@ def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> d
     for index, findings in enumerate(found.findings):
         axes = contradicted_axes(findings)
         if any(axes):
-            diagnosis = _Diagnosis(stacks.one(index), timing, found, index, axes).result(rotates=rotates[index])
+            diagnosis = _diagnosis(stacks.one(index), timing, found, index, axes, rotates=rotates[index])
             if diagnosis is not None:
                 diagnoses[index] = diagnosis
     return diagnoses
 
 
-@dataclass(frozen=True, eq=False)
-class _Diagnosis:
-    """The timings that are tried for one stack.
+def _diagnosis(
+    stack: GreyFrames, timing: SensorTiming, found: Attempt, index: int, axes: tuple[bool, bool], *, rotates: bool
+) -> TimingDiagnosis | None:
+    """The setting with the value that one stack agrees with; None if it agrees with no other timing.
 
-    Attributes:
+    Args:
         stack: The frames, (1, T, H, W) in row order.
         timing: The sensor as stated, in image order.
         found: The attempt with this timing, of all stacks.
         index: The stack.
         axes: Axes (x, y) in row order that contradict the stated timing.
+        rotates: Whether the halves of the rows move apart, as they do with the wrong scan axis.
     """
+    num_frames, height, width = stack.images.shape[1:]
+    only = slice(index, index + 1)
 
-    stack: GreyFrames
-    timing: SensorTiming
-    found: Attempt
-    index: int
-    axes: tuple[bool, bool]
-
-    def result(self, *, rotates: bool) -> TimingDiagnosis | None:
-        """The setting with the value that the stack agrees with; None if it agrees with no other timing.
-
-        Args:
-            rotates: Whether the halves of the rows move apart, as they do with the wrong scan axis.
-        """
-        timing, row_timing = self.timing, self.timing.in_row_order()
-        num_frames, height, width = self.stack.images.shape[1:]
-        # The rows of a frame and the phase from frame to frame agree with one period of the frames.
-        part = slice(self.index, self.index + 1)
-        measurements = self.found.fitted.measurements.mapped(itemgetter(part))
-        agreeing = period_factor(measurements, row_timing, num_frames, BLOCK_ROWS) if num_frames > 2 else None
-        factor, tones = (None, None) if agreeing is None else agreeing
-        if factor is not None and factor < 0:
-            if self._agrees(row_timing, change=lambda images: images.flip(-2), tones=tones):
-                other: Literal["forward", "reverse"] = "reverse" if timing.readout_direction == "forward" else "forward"
-                changed = replace(timing, readout_direction=other)
-                return TimingDiagnosis("readout_direction", timing.readout_direction, other, changed)
-        elif factor is not None and timing.frame_start_times is None:
-            frame_rows = factor * timing.frame_rows
-            if frame_rows >= max(height, timing.exposure_rows) and self._agrees(
-                replace(row_timing, frame_rows=frame_rows), tones=tones
-            ):
-                return TimingDiagnosis(
-                    "frame_rows", timing.frame_rows, frame_rows, replace(timing, frame_rows=frame_rows)
-                )
-        elif factor is not None:
+    # 1. The candidates, each with the frequencies of one tone of each axis if they are known. The rows of a frame and
+    # the phase from frame to frame agree with one period of the frames.
+    candidates: list[tuple[SensorTiming, Tensor | None]] = []
+    measurements = found.fitted.measurements.mapped(itemgetter(only))
+    agreeing = None
+    if num_frames > 2:
+        agreeing = period_factor(measurements, timing.in_row_order(), num_frames, BLOCK_ROWS)
+    if agreeing is not None:
+        factor, tones = agreeing
+        if factor < 0:
+            is_forward = timing.readout_direction == "forward"
+            candidates.append((replace(timing, readout_direction="reverse" if is_forward else "forward"), tones))
+        elif timing.frame_start_times is not None:
             times = {name: getattr(timing, name) * factor for name in ("frame_rows", "exposure_rows")}
-            times["row_time"] = timing.row_time / factor
-            if self._agrees(replace(row_timing, **times), tones=tones):
-                return TimingDiagnosis("row_time", timing.row_time, times["row_time"], replace(timing, **times))
-        # With the wrong scan axis, the halves of a row are exposed at different times and move apart.
-        swapped = (self.axes[1], self.axes[0])
-        if (
-            rotates
-            and width <= timing.frame_rows
-            and fits_frame(width, height, self.found.options.bands)
-            and self._agrees(row_timing, change=lambda images: images.mT, concerned=swapped)
-        ):
-            if timing.scan_axis == -2:
-                return TimingDiagnosis("scan_axis", "y", "x", replace(timing, scan_axis="x"))
-            return TimingDiagnosis("scan_axis", "x", "y", replace(timing, scan_axis="y"))
-        return None
+            candidates.append((replace(timing, row_time=timing.row_time / factor, **times), tones))
+        elif factor * timing.frame_rows >= max(height, timing.exposure_rows):
+            candidates.append((replace(timing, frame_rows=factor * timing.frame_rows), tones))
+    # With the wrong scan axis, the halves of a row are exposed at different times and move apart.
+    if rotates and width <= timing.frame_rows and fits_frame(width, height, found.options.bands):
+        candidates.append((replace(timing, scan_axis="x" if timing.scan_axis == -2 else "y"), None))
 
-    def _agrees(
-        self,
-        timing: RowTiming,
-        *,
-        change: Callable[[Tensor], Tensor] | None = None,
-        concerned: tuple[bool, bool] | None = None,
-        tones: Tensor | None = None,
-    ) -> bool:
-        """Whether detection with another timing is reliable along the axes that contradict the stated one.
-
-        Args:
-            timing: The other timing, in row order.
-            change: Change of the frames from the stated to the other order of rows; None for none.
-            concerned: The axes; None for those that contradict the stated timing.
-            tones: (1, 2, 1) Hz of one tone of each axis, if they are known.
-        """
-        stack, bands = self.stack, None
-        if change is None:
-            curve, part = self.found.start.curve, slice(self.index, self.index + 1)
-            bands = replace(curve, offsets=curve.offsets[part], quality=curve.quality[part])
+    # 2. The first one with which detection is reliable along the axes that contradict the stated timing.
+    for candidate, known in candidates:
+        turned, curve, bands = stack, found.start.curve, None
+        if (candidate.scan_axis, candidate.readout_direction) == (timing.scan_axis, timing.readout_direction):
+            bands = replace(curve, offsets=curve.offsets[only], quality=curve.quality[only])
         else:
-            valid = None if stack.valid is None else change(stack.valid)
-            stack = replace(stack, images=change(stack.images), valid=valid)
-        height, width = stack.images.shape[-2:]
-        hypothesis = Hypothesis(FieldScale(2, width, height), is_doubtful=True, bands=bands, frequencies=tones)
-        other = attempt(stack, timing, self.found.options, hypothesis)
-        if other.statuses[0] == "abandoned":
-            return False
-        axes = zip(other.findings[0], self.axes if concerned is None else concerned, strict=True)
-        return all(not against or not axis for against, axis in axes)
+            turned = stack.with_timing(candidate)
+        scale = FieldScale(2, turned.images.shape[-1], turned.images.shape[-2])
+        hypothesis = Hypothesis(scale, is_doubtful=True, bands=bands, frequencies=known)
+        other = attempt(turned, candidate.in_row_order(), found.options, hypothesis)
+        concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
+        refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))
+        if other.statuses[0] != "abandoned" and not refused:
+            return TimingDiagnosis.between(timing, candidate)
+    return None
 
 
 # Frame period

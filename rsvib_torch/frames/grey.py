@@ -7,6 +7,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arrays import Channels
 from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
@@ -44,6 +45,15 @@ class GreyFrames:
         part = slice(index, index + 1)
         valid = None if self.valid is None else self.valid[part]
         return replace(self, images=self.images[part], valid=_unless_complete(valid), batched=False)
+
+    def with_timing(self, timing: SensorTiming) -> "GreyFrames":
+        """The same stacks in the row order of another timing."""
+
+        def turned(values: Tensor) -> Tensor:
+            return frames_to_row_order(frames_from_row_order(values, self.timing), timing)
+
+        valid = None if self.valid is None else turned(self.valid)
+        return replace(self, images=turned(self.images), valid=valid, timing=timing)
 
 
 def _unless_complete(valid: Tensor | None) -> Tensor | None:

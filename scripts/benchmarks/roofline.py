@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from benchmarks.measure import in_turns, seconds_of, shown_seconds
 from benchmarks.restoration import MARGIN, SEED, TIMED_NOISE, camera, vibration
-from rsvib_torch.restoration.scene_model.scene_prior import ORDER
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
@@ -27,6 +26,7 @@ from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.scene_model.observation import Observation, row_kernels, scene_weights, smooth_kernels
+from rsvib_torch.restoration.scene_model.scene_prior import ORDER
 
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth
