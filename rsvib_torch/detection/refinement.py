@@ -55,6 +55,8 @@ class FittedRows:
         uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
         rows: The frames; without a pattern of columns if there was one.
         has_pattern: Whether a pattern of columns was subtracted.
+        unknown: (B, A P, A P) part of the covariance of the fit, what the last rounds changed; 0 for stacks that
+            converged.
         converged: (B,) bool, stacks whose next round would change little.
         abandoned: (B,) bool, stacks whose large residual ended the rounds early.
     """
@@ -67,6 +69,7 @@ class FittedRows:
     uneven: Tensor
     rows: MeasuredRows
     has_pattern: bool
+    unknown: Tensor
     converged: Tensor
     abandoned: Tensor
 
@@ -110,7 +113,9 @@ def refine(
             refined = _better_of_both(refined, again)
     # Tones that the exact fit does not confirm are left out.
     if tones is None:
-        refined = replace(refined, fit=significant_only(refined.measurements, refined.fit, intervals))
+        fit = significant_only(refined.measurements, refined.fit, intervals)
+        if fit is not refined.fit:  # it was fitted again, without what the last rounds changed
+            refined = replace(refined, fit=replace(fit, covariance=fit.covariance + refined.unknown))
     # The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
     blur = refined.rows.blur_ratio(shrunk_motion(refined.fit, intervals))
     return replace(refined, other_motion=replace(refined.other_motion, blur=blur))
@@ -367,6 +372,7 @@ def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
         uneven=record.uneven(),
         rows=rows,
         has_pattern=False,
+        unknown=torch.zeros_like(fit.covariance),
         converged=torch.zeros_like(fit.centre, dtype=torch.bool),
         abandoned=torch.zeros_like(fit.centre, dtype=torch.bool),
     )
@@ -398,7 +404,9 @@ def with_unknown_changes(
     other = replace(other, unexplained=torch.maximum(other.unexplained, least))
     changes = torch.stack([one.about(fit.centre).parameters - fit.parameters for one in fits], -1).flatten(1, 2)
     changes = changes * where[:, None, None]
-    return replace(fitted, other_motion=other, fit=replace(fit, covariance=fit.covariance + changes @ changes.mT))
+    unknown = changes @ changes.mT
+    fit = replace(fit, covariance=fit.covariance + unknown)
+    return replace(fitted, other_motion=other, fit=fit, unknown=unknown)
 
 
 # Mirrored frequencies
@@ -454,13 +462,28 @@ def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
     measurements = select_stacks(better, second.measurements, first.measurements)
     frequencies = tones(second.fit.frequencies, first.fit.frequencies)
     active = tones(second.fit.active, first.fit.active)
+    fit = fit_tones(measurements, frequencies, active, first.fit.model)
+    unknown = torch.where(better[:, None, None], _with_tones(second, count), _with_tones(first, count))
     return replace(
         first,
         measurements=measurements,
-        fit=fit_tones(measurements, frequencies, active, first.fit.model),
+        fit=replace(fit, covariance=fit.covariance + unknown),
+        unknown=unknown,
         other_motion=select_stacks(better, second.other_motion, first.other_motion),
         robust_weights=torch.where(better[:, None, None], second.robust_weights, first.robust_weights),
         aliasing=torch.where(better, second.aliasing, first.aliasing),
         converged=torch.where(better, second.converged, first.converged),
         uneven=torch.where(better[:, None], second.uneven, first.uneven),
     )
+
+
+def _with_tones(fitted: FittedRows, count: int) -> Tensor:
+    """``FittedRows.unknown`` of a fit with ``count`` tones on each axis; the further ones are known."""
+    axes, tones = fitted.fit.active.shape[1:]
+    added = functional.pad(fitted.unknown.unflatten(2, (axes, -1)).unflatten(1, (axes, -1)), (0, 3 * (count - tones)))
+    # the drift follows the tones
+    order = fitted.fit.drift.shape[-1]
+    place = torch.cat([torch.arange(3 * tones), torch.arange(3 * tones + order, 3 * count + order)])
+    place = torch.cat([place, torch.arange(3 * tones, 3 * tones + order)]).to(added.device)
+    added = functional.pad(added[..., place], (0, 0, 0, 0, 0, 3 * (count - tones)))
+    return added[:, :, place].flatten(3, 4).flatten(1, 2)

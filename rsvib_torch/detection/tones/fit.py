@@ -47,9 +47,9 @@ __all__ = [
 ]
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
-# px (roll: rad; zoom: 1), of tones near blind frequencies. A clip with a blind vibration along y was fitted by a tone
-# of 59 px; after warping by it, the known motion along x was not measurable in 13 of 24 repetitions
-LARGEST = (30.0, 30.0, 0.1, 0.1)
+# px, amplitude of tones near blind frequencies. A clip with a blind vibration along y was fitted by a tone of 59 px;
+# after warping by it, the known motion along x was not measurable in 13 of 24 repetitions
+LARGEST = 30.0
 
 Result = TypeVar("Result", bound="DataclassInstance")
 
@@ -608,8 +608,7 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
     blindness = 1 / (1 + (offset_gain(fit.frequencies, intervals) / MIN_GAIN).square())
     noise = (amplitude_std(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
     share = (1 - blindness * noise).clamp(min=0.0)
-    largest = share.new_tensor(LARGEST)[: share.shape[1], None]
-    share = torch.where(blindness * (fit.amplitude / largest).square() < 1, share, 0.0)
+    share = torch.where(blindness * (fit.amplitude / LARGEST).square() < 1, share, 0.0)
     return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
 
 
