@@ -1,4 +1,4 @@
-"""From row order to the user's layout: the only place of detection where axes are exchanged and units are changed.
+"""From row order to the user's layout: axes and units of the results of ``detect_vibration`` and of the tracker.
 
 Detection works in row order with all components of the motion in px. A ``DetectionResult`` has image axes (x, y), roll
 in rad and zoom relative.

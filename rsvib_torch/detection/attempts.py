@@ -2,11 +2,13 @@
 
 1. The motion is a translation: all columns of a row are displaced alike.
 2. If the halves of the rows move apart as roll and zoom cause it, or if roll and zoom are requested: a motion with
-   roll and zoom.
-3. If the tones do not explain the rows: another timing (``diagnosis``), which then is the reason against the axes.
+   roll and zoom. All stacks of a batch then have these components.
+3. If the tones of the translation do not explain the rows: another timing (``diagnosis``), which then is the reason
+   against the axes. The vibration is that of the stated timing.
 
-Attempts return statuses (``pipeline``), by which the next hypothesis is chosen. Windows of a long stack are detected
-one after the other, with the same components of the motion.
+The findings of an attempt (``pipeline``) decide whether the next hypothesis is tried, and its status whether it is
+accepted. Windows of a long stack are detected one after the other, with the same components of the motion, and without
+the third hypothesis: windows are short, and the timing is that of the stack.
 """
 
 from dataclasses import dataclass, replace
@@ -121,10 +123,10 @@ def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> 
 
 def _any_rolls(found: Attempt) -> bool:
     """Whether roll or zoom may be the cause of what the translation of any stack does not explain."""
-    rows = found.fitted.rows
-    if rows is None:
+    refined = found.fitted.refined
+    if refined is None:
         return False
-    return bool(rotation_possible(rows.other_motion, rows.uneven, found.scale.height / found.scale.width).any())
+    return bool(rotation_possible(refined.other_motion, refined.uneven, found.scale.height / found.scale.width).any())
 
 
 def _moving_axes(found: Attempt, least: int) -> int:

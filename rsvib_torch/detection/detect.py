@@ -210,7 +210,7 @@ def detect_vibration(
             ignore=ignore,
             full_scale=full_scale,
             channels=channels,
-            **_options_of_field(
+            **_given_for_model(
                 model,
                 roll=roll is True or None,  # "auto": not measured unless requested
                 zoom=zoom is True or None,
@@ -234,7 +234,7 @@ def detect_vibration(
     timing = stacks.timing
     height, width = stacks.images.shape[-2:]
     camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
-    field = _field_options(roll, zoom, columns, camera)
+    field = _checked_field(roll, zoom, columns, camera)
     model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
     options = DetectionOptions(method, None if tones == "auto" else tones, model_of_tones, bands)
     if columns is not None:
@@ -250,7 +250,7 @@ def detect_vibration(
     return result if stacks.batched else result[0]
 
 
-def _field_options(
+def _checked_field(
     roll: bool | Literal["auto"], zoom: bool | Literal["auto"], columns: int | None, camera: Camera | None
 ) -> FieldOptions:
     """The checked options of roll and zoom, which are not measured of a part of the columns."""
@@ -265,7 +265,7 @@ def _field_options(
     return FieldOptions(columns is None and roll, columns is None and zoom, camera)
 
 
-def _options_of_field(model: str, **options: object) -> dict[str, object]:
+def _given_for_model(model: str, **options: object) -> dict[str, object]:
     """Options of roll, zoom and camera that were given for another model than tones."""
     given = {name: value for name, value in options.items() if value is not None}
     if given and model == "swept":

@@ -148,9 +148,9 @@ def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> d
         timing: The sensor as stated, in image order.
         found: The attempt with this timing.
     """
-    if found.fitted.rows is None:
+    if found.fitted.refined is None:
         return {}
-    diagnoses, rotates = {}, halves_move_apart(found.fitted.rows.other_motion).tolist()
+    diagnoses, rotates = {}, halves_move_apart(found.fitted.refined.other_motion).tolist()
     for index, findings in enumerate(found.findings):
         axes = contradicted_axes(findings)
         if any(axes):

@@ -19,7 +19,7 @@ from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
-from rsvib_torch.detection.rows.measured_rows import strip_rows, whole_rows
+from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
 from rsvib_torch.detection.start import BandStart, band_start, field_start
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (
@@ -98,14 +98,14 @@ class Fitted:
         measurements: The measurements with the weights of the fit.
         offsets: The same as offsets (B, P, N, A) between consecutive frames.
         predicted: (B, P, N, A) px, the offsets that the fit predicts.
-        rows: The complete result of the direct method; None if the fit is to bands.
+        refined: The complete result of the direct method; None if the fit is to bands.
     """
 
     fit: ToneFit
     measurements: Measurements
     offsets: OffsetCurve
     predicted: Tensor
-    rows: FittedRows | None = None
+    refined: FittedRows | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +113,9 @@ class Attempt:
     """What an attempt found, for B stacks in row order.
 
     Attributes:
-        statuses: For each stack, ``"converged"``; ``"not converged"``: the last rounds changed the motion, which counts
-            as an error; ``"abandoned"``: the hypothesis is wrong; ``"not visible"``: no row was measured.
+        statuses: For each stack, ``"converged"`` (always for bands); ``"not converged"``: the rounds ended before, and
+            what the last ones changed counts as an error; ``"abandoned"``: the hypothesis is wrong; ``"not visible"``:
+            no row was measured.
         options: The options.
         scale: Components of the motion.
         start: Offsets of the row bands.
@@ -140,7 +141,7 @@ class Attempt:
     @property
     def has_pattern(self) -> bool:
         """Whether a pattern of columns was subtracted."""
-        return self.fitted.rows is not None and self.fitted.rows.has_pattern
+        return self.fitted.refined is not None and self.fitted.refined.has_pattern
 
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
@@ -172,20 +173,34 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     fitted = method.fit(start, stacks, timing, options, hypothesis)
 
     # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
-    # for any errors; aliasing biases the displacements; the record may contain a further tone.
-    starts = _starts_of_rows(timing, num_frames, height, frames.device)
-    if fitted.rows is None:
+    # for any errors; aliasing biases the displacements; the record may contain a further tone. The displacement is that
+    # of every eighth row of all frames.
+    row_starts = timing.row_starts(num_frames, height, frames.device)[:, ::8].flatten()
+    if fitted.refined is None:
         fit = with_unknown_errors(fitted.measurements, fitted.fit)
     else:
-        fit = without_aliasing(fitted.measurements, fitted.fit, fitted.rows.aliasing)
-    known_std = displacement_std(fit, starts, timing.exposure_time)
-    fit, total_std = with_further_tones(fitted.measurements, fit, starts, number_is_known=options.tones is not None)
+        fit = without_aliasing(fitted.measurements, fitted.fit, fitted.refined.aliasing)
+    known_std = displacement_std(fit, row_starts, timing.exposure_time)
+    fit, total_std = with_further_tones(fitted.measurements, fit, row_starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)
     std = replace(std, displacement=total_std)
 
-    # 4. Verdict: for each axis, the reasons against it.
+    # 4. Verdict: for each axis, the reasons against it, from the rows or the bands that the vibration was fitted to.
     intervals = compared_intervals(timing, num_frames, method.max_group_frames, frames.device)
-    findings = _judged(start, fitted, fit, vibration, std, known_std, starts, intervals, timing, options, scale)
+    tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+    moved = tones.mean_displacement(row_starts.expand(len(fit.centre), -1), timing.exposure_time)
+    refined = fitted.refined
+    findings = judged(
+        vibration,
+        std,
+        _band_offsets(start, fit, options, height) if refined is None else refined.other_motion,
+        intervals=intervals,
+        displacement=moved.std(1, correction=0),
+        known_std=known_std,
+        timing=timing,
+        max_tones=options.max_tones,
+        radius=scale.radius,
+    )
     return Attempt(
         statuses=_statuses(fitted),
         options=options,
@@ -202,12 +217,12 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
 
 def _statuses(fitted: Fitted) -> tuple[Status, ...]:
     """Status of each stack."""
-    rows = fitted.rows
+    refined = fitted.refined
     statuses: list[Status] = ["converged"] * len(fitted.fit.centre)
-    if rows is None:
+    if refined is None:
         return tuple(statuses)
     for index, (converged, measured, abandoned) in enumerate(
-        torch.stack([rows.converged, rows.other_motion.measured > 0, rows.abandoned], -1).tolist()
+        torch.stack([refined.converged, refined.other_motion.measured > 0, refined.abandoned], -1).tolist()
     ):
         if abandoned:
             statuses[index] = "abandoned"
@@ -218,44 +233,13 @@ def _statuses(fitted: Fitted) -> tuple[Status, ...]:
     return tuple(statuses)
 
 
-def _starts_of_rows(timing: RowTiming, num_frames: int, height: int, device: torch.device) -> Tensor:
-    """(N,) s, exposure starts of every eighth row of all frames."""
-    return timing.row_starts(num_frames, height, device)[:, ::8].flatten()
-
-
-def _judged(
-    start: BandStart,
-    fitted: Fitted,
-    fit: ToneFit,
-    vibration: Vibration,
-    std: VibrationStd,
-    known_std: Tensor,
-    starts: Tensor,
-    intervals: Tensor,
-    timing: RowTiming,
-    options: DetectionOptions,
-    scale: FieldScale,
-) -> tuple[Findings, ...]:
-    """For each stack and each axis the reasons against it."""
-    tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
-    moved = tones.mean_displacement(starts.expand(len(fit.centre), -1), timing.exposure_time)
-    if fitted.rows is None:
-        curve, predicted = start.curve, start.predicted(fit)
-        # an image motion may carry bands out of the later frame
-        later, half = curve.rows + predicted[..., 1], 0.5 * options.bands.band_rows
-        visible = (later >= half) & (later <= scale.height - 1 - half)
-        bands = BandOffsets(*(values.flatten(1, 2) for values in (curve.offsets, predicted, visible)))
-    return judged(
-        vibration,
-        std,
-        bands if fitted.rows is None else fitted.rows.other_motion,
-        intervals=intervals,
-        displacement=moved.std(1, correction=0),
-        known_std=known_std,
-        timing=timing,
-        max_tones=options.max_tones,
-        radius=scale.radius,
-    )
+def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:
+    """The offsets of the row bands with those that a fit predicts."""
+    curve, predicted = start.curve, start.predicted(fit)
+    # an image motion may carry bands out of the later frame
+    later, half = curve.rows + predicted[..., 1], 0.5 * options.bands.band_rows
+    visible = (later >= half) & (later <= height - 1 - half)
+    return BandOffsets(*(values.flatten(1, 2) for values in (curve.offsets, predicted, visible)))
 
 
 # Methods of detection
@@ -265,8 +249,9 @@ def _judged(
 class Method:
     """A method of detection: ``fit(start, stacks, timing, options, hypothesis)`` -> ``Fitted``.
 
-    The arguments of ``fit`` are the offset curve (B, P, N) of row bands with its measurements, the grey frames
-    (B, T, H, W) in row order, the sensor in row order, and the options. Stacks of a batch must not affect each other.
+    The arguments of ``fit`` are the start with the offset curve (B, P, N) of row bands, the grey frames (B, T, H, W)
+    in row order, the sensor in row order, the options, and the hypothesis. Stacks of a batch have the same components
+    and groups of frames, and must not affect each other otherwise.
 
     Attributes:
         fit: The function.
@@ -297,18 +282,19 @@ def fit_directly(
     intervals = compared_intervals(timing, stacks.images.shape[1], MAX_GROUP_FRAMES, stacks.images.device)
     motion, scale, doubtful = shrunk_motion(fit, intervals), hypothesis.scale, hypothesis.is_doubtful
     if scale.same_for_all_columns:
-        rows = whole_rows(stacks.images, stacks.valid, timing, motion)
+        frames = grouped_frames(stacks.images, stacks.valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
-        rows = strip_rows(stacks.images, stacks.valid, timing, motion, scale, pairs_if_blurred_differently=not doubtful)
-    refined = refine(rows, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
+        pairs = not doubtful
+        frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs_if_blurred_differently=pairs)
+    refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
     # Roll and zoom that were confirmed are fitted again with equal blur, if the exposures blur the frames differently.
     if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
         motion = shrunk_motion(refined.fit, intervals)
-        if rows.differently_blurred(motion):
-            rows = strip_rows(stacks.images, stacks.valid, timing, motion, scale)
-            again = refine(rows, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
+        if frames.differently_blurred(motion):
+            frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
+            again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)
-    group_frames = [group.starts.shape[1] for group in refined.rows.groups]
+    group_frames = [group.starts.shape[1] for group in refined.frames.groups]
     offsets, predicted = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames)
     return Fitted(refined.fit, refined.measurements, offsets, predicted, refined)
 

@@ -3,7 +3,7 @@
 ``Refinement.step`` is one round:
 
 1. warp the frames to the scene by the current motion, and measure the residual displacement and the information matrix
-   of every scene row (``rows.displacements``), with roll and zoom in strips of columns (``rows.measured_rows``),
+   of every scene row (``rows.displacements``), with roll and zoom in strips of columns (``rows.grouped_frames``),
 2. fit tones and image motion to the measurements by weighted least squares (``tones``),
 3. decide: stop, subtract a pattern of columns and begin again, or continue, possibly with a faster step.
 
@@ -24,7 +24,7 @@ from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
-from rsvib_torch.detection.rows.measured_rows import MeasuredRows, RowRecord
+from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, MeasuredRows
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
     fit_tones,
@@ -49,11 +49,11 @@ class FittedRows:
     Attributes:
         measurements: Displacements of blocks of scene rows, measured around the fit, with its weights.
         fit: The fit to them.
-        other_motion: Motion in the measurements that the fit does not explain.
+        other_motion: Motion in the measurements that the fit does not explain, before insignificant tones are left out.
         robust_weights: (B, N, A) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
         aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
         uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
-        rows: The frames; without a pattern of columns if there was one.
+        frames: The frames; without a pattern of columns if there was one.
         has_pattern: Whether a pattern of columns was subtracted.
         unknown: (B, A P, A P) part of the covariance of the fit, what the last rounds changed; 0 for stacks that
             converged.
@@ -67,7 +67,7 @@ class FittedRows:
     robust_weights: Tensor
     aliasing: Tensor
     uneven: Tensor
-    rows: MeasuredRows
+    frames: GroupedFrames
     has_pattern: bool
     unknown: Tensor
     converged: Tensor
@@ -75,7 +75,7 @@ class FittedRows:
 
 
 def refine(
-    rows: MeasuredRows,
+    frames: GroupedFrames,
     intervals: Tensor,
     start: ToneFit,
     tones: int | None,
@@ -86,7 +86,7 @@ def refine(
     """Refine a detected motion on the images.
 
     Args:
-        rows: The frames.
+        frames: The frames.
         intervals: (M,) s, times between the frames that are compared.
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
@@ -97,9 +97,9 @@ def refine(
         The last measurements and the fit to them.
     """
     # Rounds of measuring and fitting from the given start.
-    refined = _rounds(rows, intervals, start, tones, may_abandon, has_pattern)
+    refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
     # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well.
-    if rows.differently_blurred(shrunk_motion(start, intervals)):
+    if frames.differently_blurred(shrunk_motion(start, intervals)):
         tried = torch.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
             frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
@@ -109,7 +109,7 @@ def refine(
             active = strongest_only(refined.fit).active
             other, _ = robust_fit(refined.measurements, frequencies, active, start.model)
             # a pattern that was subtracted does not appear again
-            again = _rounds(refined.rows, intervals, other, tones, False, has_pattern)
+            again = _rounds(refined.frames, intervals, other, tones, False, has_pattern)
             refined = _better_of_both(refined, again)
     # Tones that the exact fit does not confirm are left out.
     if tones is None:
@@ -117,12 +117,12 @@ def refine(
         if fit is not refined.fit:  # it was fitted again, without what the last rounds changed
             refined = replace(refined, fit=replace(fit, covariance=fit.covariance + refined.unknown))
     # The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
-    blur = refined.rows.blur_ratio(shrunk_motion(refined.fit, intervals))
+    blur = refined.frames.blur_ratio(shrunk_motion(refined.fit, intervals))
     return replace(refined, other_motion=replace(refined.other_motion, blur=blur))
 
 
 def _rounds(
-    rows: MeasuredRows,
+    frames: GroupedFrames,
     intervals: Tensor,
     start: ToneFit,
     tones: int | None,
@@ -130,7 +130,7 @@ def _rounds(
     has_pattern: bool | None,
 ) -> FittedRows:
     """All rounds of a ``Refinement``."""
-    refinement = Refinement(rows, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)
+    refinement = Refinement(frames, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)
     while not refinement.is_finished:
         refinement.step()
     return refinement.result()
@@ -151,12 +151,12 @@ class ColumnPatterns:
     refused: Tensor | None = None
 
     def without(
-        self, rows: MeasuredRows, motion: Vibration, gradients: list[RowGradients], refused: Tensor | None = None
-    ) -> MeasuredRows | None:
+        self, frames: GroupedFrames, motion: Vibration, gradients: list[RowGradients], refused: Tensor | None = None
+    ) -> GroupedFrames | None:
         """The rows without their pattern; None if there is none, or if axes are refused again after the last one."""
         if self.remaining == 0 or (refused is not None and self.refused is not None):
             return None
-        cleared = rows.without_column_pattern(motion, gradients)
+        cleared = frames.without_column_pattern(motion, gradients)
         if cleared is not None:
             self.remaining, self.subtracted, self.refused = self.remaining - 1, True, refused
         return cleared
@@ -170,7 +170,7 @@ class Refinement:
     """State of the rounds that refine the motion of B stacks.
 
     Args:
-        rows: The frames.
+        frames: The frames.
         intervals: (M,) s, times between the frames that are compared.
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
@@ -181,11 +181,11 @@ class Refinement:
             of the last, or not looked for. None if it is not known.
 
     Attributes:
-        rows: The frames, without a pattern of columns that was subtracted.
+        frames: The frames, without a pattern of columns that was subtracted.
         fit: The fit of the last round.
         motion: The motion of the fit, around which the next round measures.
         warped_by: The motion around which the last round measured.
-        round: Number of the next round.
+        round: Number of the next round, from 0, and of the rounds that have been made.
         search_round: Round in which further tones are searched for. The first round removes the error of the band
             offsets; weak tones are significant after it.
         is_finished: Whether the last round has been made.
@@ -195,7 +195,7 @@ class Refinement:
 
     def __init__(
         self,
-        rows: MeasuredRows,
+        frames: GroupedFrames,
         intervals: Tensor,
         start: ToneFit,
         tones: int | None,
@@ -204,16 +204,16 @@ class Refinement:
         may_abandon: bool = False,
         has_pattern: bool | None = None,
     ) -> None:
-        self.rows, self.fit = rows, start
+        self.frames, self.fit = frames, start
         self.motion = self.warped_by = shrunk_motion(start, intervals)
         self.round, self.search_round, self.is_finished = 0, 1, False
         self.converged = self.abandoned = torch.zeros_like(start.centre, dtype=torch.bool)
         self._intervals, self._tones, self._max_rounds = intervals, tones, max_rounds
         self._may_abandon, self._has_pattern = may_abandon, has_pattern
         # exposures average out faster tones
-        self._sample_interval = max(BLOCK_ROWS * rows.timing.row_time, 0.5 * rows.timing.exposure_time)
-        self._blind = blind_frequencies(rows.timing, 0.5 / self._sample_interval).to(start.centre.device)
-        self._record: RowRecord  # of the last round
+        self._sample_interval = max(BLOCK_ROWS * frames.timing.row_time, 0.5 * frames.timing.exposure_time)
+        self._blind = blind_frequencies(frames.timing, 0.5 / self._sample_interval).to(start.centre.device)
+        self._measured: MeasuredRows  # of the last round
         self._gradients: list[RowGradients] | None = None  # of the scene; None: compute them from the warped frames
         self._acceleration = Acceleration()
         # a strong pattern biases its first estimate, so that it is subtracted twice
@@ -228,8 +228,8 @@ class Refinement:
         self.round += 1
 
         # 1. Measure the displacements of the rows around the motion.
-        record = self._record = self.rows.measure(self.motion, self._gradients)
-        measurements = record.measurements
+        measured = self._measured = self.frames.measure(self.motion, self._gradients)
+        measurements = measured.measurements
         residual = residual_of(measurements, previous)
         size = measurements.sizes(residual).nanmedian(1).values
         self._sizes = [] if number == self.search_round else [*self._sizes, size]  # fewer tones before the search
@@ -242,18 +242,17 @@ class Refinement:
         same_tones = torch.equal(previous.active, fit.active)
         self._fits = [*self._fits, fit] if same_tones and number > self.search_round else [fit]
         self.warped_by, self.motion = self.motion, shrunk_motion(fit, self._intervals)
-        self._gradients = record.gradients
+        self._gradients = measured.gradients
 
         # 3. Decide. A known pattern of columns is subtracted as soon as the motion is known roughly.
         if number == 0 and self._has_pattern and self._subtract_pattern():
             return
-        if self.round == self._max_rounds or not bool(
-            (measurements.weights > 0).any()
-        ):  # or no row is visible any more
+        is_visible = bool((measurements.weights > 0).any())  # any row of any stack
+        if self.round == self._max_rounds or not is_visible:
             self.is_finished = True
             return
         if self._may_abandon and self.round == _TRIED_ROUNDS:
-            self.abandoned = _large_residual(self.rows, record, fit)
+            self.abandoned = _large_residual(self.frames, measured, fit)
         if bool(self.abandoned.all()) or (
             self.round == self.search_round + 2 and self._patterns.were_not_the_cause(size)
         ):
@@ -264,7 +263,7 @@ class Refinement:
         step = Step.between(measurements, self.warped_by, self.motion)
         converged = is_converged(previous, fit, self._acceleration.ratio(step) if same_tones else None)
         converged = converged & (number >= self.search_round)
-        stalled = self._stalled(record)
+        stalled = self._stalled(measured)
         self.converged = converged.all(-1)
         if bool((converged | stalled | self.abandoned[:, None]).all()):
             if not self._subtract_pattern(size if bool(stalled.all()) else None):
@@ -282,7 +281,7 @@ class Refinement:
 
     def result(self) -> FittedRows:
         """The last measurements, with the exact fit to them."""
-        fitted = conclude(self.rows, self._record, self.fit)
+        fitted = conclude(self.frames, self._measured, self.fit)
         converged = self.converged | self.abandoned
         if not bool(converged.all()):
             fitted = with_unknown_changes(fitted, self.warped_by, self.motion, self._fits, ~converged)
@@ -302,10 +301,10 @@ class Refinement:
             refused: (B, A) residuals of the axes, if all of them are refused.
         """
         assert self._gradients is not None
-        cleared = self._patterns.without(self.rows, self.motion, self._gradients, refused)
+        cleared = self._patterns.without(self.frames, self.motion, self._gradients, refused)
         if cleared is None:
             return False
-        self.rows, self._gradients = cleared, None
+        self.frames, self._gradients = cleared, None
         self.converged = torch.zeros_like(self.converged)
         if self.round > 1:  # after the first round, the search is still to come
             self.search_round = self.round
@@ -315,14 +314,14 @@ class Refinement:
 
     def _bounded(self, fit: ToneFit, previous: ToneFit) -> ToneFit:
         """The fit, with the previous one for stacks whose fit diverges."""
-        bounded = is_bounded(fit, self.rows.timing.exposure_time)
+        bounded = is_bounded(fit, self.frames.timing.exposure_time)
         if bool(bounded.all()):
             return fit
         if fit.active.shape != previous.active.shape:  # of a search: all stacks keep the tones that they had
             return previous
         return select_stacks(bounded, fit, previous)
 
-    def _stalled(self, record: RowRecord) -> Tensor:
+    def _stalled(self, measured: MeasuredRows) -> Tensor:
         """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
 
         A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
@@ -334,7 +333,7 @@ class Refinement:
         stalled = sizes[-1] > 0.75 * sizes[-3]
         if not bool(stalled.any()):
             return nothing
-        other = conclude(self.rows, record, self.fit).other_motion
+        other = conclude(self.frames, measured, self.fit).other_motion
         return stalled & (other.unexplained > other.permitted)
 
 
@@ -343,18 +342,18 @@ _TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
 _SAME_GRADIENTS = 0.05  # px; over smaller distances the gradients of the scene are the same
 
 
-def _large_residual(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> Tensor:
+def _large_residual(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Tensor:
     """(B,) bool, whether the fit leaves a residual that no further round would reduce enough."""
-    other = conclude(rows, record, fit).other_motion
+    other = conclude(frames, measured, fit).other_motion
     return (other.unexplained > _MAX_TRIED * other.permitted).any(-1)
 
 
 # Conclusion
 
 
-def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
+def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> FittedRows:
     """The exact fit to the measurements themselves, with a covariance that accounts for correlated residuals."""
-    measurements = record.measurements
+    measurements = measured.measurements
     residual = residual_of(measurements, fit)
     weighted = measurements.reweighted(residual)
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
@@ -362,15 +361,15 @@ def conclude(rows: MeasuredRows, record: RowRecord, fit: ToneFit) -> FittedRows:
     exact = fit_tones(weighted, fit, fit.active, fit.model)
     fit = select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)  # the exact fit may diverge
     tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
-    other = OtherMotion.of(measurements, tones, residual, record.differential())
+    other = OtherMotion.of(measurements, tones, residual, measured.differential())
     return FittedRows(
         weighted,
         fit,
         other,
         robust_weights=weighted.weights / measurements.weights.clamp(min=1e-300),
-        aliasing=torch.stack([gradients.aliasing for gradients in record.gradients]).mean(0),
-        uneven=record.uneven(),
-        rows=rows,
+        aliasing=torch.stack([gradients.aliasing for gradients in measured.gradients]).mean(0),
+        uneven=measured.uneven(),
+        frames=frames,
         has_pattern=False,
         unknown=torch.zeros_like(fit.covariance),
         converged=torch.zeros_like(fit.centre, dtype=torch.bool),
@@ -447,7 +446,7 @@ def mirrored_frequencies(
 def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
     """For every stack the result with the smaller residual in the typical row."""
     better = typical_size(second.measurements, second.fit) < typical_size(first.measurements, first.fit)
-    first = replace(first, rows=second.rows)
+    first = replace(first, frames=second.frames)
     if not bool(better.any()):
         return first
     if bool(better.all()):

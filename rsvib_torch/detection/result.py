@@ -47,6 +47,7 @@ class OtherMotion:
         visible = measurements.num_differences > 0
         measured = visible & (measurements.weights > 0).any(-1)
         return cls(
+            # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
             size=math.sqrt(2) * measurements.distances(by_tones).square().nanmean(1).sqrt(),
             unexplained=measurements.unexplained(residual),
             correlated=measurements.correlated(residual),
@@ -188,7 +189,8 @@ class DetectionResult(
     Attributes:
         vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
         std: Standard deviations of its parameters.
-        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
+        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames. A tone with a
+            gain near 0 is nearly blind, unless other frames are at other intervals.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis.
         findings: Each ``Reason`` against each axis (x, y) that is not reliable; a tuple of those for a batch.

@@ -26,7 +26,7 @@ class DetectedVibration(
     Attributes:
         vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
         std: Standard deviations of its parameters, infinite where unknown.
-        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset; a tone with a gain near 0 is nearly blind.
+        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis (x, y).
         findings: Each ``Reason`` against each axis that is not reliable; a tuple of those for a batch. ``reasons`` has

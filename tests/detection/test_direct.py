@@ -11,7 +11,7 @@ from rsvib_torch import SensorTiming, Vibration, detect_vibration, simulate_fram
 from rsvib_torch.detection.convergence import is_converged
 from rsvib_torch.detection.pipeline import DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.refinement import Refinement, with_unknown_changes
-from rsvib_torch.detection.rows.measured_rows import whole_rows
+from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
@@ -334,7 +334,7 @@ def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
     options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
     start = attempt(stacks, timing, options, Hypothesis(FieldScale(2, *frames.shape[:-3:-1]))).fitted.fit
     intervals = torch.tensor([timing.frame_period], dtype=torch.float64)
-    rows = whole_rows(stacks.images, None, timing, shrunk_motion(start, intervals))
+    rows = grouped_frames(stacks.images, None, timing, shrunk_motion(start, intervals))
     refinement = Refinement(rows, intervals, start, None)
     while not refinement.is_finished:
         refinement.step()

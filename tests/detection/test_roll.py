@@ -53,6 +53,16 @@ def test_roll_is_detected(detection):
     assert float(detection.std.amplitude[2, 0]) < 1.2e-4
 
 
+def test_roll_that_displaces_rows_by_pixels():
+    """By 2 px rms, more than the parts of a pixel that gradients reach: the frames must be warped by the roll."""
+    truth = FieldMotion((1.1, 0.8, 0.02, 0.0), (38.0, 31.0, 26.0, 0.0), (0.3, 1.1, 2.0, 0.0))
+    frames = take_field_frames(draw_scene(304, 368, 11, blur=1.2), TIMING, truth, SIZE, 4, nodes=6)
+    frames = frames + 0.004 * np.random.default_rng(5).standard_normal(frames.shape)
+    found = detect_vibration(torch.from_numpy(frames).float(), TIMING, roll=True)
+    assert found.reliable.tolist() == [True, True, True]
+    assert abs(float(found.vibration.amplitude[2, 0]) / 0.02 - 1) < 0.01
+
+
 def test_roll_is_measured_by_default(rolling, detection):
     """Zoom is measured as well, found to be 0, and left out."""
     found = detect_vibration(rolling[1], TIMING)

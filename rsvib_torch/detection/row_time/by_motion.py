@@ -187,8 +187,8 @@ def _measured_freely(
         times=starts[:-1, None] + curve.rows * timing.row_time,
         later_times=starts[1:, None] + curve.rows * timing.row_time,
     )
-    rows, motion, _ = measure_freely(stack, timing, timed, record, options, 24, 4)
-    measured = rows.measurements
+    measured_rows, motion, _ = measure_freely(stack, timing, timed, record, options, 24, 4)
+    measured = measured_rows.measurements
     measured = measured.reweighted(residual_of_motion(measured, motion[0]))
     residual = residual_of_motion(measured, motion[0])
     measured = replace(measured, independent=measured.independent_fraction(residual))

@@ -23,7 +23,7 @@ from rsvib_torch.detection.row_time.row_tones import (
     fit_row_tones,
 )
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
-from rsvib_torch.detection.rows.measured_rows import whole_rows
+from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of, shrunk_motion
 from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
@@ -221,7 +221,7 @@ def _measured_with(
     intervals = compared_intervals(timing, stack.images.shape[1], MAX_GROUP_FRAMES, stack.images.device)
     exposure = None
     for _ in range(4):
-        rows = whole_rows(stack.images, stack.valid, timing, shrunk_motion(start, intervals))
+        rows = grouped_frames(stack.images, stack.valid, timing, shrunk_motion(start, intervals))
         found = refine(rows, intervals, start, None)
         if found.measurements.independent <= 0:  # too few rows agree with each other
             return None

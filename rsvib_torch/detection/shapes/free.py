@@ -26,7 +26,7 @@ from rsvib_torch.core.splines import bspline_weights, gauss_legendre
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
-from rsvib_torch.detection.rows.measured_rows import MeasuredRows, RowRecord, StripRows, strip_rows
+from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.verdict import rotation_reasons
@@ -261,15 +261,15 @@ def _measure_field(
     record: tuple[float, float],
     scale: FieldScale,
     iterations: int,
-) -> tuple[RowRecord, FreeMotion]:
+) -> tuple[MeasuredRows, FreeMotion]:
     """``measure_freely`` with roll and zoom, from a motion without them; all components in px."""
     still = torch.zeros_like(start.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
     drift = torch.cat([start.image_motion, start.image_motion.new_zeros(1, scale.axes - 2)], -1)
     tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
     motion = FreeMotion(torch.cat([start.coefficients, still], 1), start.start, start.spacing, tones)
 
-    def strips_for(motion: FreeMotion) -> StripRows:
-        return strip_rows(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
+    def strips_for(motion: FreeMotion) -> GroupedStrips:
+        return grouped_strips(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
 
     # strips follow the size of roll and zoom, which are unknown in the first round
     rows, motion = _rounds(strips_for(motion), motion, spacing, record, 1)
@@ -279,14 +279,14 @@ def _measure_field(
 
 
 def _rounds(
-    rows: MeasuredRows,
+    rows: GroupedFrames,
     motion: FreeMotion,
     spacing: float,
     record: tuple[float, float],
     count: int,
     *,
     weighted: bool = False,
-) -> tuple[RowRecord, FreeMotion]:
+) -> tuple[MeasuredRows, FreeMotion]:
     """Rounds of measuring the rows of one stack around a spline and fitting the spline to them.
 
     Args:
@@ -318,7 +318,7 @@ def measure_freely(
     bands: RegistrationOptions,
     knot_rows: int,
     iterations: int,
-) -> tuple[RowRecord, FreeMotion, float]:
+) -> tuple[MeasuredRows, FreeMotion, float]:
     """Displacements of the rows of one stack, measured around a spline that is fitted to them again in every round.
 
     Args:
@@ -337,7 +337,7 @@ def measure_freely(
     measured = measurements_of_curve(curve, timing, bands.band_step)
     fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * timing.row_time), record)
     motion = _motion(fit)
-    rows = MeasuredRows(frame_groups(stack_spectra(stack.images, stack.valid), timing, motion), timing)
+    rows = GroupedFrames(frame_groups(stack_spectra(stack.images, stack.valid), timing, motion), timing)
     return *_rounds(rows, motion, spacing, record, iterations), spacing
 
 

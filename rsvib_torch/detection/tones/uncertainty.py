@@ -202,8 +202,8 @@ def with_further_tones(
         number_is_known: Whether there are no further tones; slow errors remain.
 
     Returns:
-        The fit, and the standard deviation (B, 2) in px of the displacement of rows without mean and linear trend, rms
-        over the rows.
+        The fit, and the standard deviation (B, A) in px of the displacement of rows without their mean, rms over the
+        rows; the effect of a further tone is that without linear trend, which the image motion contains.
     """
     covariance, rows = fit.covariance.clone(), exposure_starts.expand(len(fit.centre), -1)
     variance = displacement_std(fit, exposure_starts, measurements.exposure_time).square()

@@ -36,11 +36,11 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import MARGIN
 
-__all__ = ["MeasuredRows", "RowRecord", "StripRows", "strip_rows", "whole_rows"]
+__all__ = ["GroupedFrames", "GroupedStrips", "MeasuredRows", "grouped_frames", "grouped_strips"]
 
 
 @dataclass(frozen=True, eq=False)
-class RowRecord:
+class MeasuredRows:
     """One round of measurements.
 
     Attributes:
@@ -66,7 +66,7 @@ class RowRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredRows:
+class GroupedFrames:
     """Frames whose rows are measured as a whole.
 
     Attributes:
@@ -77,9 +77,9 @@ class MeasuredRows:
     groups: list[FrameGroup]
     timing: RowTiming
 
-    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> MeasuredRows:
         """Measurements around a motion, see ``measure_groups``."""
-        return RowRecord(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
+        return MeasuredRows(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
@@ -101,7 +101,7 @@ class MeasuredRows:
         return any(bool(differently_blurred(group.starts, height, self.timing, view).any()) for group in self.groups)
 
 
-def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> MeasuredRows:
+def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
     """Frames (B, T, H, W) in groups for a motion of two components.
 
     Args:
@@ -111,7 +111,7 @@ def whole_rows(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: 
         motion: A first estimate of the motion.
     """
     spectra = stack_spectra(frames, valid)
-    return MeasuredRows(frame_groups(spectra, timing, motion, pairs_if_blurred_differently=True), timing)
+    return GroupedFrames(frame_groups(spectra, timing, motion, pairs_if_blurred_differently=True), timing)
 
 
 # Strips
@@ -125,7 +125,7 @@ def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | Fr
 
 
 @dataclass(frozen=True, eq=False)
-class StripRows(MeasuredRows):
+class GroupedStrips(GroupedFrames):
     """Frames whose strips of columns are measured.
 
     Attributes:
@@ -142,7 +142,7 @@ class StripRows(MeasuredRows):
     num_frames: int
     slide: float
 
-    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> RowRecord:
+    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> MeasuredRows:
         """Components of the motion of every row (B, N, G, A)."""
         known = [None] * len(self.groups) if gradients is None else gradients
         view, measured, advance = self.view(motion), [], steps(len(self.groups), "groups of strips")
@@ -151,10 +151,10 @@ class StripRows(MeasuredRows):
             measured.append(measure_strips(group, self.timing, motion, view, self.strips, factors, of_group))
             advance()
         gradients = [of_group for _, of_group in measured]
-        return RowRecord(joined_groups([part for part, _ in measured]), gradients, self._apart(gradients))
+        return MeasuredRows(joined_groups([part for part, _ in measured]), gradients, self._apart(gradients))
 
     def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
-        """``RowRecord.apart``, from sums over parts of ``rows`` rows."""
+        """``MeasuredRows.apart``, from sums over parts of ``rows`` rows."""
         excesses = []
         for of_group in gradients:
             residual, noise, regular = displacements_of_parts(of_group, rows)
@@ -184,7 +184,7 @@ class StripRows(MeasuredRows):
         index = place[place % len(self.columns) % 2 == 0]
         groups = [FrameGroup(group.spectra.stacks(index), group.starts[index]) for group in self.groups]
         every_second = replace(self, groups=groups, columns=self.columns[::2])
-        of_strips = MeasuredRows.blur_ratio(every_second, motion)
+        of_strips = GroupedFrames.blur_ratio(every_second, motion)
         ratio, std, size = of_strips.unflatten(0, (-1, len(every_second.columns))).unbind(-1)
         weight = torch.where(std > 0, std.square().reciprocal(), 0.0)
         total = weight.sum(1).clamp(min=1e-300)
@@ -192,7 +192,7 @@ class StripRows(MeasuredRows):
         return torch.stack([(weight * ratio).sum(1) / total, total.rsqrt(), size], -1)
 
 
-def strip_rows(
+def grouped_strips(
     frames: Tensor,
     valid: Tensor | None,
     timing: RowTiming,
@@ -202,7 +202,7 @@ def strip_rows(
     pairs_if_blurred_differently: bool = True,
     max_slide: float = 0.1,
     min_pitch: int = 48,
-) -> StripRows:
+) -> GroupedStrips:
     """Frames (B, T, H, W) in strips of columns.
 
     Args:
@@ -231,4 +231,4 @@ def strip_rows(
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
     groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
     slide = slope * float(columns[1] - columns[0])
-    return StripRows(groups, timing, scale, strips, columns, count, slide)
+    return GroupedStrips(groups, timing, scale, strips, columns, count, slide)
