@@ -26,7 +26,7 @@ from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.scene_model.observation import Observation, row_kernels, scene_weights, smooth_kernels
-from rsvib_torch.restoration.scene_model.row_prior import ORDER
+from rsvib_torch.restoration.scene_model.scene_prior import ORDER
 
 REAL, COMPLEX = 4, 8  # bytes
 COPIED = 1 << 28  # bytes copied to measure the bandwidth
@@ -68,8 +68,8 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     height, width = size
     motion = frame_motion(truth.expanded(1), timing.in_row_order(), 1, height)
     moved, weights = motion.exposures(height)
-    length = exact.scene_period(width, motion.reach(height), moved)
-    kernels = row_kernels(moved[0], weights, torch.ones(1), height, 16)
+    length = exact.scene_periods(motion, moved, width)[0]
+    kernels = row_kernels(moved[0], weights, torch.ones(1), height)
     observation = Observation(kernels, height, length, torch.float32)
     band = observation.normal(ORDER)
     frequencies = length // 2 + 1
