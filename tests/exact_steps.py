@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from rsvib_torch.restoration.exact.exact import model_stacks, solve_scenes
-from rsvib_torch.restoration.exact.priors import PRIORS, PriorOptions
+from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
 
@@ -18,7 +18,7 @@ def solved(stack, *, joint=False, regularisation=1.0, **changes):
     """Restored frames (T', H', W') of a stack, of whose model some quantities are replaced."""
     stack = replace(stack, **changes)
     scenes = stack.scenes(joint_groups(len(stack.frames), joint), regularisation)
-    images, _ = solve_scenes(scenes, PRIORS["gaussian"], PriorOptions(regularisation), Partition())
+    images, _ = solve_scenes(scenes, PRIORS["gaussian"], regularisation, Partition())
     return images[:, 0]
 
 

@@ -172,15 +172,9 @@ def trajectory_psf(displacement: Tensor, node_weights: Tensor, *, interpolation:
 
 
 def row_taps(places: Tensor, node_weights: Tensor, interpolate: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Scene rows between which rows of frames are interpolated.
+    """Integer part (..., R) of the lowest of the ``places`` (..., R, N) of a row, and weights (..., R, J, N) from it.
 
-    Args:
-        places: (..., R, N) scene rows at the nodes of the exposures.
-        node_weights: (N,), sums to 1.
-        interpolate: Weights (..., K) of K neighbouring rows at fractional positions (...).
-
-    Returns:
-        Integer part (..., R) of the lowest place of each row, int64, and weights (..., R, J, N) of J rows from there.
+    ``interpolate`` returns the weights (..., K) of K neighbouring scene rows at fractional positions (...).
     """
     cell = places.detach().floor()
     first, taps = spread_taps(cell, interpolate(places - cell) * node_weights[:, None])
@@ -190,10 +184,7 @@ def row_taps(places: Tensor, node_weights: Tensor, interpolate: Callable[[Tensor
 def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
     """Kernels (..., R, J, U) of rows after a Fourier transform along them: ``sum_n taps exp(-2 pi i u x_n)``.
 
-    Args:
-        taps: (..., R, J, N) weights of J scene rows, as from ``row_taps``.
-        along: (..., R, N) displacement x_n along the rows in px.
-        frequencies: (U,) u in cycles per px.
+    The ``taps`` (..., R, J, N) are those of ``row_taps``; ``along`` (..., R, N) is the displacement x_n in px.
     """
     angle = (-2 * math.pi) * along[..., None] * frequencies
     taps = taps.to(angle.dtype)
@@ -206,15 +197,12 @@ def form_rows(
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
     Args:
-        spectra: (..., S, U) of the B-spline coefficients of S scene rows.
-        places: (T, R, N) scene rows at the nodes of the exposures of R rows of T frames.
-        along: (T, R, N) displacement along the rows in px.
-        node_weights: (N,), sums to 1.
+        spectra: (..., S, U) of the B-spline coefficients, of ``degree`` across the rows, of S scene rows.
+        places: (..., R, N) scene rows at the nodes of the exposures of R rows, with ``node_weights`` (N,).
+        along: (..., R, N) displacement along the rows in px.
+        node_weights: They sum to 1.
         frequencies: (U,) in cycles per px.
-        degree: Degree of the B-spline across rows.
-
-    Returns:
-        Spectra (..., T, R, U).
+        degree: Degree of the B-spline.
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)

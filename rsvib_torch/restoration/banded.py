@@ -95,14 +95,13 @@ def _filters(
 def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int) -> Tensor:
     """Fourier transform of the rows, each moved back by its own mean displacement along it, (B T, H, C, U)."""
     B, T, _, H, _ = frames.shape
-    starts = motion.row_starts(torch.arange(H, dtype=torch.float64, device=frames.device))
-    starts = starts.expand(B, T, H)
-    mean = motion.vibration.mean_displacement(starts, motion.timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
+    rows = torch.arange(H, dtype=torch.float64, device=frames.device).expand(B, T, H)
+    mean = motion.mean_displacement(rows)[..., 0]
     spectra = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
     aligned_rows = 256  # at a time; bounds the memory
     moved = [
-        rows * torch.complex(*(part.to(frames.dtype) for part in _waves(u, -places)))[:, None]
-        for rows, places in zip(spectra.split(aligned_rows), mean.flatten().split(aligned_rows), strict=True)
+        lines * torch.complex(*(part.to(frames.dtype) for part in _waves(u, -places)))[:, None]
+        for lines, places in zip(spectra.split(aligned_rows), mean.flatten().split(aligned_rows), strict=True)
     ]
     aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
     return aligned
@@ -164,8 +163,8 @@ def restore_banded(
         motion.vibration, motion.row_starts(frame_rows), motion.timing, _TRANSFERS[interpolation][2]
     )
     rows = frame_rows.detach().round()
-    mean = motion.vibration.mean_displacement(motion.row_starts(frame_rows), motion.timing.exposure_time)
-    moved = torch.stack([mean[..., 0], rows - centres + motion.shift[..., 1, None]], dim=-1)
+    along = motion.mean_displacement(frame_rows)[..., 0] + motion.shift[..., 0, None]
+    moved = torch.stack([along, rows - centres + motion.shift[..., 1, None]], dim=-1)
     displacement = (displacement - moved[..., None, :]).flatten(0, 2).to(frames.dtype)
     grid = (u.to(frames.dtype), v.to(frames.dtype))
     slab_rows = rows.flatten().to(torch.int64)

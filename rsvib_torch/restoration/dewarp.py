@@ -34,9 +34,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128
     degree = 5
     B, T, C, H, W = frames.shape
     rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
-    mean = motion.vibration.mean_displacement(motion.row_starts(rows), motion.timing.exposure_time)[..., 0]
-    along = (mean - motion.shift[..., 0, None]).flatten(0, 1)
-    rows = rows.flatten(0, 1)
+    along, rows = motion.mean_displacement(rows)[..., 0].flatten(0, 1), rows.flatten(0, 1)
 
     length = extended_length(W, motion.reach(H))
     spectra = spline_spectra(frames, degree, length)

@@ -92,6 +92,11 @@ class FrameMotion:
         """Exposure starts of frame rows (B, T, S) in seconds."""
         return self.frame_starts[:, None] + frame_rows * self.timing.row_time
 
+    def mean_displacement(self, frame_rows: Tensor) -> Tensor:
+        """Mean displacement (B, T, S, 2) in px of frame rows (B, T, S) during their exposures, beyond the shift."""
+        starts = self.row_starts(frame_rows)
+        return self.vibration.mean_displacement(starts, self.timing.exposure_time) - self.shift[..., None, :]
+
     def exposures(self, num_rows: int) -> tuple[Tensor, Tensor]:
         """Displacement (B, T, R, N, 2) in px of rows 0 ... R - 1 at N nodes of their exposures, and weights (N,)."""
         rows = torch.arange(num_rows, dtype=torch.float64, device=self.frame_starts.device)
@@ -105,13 +110,6 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
     middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift)
-
-
-def _of_column(motion: Motion, column: Tensor, timing: RowTiming, num_frames: int, num_rows: int) -> Motion:
-    """Displacement (B) of a column in px from the centre of the frame, by a motion (B) in row order."""
-    if motion.same_for_all_columns:
-        return motion
-    return ColumnMotion.of_columns(motion, column[None], timing, num_frames, num_rows)
 
 
 @checks_arguments
@@ -152,16 +150,14 @@ def visible_pixels(
     strips = ColumnStrips.of(width, max_pitch=width if rowwise.same_for_all_columns else 16, margin=0)
     parts = []
     for first, last, column in zip(strips.edges[:-1], strips.edges[1:], strips.columns, strict=True):
-        motion = frame_motion(
-            _of_column(rowwise, column, row_timing, num_frames, height), row_timing, num_frames, height
-        )
+        of_column = rowwise
+        if not rowwise.same_for_all_columns:
+            of_column = ColumnMotion.of_columns(rowwise, column[None], row_timing, num_frames, height)
+        motion = frame_motion(of_column, row_timing, num_frames, height)
         motion.check_fits(height, width)
         rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
-        starts = motion.row_starts(rows)
-        displacement = (
-            motion.vibration.mean_displacement(starts, timing.exposure_time)[..., 0] - motion.shift[..., 0, None]
-        )
-        columns = torch.arange(first, last, device=vibration.device) + displacement[..., None]
+        along = motion.mean_displacement(rows)[..., 0]
+        columns = torch.arange(first, last, device=vibration.device) + along[..., None]
         visible_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
         parts.append(visible_rows & (columns >= 0) & (columns <= width - 1))
     mask = frames_from_row_order(torch.cat(parts, -1), timing)
@@ -220,13 +216,7 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
 
 
 def restore_in_strips(
-    method: Callable[..., Tensor],
-    images: Tensor,
-    motion: Motion,
-    timing: RowTiming,
-    options: Mapping[str, Any],
-    *,
-    pass_strips: bool = False,
+    method: Callable[..., Tensor], images: Tensor, motion: Motion, timing: RowTiming, options: Mapping[str, Any]
 ) -> Tensor:
     """Frames restored by a method, in strips of columns if the motion has roll or zoom.
 
@@ -235,8 +225,8 @@ def restore_in_strips(
         images: (B, T, C, H, W) in row order.
         motion: (B) in row order.
         timing: The sensor.
-        options: Options of the method; masks shaped like the images are cut as well.
-        pass_strips: Whether the method has the option ``strips``, see ``RestorationMethod``.
+        options: Options of the method. Masks shaped like the images are cut as well, and ``strips`` becomes the number
+            of strips, if the method has that option.
 
     Returns:
         Restored frames as from the method.
@@ -257,7 +247,7 @@ def restore_in_strips(
     of_frames = frame_motion(of_strips, timing, count, height)
     of_frames = replace(of_frames, neglected=neglected)
     of_frames.check_fits(height, width)
-    if pass_strips:
+    if "strips" in cut:
         cut["strips"] = len(strips.firsts)
     restored = method(strips.cut(images), of_frames, **cut)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)

@@ -95,8 +95,7 @@ class RestorationMethod:
     Attributes:
         function: The method, see the contract above ``METHODS``.
         masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
-        strips: Whether it takes ``strips``, and then estimates once what strips of columns of the same frames have in
-            common. Without, every strip is restored as a stack of its own.
+        strips: Whether it takes ``strips``, and estimates once what strips of the same frames have in common.
         sharpens: Whether its result estimates the scene after the optics, so that option ``optics`` can sharpen it.
         mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
     """
@@ -117,15 +116,14 @@ class RestorationMethod:
 #         into strips of columns, which are stacks of one batch.
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
 #         Without ``"ignore"``, the local means count as measured; without ``"clipped"``, saturated pixels do.
-#     strips: number of neighbouring stacks of the batch that are strips of the same frames, passed only if declared.
+#     strips: number of neighbouring stacks that are strips of the same frames, passed only if declared.
 #     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; passed
 #         to ``mosaic`` only. A method without it has no option ``mosaic``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
 # Frames of one stack must not affect other stacks, ``frames`` must not be changed, and gradients must flow to frames
-# and motion. A new method is one module, its options in core/option_types.py, one line here, and one TypedDict
-# and overload of ``restore`` and of ``VibrationRestorer``.
+# and motion. Recipe of a new method: docs/architecture.md.
 METHODS: dict[str, RestorationMethod] = {
     "exact": RestorationMethod(
         restore_exact,
@@ -150,12 +148,7 @@ def check_method_options(method: str, options: Mapping[str, Any]) -> None:
 
 
 def check_optics(optics: Optics | Mapping[str, Any] | None, method: str) -> Optics | None:
-    """Optics from their fields, if that is what was given.
-
-    Raises:
-        TypeError: If they are neither ``Optics`` nor their fields.
-        ValueError: If they transmit nothing, or the method does not restore frames that can be sharpened.
-    """
+    """Optics, or those with the given fields; refuse some that transmit nothing or that the method does not have."""
     if optics is None:
         return None
     if not METHODS[method].sharpens:
@@ -332,8 +325,10 @@ def restore_prepared(
     options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         options["colours"] = frames.colours
+    if chosen.strips:
+        options["strips"] = 1
     motion = _motion_in_row_order(frames, vibration)
-    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options, pass_strips=chosen.strips)
+    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options)
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:

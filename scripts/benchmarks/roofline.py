@@ -68,8 +68,8 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     height, width = size
     motion = frame_motion(truth.expanded(1), timing.in_row_order(), 1, height)
     moved, weights = motion.exposures(height)
-    length = exact.scene_period(width, motion.reach(height), moved)
-    kernels = row_kernels(moved[0], weights, torch.ones(1), height, 16)
+    length = exact.scene_periods(motion, moved, width)[0]
+    kernels = row_kernels(moved[0], weights, torch.ones(1), height)
     observation = Observation(kernels, height, length, torch.float32)
     band = observation.normal(ORDER)
     frequencies = length // 2 + 1

@@ -14,7 +14,7 @@ from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact.exact import model_stacks, solve_scenes
 from rsvib_torch.restoration.exact.filling import Extended
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior, PriorOptions
+from rsvib_torch.restoration.exact.priors import PRIORS, Prior
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
 
@@ -138,9 +138,9 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     parts = []
     gaussian = PRIORS["gaussian"].function
 
-    def recorded_prior(problem, options):
+    def recorded_prior(problem, regularisation):
         parts.append((threading.current_thread(), torch.is_grad_enabled()))
-        return gaussian(problem, options)
+        return gaussian(problem, regularisation)
 
     monkeypatch.setitem(PRIORS, "gaussian", Prior(recorded_prior))  # solves one scene at a time
     try:
@@ -358,8 +358,7 @@ def test_scenes_filled_together_equal_single_ones(amplitude, shapes):
     ]
     assert len({scene.problem(Partition()).problem.data.shape for scene in scenes}) == shapes
     found, single = (
-        solve_scenes(scenes, PRIORS["gaussian"], PriorOptions(), Partition(), filled_together=count)[0]
-        for count in (6, 1)
+        solve_scenes(scenes, PRIORS["gaussian"], 1.0, Partition(), filled_together=count)[0] for count in (6, 1)
     )
     torch.testing.assert_close(found, single, rtol=0, atol=2e-5)
 
@@ -367,16 +366,16 @@ def test_scenes_filled_together_equal_single_ones(amplitude, shapes):
 def test_prior_added_to_the_table(short, monkeypatch):
     _, frames, motion = short
     frames = with_noise(frames[:1, :96, :80], 0.005, dtype=torch.float64)
-    options = []
+    factors = []
 
-    def toy(problem, chosen):
+    def toy(problem, regularisation):
         """A restoration that contains only the mean brightness."""
-        options.append(chosen)
+        factors.append(regularisation)
         return torch.zeros_like(problem.data[0])
 
     monkeypatch.setitem(PRIORS, "toy", Prior(toy))
     restored = restore(frames, TIMING, motion.vibration(), prior="toy", regularisation=2.0)
-    assert options[0].regularisation == 2.0
+    assert factors == [2.0]
     assert (restored - restored.mean()).abs().max() < 1e-12
     for option in ({"scale": 2}, {"mosaic": "RGGB"}):  # not declared
         with pytest.raises(ValueError, match="has prior='gaussian' only, got 'toy'"):

@@ -166,10 +166,10 @@ def test_gradient_of_the_least_squares_solution():
     generator = torch.Generator().manual_seed(1)
     motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), 2, 24)
     displacement, node_weights = motion.exposures(24)
-    kernels = finer_kernels(displacement[0], node_weights, torch.ones(2), 24, 16)
+    kernels = finer_kernels(displacement[0], node_weights, torch.ones(2), 24)
     observation = FinerObservation(kernels, 24, 32, torch.float64)
-    prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64))
-    precisions = [prior.precision(torch.tensor(1e-4 * factor), 1.0, 32, kernels.reach) for factor in (1.0, 4.0, 4.0)]
+    prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64), 32)
+    precisions = [prior.precision(torch.tensor(1e-4 * factor), 1.0, kernels.reach) for factor in (1.0, 4.0, 4.0)]
     weights = (torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64) < 0.4).double()
     solver = MosaicSolver(observation, weights, precisions, Partition())
     check_gradient(

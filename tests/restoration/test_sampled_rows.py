@@ -25,7 +25,7 @@ def slab_data(request):
     motion = frame_motion(Motion().vibration().expanded(1), timing, 2, NUM_ROWS)
     starts = motion.row_starts(torch.arange(NUM_ROWS, dtype=torch.float64))
     displacement, weights = exposure_trajectory(motion.vibration[0], starts, timing, "gauss")
-    kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS, 16)
+    kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS)
     prior = fit_prior(frames, motion, 0, torch.full((2,), NOISE), WIDTH).of([0, 1])
     chosen = torch.arange(8, 120, 8)
     precision = prior.precision(torch.tensor(NOISE**2 * WIDTH), 1.0, kernels.reach)[..., chosen]

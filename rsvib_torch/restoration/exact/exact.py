@@ -16,19 +16,12 @@ from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
 from rsvib_torch.restoration.exact.filling import FILLED_REACH, Extended, Incomplete, filled, measured_values
 from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
-from rsvib_torch.restoration.exact.priors import PRIORS, Prior, PriorOptions, check_prior
+from rsvib_torch.restoration.exact.priors import PRIORS, Prior, check_prior
 from rsvib_torch.restoration.exact.scene_solver import SIDE_BY_SIDE, Partition, SceneProblem, SolversSideBySide
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.scene_model.cross_validation import Strengths, prior_strength
-from rsvib_torch.restoration.scene_model.observation import (
-    SCALE,
-    FinerObservation,
-    Observation,
-    RowKernels,
-    finer_kernels,
-    row_kernels,
-)
+from rsvib_torch.restoration.scene_model.observation import GRIDS, SCALE, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import (
     PolynomialPrior,
     RowPrior,
@@ -37,10 +30,9 @@ from rsvib_torch.restoration.scene_model.scene_prior import (
     fit_prior,
 )
 
-__all__ = ["Scene", "StackModel", "given_level", "model_stacks", "restore_exact", "scene_period", "solve_scenes"]
+__all__ = ["Scene", "StackModel", "given_level", "model_stacks", "restore_exact", "scene_periods", "solve_scenes"]
 
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
-_SCENE_MARGIN = 16  # rows by which a scene extends beyond the frame; rows displaced further have weight 0
 
 
 def restore_exact(
@@ -115,7 +107,7 @@ def restore_exact(
     scenes = [scene for stack in stacks for scene in stack.scenes(groups, factor)]
 
     # 4. Fill missing values, and solve the banded systems of all frequencies.
-    images, misfits = solve_scenes(scenes, PRIORS[prior], PriorOptions(factor), partition, motion.neglected)
+    images, misfits = solve_scenes(scenes, PRIORS[prior], factor, partition, motion.neglected)
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if scale != 1:
@@ -143,8 +135,8 @@ class StackModel:
         scale: Points of the restored scenes per px.
         missing: (T, C, H, W) bool, missing and saturated pixels; None for none.
         clipped: Likewise, the saturated ones.
-        fills_ends: Whether the boundary extension may be filled. Inner strips of columns end where they have no weight:
-            to fill their extension doubles the time and changes the result by 0.00 dB.
+        fills_ends: Whether the boundary extension may be filled: not that of inner strips of columns, which end where
+            they have no weight (half the time, 0.00 dB).
     """
 
     frames: Tensor
@@ -163,16 +155,10 @@ class StackModel:
     clipped: Tensor | None
     fills_ends: bool
 
-    @property
-    def noise_power(self) -> Tensor:
-        """Of a frame of weight 1, in the units of the prior."""
-        return self.level.square() * self.period
-
     def kernels(self, members: list[int], reference: int) -> RowKernels:
         """Kernels of some frames, in the coordinates of one of them."""
         moved = self.displacement[members] - self.shift[reference]
-        make = row_kernels if self.scale == 1 else finer_kernels
-        return make(moved, self.node_weights, self.weights[members], self.frames.shape[-2], _SCENE_MARGIN)
+        return GRIDS[self.scale][0](moved, self.node_weights, self.weights[members], self.frames.shape[-2])
 
     def places(self, members: list[int]) -> Tensor:
         """Mean displacement (M, R, 2) of the rows of some frames."""
@@ -194,7 +180,7 @@ class StackModel:
         if isinstance(self.prior, PolynomialPrior):
             return 1.0
         same_columns = [frame for frame in members if torch.equal(self.shift[frame], self.shift[reference])]
-        prior, power = self.prior.of(members), self.noise_power
+        prior, power = self.prior.of(members), self.level.square() * self.period
 
         def choose() -> float:
             kernels = self.kernels(same_columns, reference)
@@ -221,17 +207,18 @@ def model_stacks(
 
     # Displacement of each row during its exposure, and the period of the scene that it requires.
     displacement, node_weights = motion.exposures(H)
-    periods = [scene_period(W, *stack) for stack in zip(motion.reaches(H), displacement, strict=True)]
+    periods = scene_periods(motion, displacement, W)
 
     # Noise level of each frame. That of a single frame may include texture.
     given = None if noise == "auto" else given_level(noise)
     powers = frames.new_full((B, T), 1.0 if given is None else given**2)
     if given is None:
-        # two strips of the same frames give their noise as well as all of them, in a fraction of the time
+        # Two strips of the same frames give their noise as well as all of them, in a fraction of the time. Saturated
+        # pixels have no noise: with a quarter of a frame saturated, the level was 0, and the PSNR 4 dB lower.
         chosen = sorted({strips // 4, strips - 1 - strips // 4})
         for first in range(0, B, strips):
             measured = [
-                noise_levels(frames[index].detach(), motion, index, None if ignore is None else ignore[index])
+                noise_levels(frames[index].detach(), motion, index, None if missing is None else missing[index])
                 for index in (first + strip for strip in chosen)
             ]
             powers[first : first + strips] = torch.stack(measured).square().mean(0)
@@ -267,18 +254,15 @@ def model_stacks(
     return stacks
 
 
-def scene_period(width: int, reach: int, displacement: Tensor) -> int:
-    """Period L of a restored scene of ``width`` px: longer where the boundary extension is not filled.
-
-    Args:
-        width: Columns of the frames.
-        reach: Bound on the displacement along a row in px.
-        displacement: (..., N, 2) during the exposures.
-    """
+def scene_periods(motion: FrameMotion, displacement: Tensor, width: int) -> list[int]:
+    """Period of the scenes of each stack of ``width`` px with displacement (B, T, R, N, 2) during the exposures."""
     along = displacement[..., 0].detach()
-    extended = bool((along.amax(-1) - along.amin(-1)).amax() > 2 * FILLED_REACH)
+    # the boundary extension of blurred rows is filled; that of others is longer
+    extended = ((along.amax(-1) - along.amin(-1)).amax((1, 2)) > 2 * FILLED_REACH).tolist()
     # px beyond the displacement that influence the ends
-    return fast_length(width + 2 * (8 + reach)) if extended else extended_length(width, reach + 8)
+    margins = [8 + reach for reach in motion.reaches(displacement.shape[2])]
+    lengths = zip(extended, margins, strict=True)
+    return [fast_length(width + 2 * margin) if fill else extended_length(width, margin) for fill, margin in lengths]
 
 
 def given_level(noise: float) -> float:
@@ -314,14 +298,13 @@ class Scene:
 
         # Observation operator, and precision of the prior.
         kernels = stack.kernels(members, self.reference)
-        observe = Observation if stack.scale == 1 else FinerObservation
-        if isinstance(stack.prior, PolynomialPrior):
-            precision = stack.prior.precision(stack.level.square(), self.strength, stack.period, kernels.reach)
+        observation = GRIDS[stack.scale][1](kernels, height, stack.period, data.dtype)
+        if isinstance(stack.prior, RowPrior):
+            noise_power = stack.level.square() * stack.period
+            precision = stack.prior.of(members).precision(noise_power, self.strength, kernels.reach)
         else:
-            precision = stack.prior.of(members).precision(stack.noise_power, self.strength, kernels.reach)
-        problem = SceneProblem(
-            data, observe(kernels, height, stack.period, data.dtype), precision, stack.level, partition
-        )
+            precision = stack.prior.precision(stack.level.square(), self.strength, kernels.reach)
+        problem = SceneProblem(data, observation, precision, stack.level, partition)
 
         # Values that are missing: the boundary extension of blurred rows, and pixels without data.
         along = stack.shift[members, 0] - stack.shift[self.reference, 0]
@@ -347,7 +330,7 @@ _FILLED_TOGETHER = 8  # tasks; four frames of 1024 rows take 0.79 s together, 1.
 def solve_scenes(
     scenes: list[Scene],
     prior: Prior,
-    options: PriorOptions,
+    regularisation: float,
     partition: Partition,
     neglected: float = 0.0,
     filled_together: int = _FILLED_TOGETHER,
@@ -357,7 +340,7 @@ def solve_scenes(
     Args:
         scenes: The scenes.
         prior: Prior of all scenes.
-        options: Options of the prior.
+        regularisation: Factor on the strength of the prior.
         partition: Parts solved at a time.
         neglected: As in ``FrameMotion``.
         filled_together: Tasks whose missing values are filled together: more are faster and need more memory.
@@ -376,7 +359,7 @@ def solve_scenes(
             together = SolversSideBySide(problems).scenes([problem.data for problem in problems])
             solved = [(image, None) for image in together]
         else:
-            solved = [(prior.function(problem, options), None) for problem in problems]
+            solved = [(prior.function(problem, regularisation), None) for problem in problems]
         width = stack.scale * stack.frames.shape[-1]
         return [(image[..., :width], misfit) for image, misfit in solved]
 

@@ -14,7 +14,7 @@ from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
-from rsvib_torch.restoration.exact.exact import given_level, scene_period
+from rsvib_torch.restoration.exact.exact import given_level, scene_periods
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
@@ -188,9 +188,7 @@ def restore_mosaic(
     stated = None if noise == "auto" else given_level(noise)
     # displacement of each row during its exposure, and the period that it requires
     displacement, node_weights = motion.exposures(height)
-    lengths = [
-        scene_period(width, reach, moved) for reach, moved in zip(motion.reaches(height), displacement, strict=True)
-    ]
+    lengths = scene_periods(motion, displacement, width)
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
     for stack, mosaic in enumerate(frames):
@@ -219,7 +217,7 @@ def restore_mosaic(
             )
             if len(members) == 1 or _alike(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
-            kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height, 16)
+            kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height)
             observation = FinerObservation(kernels, height, lengths[stack], frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
@@ -345,7 +343,7 @@ class _Frames:
         levels = level.expand(len(images))
         return [
             fit_polynomial_prior(image[:, None], self.motion, self.stack, levels, self.length).precision(
-                level.square(), regularisation, self.length, observation.kernels.reach
+                level.square(), regularisation, observation.kernels.reach
             )
             for image in _components(images).unbind(1)
         ]

@@ -15,23 +15,11 @@ from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
 
-__all__ = ["PRIORS", "Prior", "PriorOptions", "check_prior", "shrink_patches"]
+__all__ = ["PRIORS", "Prior", "check_prior", "shrink_patches"]
 
 _PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
 _NEIGHBOURS = _PATCH // _STEP  # patches that begin before the next one that shares no pixel
 _LINES = 4  # of patches, each of neighbours, at a time
-
-
-@dataclass(frozen=True)
-class PriorOptions:
-    """Options of every prior.
-
-    Attributes:
-        regularisation: Factor > 0 on the strength of the prior; 1: as estimated from the frames. The precision of the
-            problem already includes it.
-    """
-
-    regularisation: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -48,20 +36,20 @@ class Prior:
             scripts/benchmark.py --only memory.
     """
 
-    function: Callable[[SceneProblem, PriorOptions], Tensor]
+    function: Callable[[SceneProblem, float], Tensor]
     is_precision: bool = False
     finer_grid: bool = False
     mosaic: bool = False
     pixel_bytes: int = 12
 
 
-def gaussian(problem: SceneProblem, options: PriorOptions) -> Tensor:
+def gaussian(problem: SceneProblem, regularisation: float) -> Tensor:
     """The autoregressive prior across rows, whose precision the problem contains: one solution."""
     solver = problem.solver()
     return solver.scene(solver.fit(problem.data))
 
 
-def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
+def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     """Every patch of 8 x 8 px is a sum of few cosines, which keeps edges and flat areas free of noise.
 
     Half-quadratic splitting (Geman and Yang 1995): alternately, the patches z of the scene E c are shrunk, and
@@ -81,8 +69,8 @@ def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
     # exposure of 100 or 400 rows: 0.1 to 3 dB more
     offsets = itertools.cycle([(0, 0), (1, 1)])
     for (relative, threshold), offset in zip(stages, offsets, strict=False):
-        strength = relative * weight * options.regularisation
-        level = threshold * options.regularisation**0.5 * problem.level / weight**0.5
+        strength = relative * weight * regularisation
+        level = threshold * regularisation**0.5 * problem.level / weight**0.5
         spectra = torch.fft.rfft(shrink_patches(_sampled_scene(solver, coefficients), level, offset))
         expected = strength * _sampled(spectra.movedim(0, 1))
         precision = _sampling_precision(strength, problem.precision)
@@ -93,7 +81,8 @@ def edges(problem: SceneProblem, options: PriorOptions) -> Tensor:
     return solver.scene(coefficients)
 
 
-# The function of a prior is called as function(problem, options) -> scene. It returns the deviation of the scene from
+# The function of a prior is called as function(problem, regularisation) -> scene, with the factor > 0 on its strength
+# that the precision of the problem already includes. It returns the deviation of the scene from
 # the mean brightness of the frames, (C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L the
 # period of problem.data, in units of full scale. problem.data (M, C, R, L) are complete (missing values are filled) and
 # have zero mean brightness. It may solve with problem.solver(), and with replace(problem, precision=...).solver():

@@ -19,7 +19,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -32,6 +32,7 @@ from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 
 __all__ = [
+    "GRIDS",
     "REACH",
     "SCALE",
     "SCENE_REACH",
@@ -58,6 +59,7 @@ REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * REACH
 SCENE_REACH = 5  # rows on either side; support of the weights of a scene row
 SCALE = 2  # points per px of the finer grid, and unknowns per frequency
+_MARGIN = 16  # px by which a scene extends beyond the frame; rows displaced further have weight 0
 _FINER_DEGREE = 3
 _FINER_SCENE_REACH = 5  # half rows on either side; support of the weights of a scene row on the finer grid
 # The kernel is (1 - z^2)^2 times this polynomial in z^2, z the distance divided by the reach. It has the least error of
@@ -192,7 +194,9 @@ class RowKernels:
         return row_transfer(self.taps, self.along, frequencies)
 
 
-def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int) -> RowKernels:
+def row_kernels(
+    displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int = _MARGIN
+) -> RowKernels:
     """Kernels of rows with displacement (M, R, N, 2) during the exposure.
 
     Rows whose content lies more than ``margin`` px outside the ``num_rows`` rows of the frame have weight 0.
@@ -200,12 +204,15 @@ def row_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = rows[:, None] - displacement[..., 1]
     first, taps = row_taps(place, node_weights, kernel_weights)
-    first, count = first - (REACH - 1), taps.shape[-2]
-    near = (first > -margin - count) & (first < num_rows + margin)
-    first = first.clamp(-margin - count, num_rows + margin)
-    x = displacement[..., 0]
-    middle = 0.5 * (x.detach().amin(-1) + x.detach().amax(-1))
-    return RowKernels(first, taps, middle, x - middle[..., None], weight[:, None].to(torch.float64) * near)
+    first, low, high = first - (REACH - 1), -margin - taps.shape[-2], num_rows + margin
+    weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
+    return RowKernels(first.clamp(low, high), taps, *_about_middle(displacement[..., 0]), weight)
+
+
+def _about_middle(along: Tensor) -> tuple[Tensor, Tensor]:
+    """Middles (M, R) of the ranges of displacements (M, R, N), and the displacements relative to them."""
+    middle = 0.5 * (along.detach().amin(-1) + along.detach().amax(-1))
+    return middle, along - middle[..., None]
 
 
 def interpolation_matrix(reach: float, u: Tensor, dtype: torch.dtype, *, symmetric: bool) -> tuple[Tensor, Tensor]:
@@ -503,25 +510,15 @@ class FinerKernels(RowKernels):
         return kernels
 
 
-def finer_kernels(
-    displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int
-) -> FinerKernels:
+def finer_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int) -> FinerKernels:
     """Kernels of rows with displacement (M, R, N, 2) px during the exposure, as ``row_kernels`` on the finer grid."""
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = SCALE * (rows[:, None] - displacement[..., 1])
     first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=_FINER_DEGREE))
-    first, count = first - _FINER_DEGREE // 2, taps.shape[-2]
-    low, high = -SCALE * margin - count, SCALE * (num_rows + margin)
-    near = (first > low) & (first < high)
-    x = displacement[..., 0]
-    middle = 0.5 * (x.detach().amin(-1) + x.detach().amax(-1))
-    return FinerKernels(
-        SCALE * first.clamp(low, high),
-        taps.repeat_interleave(SCALE, -2),
-        middle,
-        x - middle[..., None],
-        weight[:, None].to(torch.float64) * near,
-    )
+    first, low, high = first - _FINER_DEGREE // 2, -SCALE * _MARGIN - taps.shape[-2], SCALE * (num_rows + _MARGIN)
+    weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
+    first, taps = SCALE * first.clamp(low, high), taps.repeat_interleave(SCALE, -2)
+    return FinerKernels(first, taps, *_about_middle(displacement[..., 0]), weight)
 
 
 def spline_transfer(frequencies: Tensor) -> Tensor:
@@ -600,3 +597,10 @@ class FinerObservation(Observation):
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
         scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=SCALE * self.period) * SCALE
         return scene
+
+
+# Functions that make the kernels of rows and the operator, for the points of the scene per px
+GRIDS: dict[int, tuple[Callable[..., RowKernels], type[Observation]]] = {
+    1: (row_kernels, Observation),
+    SCALE: (finer_kernels, FinerObservation),
+}

@@ -386,29 +386,30 @@ class PolynomialPrior:
 
     Attributes:
         coefficients: (p + 1, p + 1) a_mn, in px^-2 over squared units of the frames, float64.
+        period: L, period of the rows in px.
     """
 
     coefficients: Tensor
+    period: int
 
-    def precision(self, noise: Tensor, strength: float, length: int, reach: float = 0.0) -> Tensor:
+    def precision(self, noise: Tensor, strength: float, reach: float = 0.0) -> Tensor:
         """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
 
         Args:
             noise: Variance of the noise of data of weight 1.
             strength: Factor on the precision.
-            length: L, period of the rows in px.
             reach: Largest displacement along the row in px during an exposure, from its middle.
         """
-        u = torch.fft.rfftfreq(length, dtype=torch.float64, device=noise.device)
+        u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise.device)
         u = torch.stack([u, u - 1])
         # bounds as for ``RowPrior.precision``: below, the elimination in single precision loses digits. The upper one
         # must not bound the precision at half a cycle per px, where one coefficient of degree 6 has 1/4096 of its
         # largest value: 1e3 lost 1.1 dB in soft scenes; 1e6 and single precision differ from double by -79 dB at most
-        m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=noise.device),) * 2, indexing="ij")
+        m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=u.device),) * 2, indexing="ij")
         a = self.coefficients * (noise.to(torch.float64) * strength / SCALE)
         a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n))
         a[0, 0] += 1e-5 / (1 + reach)
-        powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=noise.device)[:, None, None]
+        powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=u.device)[:, None, None]
         return torch.einsum("mn,nau->mau", a, powers) / _pixel(u)
 
 
@@ -465,4 +466,4 @@ def fit_polynomial_prior(
     coefficients = torch.zeros(_DEGREE + 1, _DEGREE + 1, dtype=torch.float64, device=frames.device)
     for (m, n), log in zip(_POWERS, logs, strict=True):
         coefficients[m, n] = log.exp()
-    return PolynomialPrior(rising.T @ coefficients)
+    return PolynomialPrior(rising.T @ coefficients, length)

@@ -250,6 +250,4 @@ def _overlap(step: tuple[int, int], size: Sequence[int]) -> tuple[Any, ...]:
 def _displacement_of_rows(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> Tensor:
     """Mean displacement (2, R, 2) of the rows of two frames minus their shifts, in px."""
     rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
-    starts = motion.frame_starts[list(frames), None] + rows * motion.timing.row_time
-    moved = motion.vibration.mean_displacement(starts[None], motion.timing.exposure_time)
-    return (moved - motion.shift[:, list(frames), None])[0]
+    return motion.mean_displacement(rows.expand(1, len(motion.frame_starts), -1))[0, list(frames)]
