@@ -1,7 +1,7 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -33,6 +33,8 @@ class DetectedVibration(
             their texts.
         assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
     """
+
+    _MADE_BY: ClassVar[str] = "from detect_vibration; of other results, pass .motion"  # for errors about arguments
 
     vibration: Vibration
     std: VibrationStd

@@ -741,8 +741,8 @@ def test_bad_options(paper_camera, options, error, message):
 def test_rows_of_a_fit_that_diverged_have_no_weight(largest):
     """Fits of a shaking handheld camera may displace rows by any amount."""
     shift = torch.tensor([0.3, largest], dtype=torch.float64)
-    assert float(inner_columns(96, shift, torch.zeros(1)).sum()) == 0
-    assert float(inner_columns(96, shift[:1], torch.zeros(1)).sum()) > 60
+    assert float(inner_columns(96, shift[None, None], torch.zeros(1)).sum()) == 0
+    assert float(inner_columns(96, shift[None, None, :1], torch.zeros(1)).sum()) > 60
 
 
 def test_narrow_frames_of_a_rotating_camera_are_refused():

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from detections import detection_of
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -34,17 +35,6 @@ def scene_and_frames():
     """A scene and two frames of it."""
     scene = draw_scene(448 + 80, 192 + 80, seed=51)
     return crop(scene), torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, NOISE)).float()
-
-
-def detection_of(vibration, relative=1e-3, reliable=(True, True), reasons=((), ())):
-    """A detection with standard deviations of ``relative`` times the amplitude, 1e-3 rad and 0.01 Hz."""
-    std = SimpleNamespace(
-        amplitude=relative * vibration.amplitude,
-        frequency=torch.full_like(vibration.frequency, 0.01),
-        phase=torch.full_like(vibration.phase, 1e-3),
-        image_motion=torch.full_like(vibration.image_motion, 0.5),
-    )
-    return SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor(reliable), reasons=reasons)
 
 
 def restored_without_warning(*args, **options):
@@ -114,14 +104,14 @@ def test_frames_are_unchanged_if_both_axes_are_refused(dtype):
 def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameters():
     generator = np.random.default_rng(3)
     vibration = MOTION.vibration()
-    uncertain = detection_of(vibration, relative=0.05)
-    uncertain.std.frequency = torch.tensor([[0.8], [1.5]], dtype=torch.float64)
+    frequency_std = torch.tensor([[0.8], [1.5]], dtype=torch.float64)
     starts = TIMING.row_starts(2, 448).numpy()
     middle = 0.5 * (starts.min() + starts.max())
     # phases have a standard deviation of 0.03 rad at the middle time, where they do not correlate with the frequency
     at_middle = 0.03
-    uncertain.std.phase = torch.sqrt(at_middle**2 + (2 * math.pi * middle * uncertain.std.frequency) ** 2)
-    error, size = displacement_uncertainty(vibration, uncertain.std, TIMING, 2, 448)
+    phase_std = torch.sqrt(at_middle**2 + (2 * math.pi * middle * frequency_std) ** 2)
+    std = replace(detection_of(vibration, relative=0.05, phase=phase_std).std, frequency=frequency_std)
+    error, size = displacement_uncertainty(vibration, std, TIMING, 2, 448)
     times = starts.ravel() + TIMING.exposure_time / 2
     for axis in range(2):
         amplitude, frequency, phase = MOTION.amplitude[axis], MOTION.frequency[axis], MOTION.phase[axis]
@@ -130,7 +120,7 @@ def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameter
         wrong = []
         for _ in range(400):
             a, f, p = generator.standard_normal(3)
-            df = f * float(uncertain.std.frequency[axis, 0])
+            df = f * float(frequency_std[axis, 0])
             angle = 2 * np.pi * (frequency * times + df * (times - middle)) + phase + p * at_middle
             wrong.append(amplitude * (1 + 0.05 * a) * shrink * np.sin(angle) - exact)
         assert float(error[axis]) == pytest.approx(np.sqrt(np.mean(np.square(wrong))), rel=0.15)
@@ -139,15 +129,14 @@ def test_uncertainty_of_the_displacement_equals_its_scatter_for_random_parameter
 
 def test_axis_with_large_uncertainty_is_not_restored(scene_and_frames):
     _, frames = scene_and_frames
-    uncertain = detection_of(MOTION.vibration())
-    uncertain.std.phase = torch.tensor([[1.2], [0.1]], dtype=torch.float64)
+    uncertain = detection_of(MOTION.vibration(), phase=[[1.2], [0.1]])
     with pytest.warns(
         RestorationWarning, match=r"x is not restored: its displacement of 1\.5 px has a standard deviation of 1\.8"
     ):
         found = restore(frames, TIMING, uncertain, check=False)
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
     torch.testing.assert_close(found, restore(frames, TIMING, only_y, check=False), rtol=0, atol=0)
-    uncertain.std.amplitude = torch.full_like(uncertain.std.amplitude, math.inf)
+    uncertain = detection_of(MOTION.vibration(), relative=math.inf)
     assert trusted_vibration(uncertain, TIMING, 2, 448)[0].amplitude.sum() == 0
 
 
@@ -244,11 +233,26 @@ def test_saturation_reduces_errors_around_lamps(rows, better, largest):
     assert (known[:, truth > 0.9] > 0.75).all()  # no dark pixels in saturated areas
 
 
+@pytest.mark.parametrize("share", [0.25, 0.4])
+def test_saturated_pixels_do_not_lower_the_noise_level(share):
+    """They have no noise: with a quarter of the frame, the level was 0, and the others lost 4 dB."""
+    scene = draw_scene(256 + 80, 192 + 80, seed=53, blur=1.0)
+    scene[: int(share * len(scene))] = 1.5
+    frames = torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, 0.01, samples=16)).float().clamp(max=1.0)
+    truth, options = crop(scene), {"saturation": 1.0, "check": False}
+    first = int(share * len(scene))
+    estimated, given = (
+        decibel(restore(frames, TIMING, MOTION.vibration(), noise=noise, **options)[0, first:], truth[first:])
+        for noise in ("auto", 0.01)
+    )
+    assert estimated > given - 0.5
+
+
 @pytest.mark.parametrize("scan_axis", [-2, -1])
 def test_saturated_pixels_are_passed_to_the_method(lamps, monkeypatch, scan_axis):
     counts, masks_of_calls = lamps[1], []
 
-    def method(frames, motion, *, ignore=None, clipped=None):
+    def method(frames, motion, *, ignore=None, clipped=None, strips=1):
         masks_of_calls.append((ignore, clipped))
         return frames
 
@@ -289,11 +293,11 @@ def test_methods_without_saturation_use_the_saturated_values(lamps, method):
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"vibration": 3.0}, TypeError, "vibration must be a Vibration or a detection, got float"),
+        ({"vibration": 3.0}, TypeError, "vibration must be a Motion or a DetectedVibration .*, got 3.0"),
         (
             {"vibration": SimpleNamespace(motion=None)},
             TypeError,
-            "a detection, got SimpleNamespace; pass its .motion",
+            "of other results, pass .motion",
         ),
         ({"saturation": -1.0}, ValueError, "saturation must be larger than 0, got -1"),
         ({"saturation": "high"}, TypeError, "saturation must be a number, got 'high'"),

@@ -2,10 +2,10 @@
 
 import math
 import warnings
-from types import SimpleNamespace
 
 import pytest
 import torch
+from detections import detection_of
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
@@ -316,10 +316,7 @@ def test_dtypes_and_detections_of_restore_are_accepted(scene):
         assert judge_restoration(raw, clear, timing, vibration).overall == "helps"
     counts = [(images.clamp(0, 1) * 4095).round().to(torch.int32) for images in (frames, restored)]
     assert judge_restoration(*counts, timing, vibration, full_scale=4095).overall == "helps"
-    tiny = {name: 1e-4 * torch.ones_like(getattr(vibration, name)) for name in ("amplitude", "frequency", "phase")}
-    std = SimpleNamespace(**tiny, image_motion=torch.full((2,), 1e-4))
-    detection = SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor([True, True]), reasons=((), ()))
-    assert judge_restoration(frames, restored, timing, detection).overall == "helps"
+    assert judge_restoration(frames, restored, timing, detection_of(vibration)).overall == "helps"
 
 
 @pytest.mark.parametrize(
@@ -329,7 +326,7 @@ def test_dtypes_and_detections_of_restore_are_accepted(scene):
         ({"most_pairs": 1.5}, TypeError, "most_pairs must be a whole number or None, got 1.5"),
         ({"joint": 2.7}, TypeError, "joint must be True or False or a whole number, got 2.7"),
         ({"joint": "all"}, TypeError, "joint must be True or False or a whole number, got 'all'"),
-        ({"vibration": 3.0}, TypeError, "vibration must be a Vibration or a detection, got float"),
+        ({"vibration": 3.0}, TypeError, "vibration must be a Motion or a DetectedVibration .*, got 3.0"),
         ({"vibration": Vibration(1.0, 50.0).expanded(2)}, ValueError, r"vibration must be one for the stack"),
         ({"timing": Vibration(1.0, 50.0)}, TypeError, "timing must be a SensorTiming, got Vibration"),
         ({"restored": torch.full((2, 96, 96), math.nan)}, ValueError, "restored must be finite"),

@@ -1,9 +1,8 @@
 """Restoration of a window with a detection: results as from the public functions."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
+from detections import detection_of
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, judge_restoration, restore
@@ -19,12 +18,9 @@ def test_trusted_restoration_equals_the_public_functions(scan_axis):
     vibration = motion.vibration()
     if scan_axis == -1:
         frames, vibration = frames.transpose(-2, -1), vibration.from_row_order(timing)
-    small = {name: 1e-3 * torch.ones_like(getattr(vibration, name)) for name in ("amplitude", "frequency", "phase")}
-    std = SimpleNamespace(**small, image_motion=torch.full((2,), 1e-3))
-    detected = SimpleNamespace(vibration=vibration, std=std, reliable=torch.tensor([True, True]), reasons=((), ()))
     expected = restore(frames, timing, vibration, check=False, saturation=0.99)
     verdict = judge_restoration(frames, expected, timing, vibration)
-    found = restore_trusted(frames, timing, detected, {"saturation": 0.99}, force=True)
+    found = restore_trusted(frames, timing, detection_of(vibration), {"saturation": 0.99}, force=True)
     assert torch.equal(found.frames, expected)
     assert found.verdict.outcome == verdict.outcome
     torch.testing.assert_close(found.verdict.predicted_gain, verdict.predicted_gain)

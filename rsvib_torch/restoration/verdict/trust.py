@@ -112,14 +112,7 @@ def trusted_vibration(
 def vibration_to_undo(
     vibration: Motion | DetectedVibration, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Motion, tuple[Reason, ...]]:
-    """A given motion unchanged; of a detection the accurate part, and a reason for each axis not restored.
-
-    Raises:
-        TypeError: If it is neither.
-    """
+    """A given motion unchanged; of a detection the accurate part, and a reason for each axis not restored."""
     if isinstance(vibration, Motion):
         return vibration, ()
-    if not isinstance(vibration, DetectedVibration):
-        remedy = "; pass its .motion" if hasattr(vibration, "motion") else ""
-        raise TypeError(f"vibration must be a Vibration or a detection, got {type(vibration).__name__}{remedy}")
     return trusted_vibration(vibration, timing, num_frames, num_rows)
