@@ -20,7 +20,7 @@ from torch.nn import functional
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_whole_number, described
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, Result
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import (
@@ -261,9 +261,6 @@ def windows_figure(
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
-    for index, found in enumerate(detections):
-        if found is not None and not isinstance(found, DetectedVibration):
-            raise TypeError(f"detections[{index}] must be a detection or None, got {described(found)}")
     figure = _Drawing(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, squeeze=False)
     for axis, name in enumerate("xy"):
