@@ -75,7 +75,7 @@ def judged(
         std: Their standard deviations.
         measured: The measurements that they were fitted to: the motion of the rows that they do not explain, or the
             offsets of row bands.
-        intervals: Times between the frames that were compared, s.
+        intervals: Times between the frames of the largest groups, s; fast motion and unequal blur permit smaller ones.
         displacement: (B, A) px, displacement of the rows by the tones without its mean, rms over the rows.
         known_std: (B, A) px, standard deviation of the displacement if the number of tones is right.
         timing: The sensor, in row order.
