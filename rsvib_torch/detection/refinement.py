@@ -244,21 +244,16 @@ class Refinement:
         self.warped_by, self.motion = self.motion, shrunk_motion(fit, self._intervals)
         self._gradients = measured.gradients
 
-        # 3. Decide. A known pattern of columns is subtracted as soon as the motion is known roughly.
+        # 3. Begin again without a pattern of columns that is known, as soon as the motion is known roughly.
         if number == 0 and self._has_pattern and self._subtract_pattern():
             return
-        is_visible = bool((measurements.weights > 0).any())  # any row of any stack
-        if self.round == self._max_rounds or not is_visible:
-            self.is_finished = True
+
+        # 4. Stop if no further round is permitted, or if none would help.
+        self.is_finished = self._must_stop(measured, size)
+        if self.is_finished:
             return
-        if self._may_abandon and self.round == _TRIED_ROUNDS:
-            self.abandoned = _large_residual(self.frames, measured, fit)
-        if bool(self.abandoned.all()) or (
-            self.round == self.search_round + 2 and self._patterns.were_not_the_cause(size)
-        ):
-            self.is_finished = True
-            return
-        # Stop if the next round would change the motion by much less than its standard deviation, or if the residual
+
+        # 5. Stop if the next round would change the motion by much less than its standard deviation, or if the residual
         # of an axis that is refused hardly decreases: unless a pattern of columns is the cause.
         step = Step.between(measurements, self.warped_by, self.motion)
         converged = is_converged(previous, fit, self._acceleration.ratio(step) if same_tones else None)
@@ -266,10 +261,11 @@ class Refinement:
         stalled = self._stalled(measured)
         self.converged = converged.all(-1)
         if bool((converged | stalled | self.abandoned[:, None]).all()):
-            if not self._subtract_pattern(size if bool(stalled.all()) else None):
-                self.is_finished = True
+            self.is_finished = not self._subtract_pattern(size if bool(stalled.all()) else None)
             return
-        # Continue with a faster step where the last one was too long or too short.
+
+        # 6. Continue with a faster step where the last one was too long or too short. The gradients of the scene are
+        # used again if the motion changes little.
         self._acceleration.add(step, same_tones=len(self._fits) > 1)
         faster = self._acceleration.applied(measurements, fit)
         if faster is not None:
@@ -278,6 +274,20 @@ class Refinement:
             step = Step.between(measurements, self.warped_by, self.motion)
         if float(step.change.abs().amax()) > _SAME_GRADIENTS:
             self._gradients = None
+
+    def _must_stop(self, measured: MeasuredRows, size: Tensor) -> bool:
+        """Whether no further round is permitted, or none would help; stacks with a large residual are abandoned.
+
+        Args:
+            measured: The last round.
+            size: (B, A) typical residuals in standard deviations.
+        """
+        if self.round == self._max_rounds or not bool((measured.measurements.weights > 0).any()):
+            return True
+        if self._may_abandon and self.round == _TRIED_ROUNDS:
+            self.abandoned = _large_residual(self.frames, measured, self.fit)
+        pattern_was_not_the_cause = self.round == self.search_round + 2 and self._patterns.were_not_the_cause(size)
+        return pattern_was_not_the_cause or bool(self.abandoned.all())
 
     def result(self) -> FittedRows:
         """The last measurements, with the exact fit to them."""
