@@ -29,8 +29,7 @@ LAYERS = (
 )
 INNER_LAYERS = {
     "detection": (
-        {"measurements"},
-        {"result"},
+        {"measurements", "result"},
         {"strips"},
         {"tones"},
         {"start"},

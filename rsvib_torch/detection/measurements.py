@@ -3,15 +3,16 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+import math
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-__all__ = ["Measurements", "cholesky_root", "trimmed_mean"]
+__all__ = ["Measurements", "OtherMotion", "cholesky_root", "trimmed_mean"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,6 +289,52 @@ class Measurements:
         size = self._sizes_for_weights(residual)
         spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
         return (size / (6.0 * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherMotion:
+    """Motion of the rows that no vibration explains, for each axis in px, without the part that noise explains.
+
+    Attributes:
+        size: (..., 2) rms offset of the rows by the tones, for comparison.
+        unexplained: (..., 2) rms residual displacement of the fit.
+        correlated: (..., 2) the part of it that neighbouring rows have in common.
+        differential: (..., 2) rms difference of the residual displacements of the left and right halves of the rows.
+        measured: (...) fraction of the visible rows whose displacement was measured.
+        blur: (..., 3) measured difference of the blur of the frames relative to the expected one, its standard
+            deviation, and the size of the expected difference relative to the detail of the scene.
+    """
+
+    size: Tensor
+    unexplained: Tensor
+    correlated: Tensor
+    differential: Tensor
+    measured: Tensor
+    blur: Tensor
+
+    @classmethod
+    def of(cls, measurements: Measurements, by_tones: Tensor, residual: Tensor, differential: Tensor) -> "OtherMotion":
+        """From displacements (B, N, G, 2) of rows by the tones, and those left; the blur counts as expected."""
+        visible = measurements.num_differences > 0
+        measured = visible & (measurements.weights > 0).any(-1)
+        return cls(
+            # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
+            size=math.sqrt(2) * measurements.distances(by_tones).square().nanmean(1).sqrt(),
+            unexplained=measurements.unexplained(residual),
+            correlated=measurements.correlated(residual),
+            differential=differential,
+            measured=measured.double().sum(1) / visible.double().sum(1).clamp(min=1.0),
+            blur=residual.new_tensor([1.0, 0.0, 0.0]).expand(len(residual), 3),
+        )
+
+    @property
+    def permitted(self) -> Tensor:
+        """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur."""
+        return (0.006 * self.size).clamp(min=0.05)
+
+    def __getitem__(self, index: int) -> "OtherMotion":
+        """The part of one stack out of a batch."""
+        return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 def cholesky_root(information: Tensor) -> Tensor:

@@ -21,8 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
-from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.result import OtherMotion
+from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, MeasuredRows
 from rsvib_torch.detection.tones.fit import (

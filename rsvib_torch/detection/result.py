@@ -1,7 +1,7 @@
 """Result of detection: vibration, standard deviations, verdict, and the offset curve."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,59 +11,12 @@ from torch.nn import functional
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table
-from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["AttitudeTones", "DetectionResult", "OtherMotion", "TimingSensitivity"]
-
-
-@dataclass(frozen=True, eq=False)
-class OtherMotion:
-    """Motion of the rows that no vibration explains, for each axis in px, without the part that noise explains.
-
-    Attributes:
-        size: (..., 2) rms offset of the rows by the tones, for comparison.
-        unexplained: (..., 2) rms residual displacement of the fit.
-        correlated: (..., 2) the part of it that neighbouring rows have in common.
-        differential: (..., 2) rms difference of the residual displacements of the left and right halves of the rows.
-        measured: (...) fraction of the visible rows whose displacement was measured.
-        blur: (..., 3) measured difference of the blur of the frames relative to the expected one, its standard
-            deviation, and the size of the expected difference relative to the detail of the scene.
-    """
-
-    size: Tensor
-    unexplained: Tensor
-    correlated: Tensor
-    differential: Tensor
-    measured: Tensor
-    blur: Tensor
-
-    @classmethod
-    def of(cls, measurements: Measurements, by_tones: Tensor, residual: Tensor, differential: Tensor) -> "OtherMotion":
-        """From displacements (B, N, G, 2) of rows by the tones, and those left; the blur counts as expected."""
-        visible = measurements.num_differences > 0
-        measured = visible & (measurements.weights > 0).any(-1)
-        return cls(
-            # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
-            size=math.sqrt(2) * measurements.distances(by_tones).square().nanmean(1).sqrt(),
-            unexplained=measurements.unexplained(residual),
-            correlated=measurements.correlated(residual),
-            differential=differential,
-            measured=measured.double().sum(1) / visible.double().sum(1).clamp(min=1.0),
-            blur=residual.new_tensor([1.0, 0.0, 0.0]).expand(len(residual), 3),
-        )
-
-    @property
-    def permitted(self) -> Tensor:
-        """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur."""
-        return (0.006 * self.size).clamp(min=0.05)
-
-    def __getitem__(self, index: int) -> "OtherMotion":
-        """The part of one stack out of a batch."""
-        return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
+__all__ = ["AttitudeTones", "DetectionResult", "TimingSensitivity"]
 
 
 _TONE_VALUES = ("amplitude", "frequency")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.detection.result import OtherMotion
+from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming

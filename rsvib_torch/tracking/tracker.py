@@ -24,9 +24,8 @@ from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
-from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.rows.displacements import FrameGroup, differential_motion, measure_group, stack_spectra
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.detection.result import OtherMotion
+from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.verdict import BandOffsets, judged
 from rsvib_torch.motion.vibration import VibrationStd
 

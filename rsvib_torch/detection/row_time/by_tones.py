@@ -11,8 +11,8 @@ from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.refinement import refine
-from rsvib_torch.detection.result import OtherMotion
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_frames
 from rsvib_torch.detection.row_time.row_tones import (
     MAX_CHI_SQUARE,
