@@ -103,8 +103,9 @@ def test_unrelated_recording_is_not_reliable(frames, tmp_path):
     path = log(tmp_path / "other.csv", clock, 3 * np.stack([np.sin(170 * clock), np.cos(230 * clock**1.3)], -1))
     found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
     assert not found.reliable
-    assert {reason.code for reason in found.findings} == {"recording_incomplete"}
-    assert all(reason.value > reason.limit for reason in found.findings)
+    unexplained = [reason for reason in found.findings if reason.code == "recording_incomplete"]
+    assert unexplained
+    assert all(reason.value > reason.limit for reason in unexplained)
 
 
 def test_periodic_motion_has_ambiguous_clock_offsets(tmp_path, scene):
@@ -157,7 +158,7 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     (tmp_path / "out.tif").unlink()
     for more, message in (
         (["--focal-length", "900", "--offset", "813.35"], "the frames need"),
-        (["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y"], "further apart along x"),
+        (["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y"], "x: rows are further apart"),
         (["--focal-length", "900", "--flip-x"], "does not explain"),
         ([], "needs a focal_length"),
         (["--focal-length", "900", "--time-unit", "us"], "check time_unit='us'"),
@@ -170,7 +171,7 @@ def test_command(frames, gyroscope, tmp_path, capsys):
         assert not (tmp_path / "out.tif").exists()
     forced = ["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y", "--force"]
     assert run_command([*arguments, *forced]) == 0
-    assert "further apart along y" in capsys.readouterr().err
+    assert "y: rows are further apart" in capsys.readouterr().err
     assert (tmp_path / "out.tif").exists()
 
 

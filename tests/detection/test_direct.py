@@ -230,7 +230,7 @@ def test_changes_of_the_last_rounds_count_as_errors(paper_camera):
     options = DetectionOptions("direct", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
     stacks = grey_frames(frames, paper_camera, None, None, None)
     translation = Hypothesis(FieldScale(2, frames.shape[-1], 512))
-    rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.rows
+    rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.refined
     fit = rows.fit
     along_y = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
     fits = [

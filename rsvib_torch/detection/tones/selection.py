@@ -305,7 +305,7 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
     better = suspected & (after / (spare + fewer).clamp(min=1.0) <= before / spare.clamp(min=1.0))
     # frames without motion along the scan contain nothing of a blind tone: its fitted amplitude was 3e16 px
-    better = better & (other.amplitude < LARGEST).all(-1)
+    better = better & (other.amplitude < other.amplitude.new_tensor(LARGEST)[: size.shape[1], None]).all(-1)
     if not bool(better.any()):
         return fit
     frequencies, active = replaced(better)
