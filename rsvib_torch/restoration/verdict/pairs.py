@@ -17,9 +17,21 @@ from rsvib_torch.core.splines import correlated
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.motion.field import ColumnMotion
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
-__all__ = ["FramePair", "TooLittleInCommonError", "equally_bright", "misfit", "pairs_to_judge", "reblur", "shared_part"]
+__all__ = [
+    "FramePair",
+    "TooLittleInCommonError",
+    "equally_bright",
+    "judged_strip",
+    "misfit",
+    "pairs_to_judge",
+    "reblur",
+    "shared_part",
+]
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
@@ -42,8 +54,8 @@ class FramePair:
         predicted: The later raw frame, formed from ``restored``.
         changed_later: Change of the restored later frame by the motion of that frame.
         offset: (2,) px, root-mean-square displacement between the two frames by the motion, axes (x, y).
-        missing: (2, C, h, w) bool, pixels of the raw frames that were not measured; they hold the values that the
-            restored frames predict. None for none.
+        ignore: (2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames
+            predict. None for none.
     """
 
     earlier: Tensor
@@ -53,7 +65,7 @@ class FramePair:
     predicted: Tensor
     changed_later: Tensor
     offset: Tensor
-    missing: Tensor | None = None
+    ignore: Tensor | None = None
 
 
 def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
@@ -68,13 +80,43 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
     return [pairs[index] for index in chosen]
 
 
+def judged_strip(
+    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: Motion, timing: RowTiming, *, columns: int = 160
+) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
+    """The part of the frames of a stack by which their restoration is judged, and its motion.
+
+    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
+
+    Args:
+        raw: (T, C, H, W) in row order.
+        restored: (T, C, H, W) or (1, C, H, W).
+        ignore: Mask shaped like ``raw`` of pixels that were not measured.
+        motion: (1) in row order.
+        timing: The sensor.
+        columns: Width of the strip.
+    """
+    count, (height, width) = len(raw), raw.shape[-2:]
+    if motion.same_for_all_columns:
+        of_frames = frame_motion(motion, timing, count, height)
+        of_frames.check_fits(height, width)
+        return raw, restored, ignore, of_frames
+    strip = min(columns, width // 2)
+    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
+    both = torch.cat([raw[0][..., half] for half in halves], -1)
+    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
+    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
+    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
+    ignore = None if ignore is None else ignore[..., half]
+    return raw[..., half], restored[..., half], ignore, frame_motion(of_strip, timing, count, height)
+
+
 def shared_part(
     raw: Tensor,
     restored: Tensor,
     motion: FrameMotion,
     frames: tuple[int, int],
     columns: int | None,
-    hidden: Tensor | None = None,
+    ignore: Tensor | None = None,
     *,
     margin: int = 4,
 ) -> FramePair:
@@ -86,7 +128,7 @@ def shared_part(
         motion: Motion of the frames, batch of one.
         frames: Indices of the two frames.
         columns: Cut to so many columns, those with the most detail; None for all.
-        hidden: Mask shaped like ``raw`` of pixels that were not measured.
+        ignore: Mask shaped like ``raw`` of pixels that were not measured.
         margin: px between the compared pixels and those outside the frame.
 
     Raises:
@@ -113,12 +155,11 @@ def shared_part(
     cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
     first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
     predicted, formed_later = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0)).chunk(2)
-    missing = None
-    if hidden is not None:
-        masks = torch.stack([hidden[earlier][before], hidden[later][after]])[..., strip]
+    if ignore is not None:
+        masks = torch.stack([ignore[earlier][before], ignore[later][after]])[..., strip]
         first = torch.where(masks[0], reblur(scene, motion, earlier, first_row=max(-y, 0)), first)
         second = torch.where(masks[1], predicted, second)
-        missing = masks[(slice(None), *cut)]
+        ignore = masks[(slice(None), *cut)]
     return FramePair(
         first[cut],
         second[cut],
@@ -127,7 +168,7 @@ def shared_part(
         predicted[cut],
         formed_later[cut] - other[cut],
         (moved[1] - moved[0]).square().mean(0).sqrt(),
-        missing,
+        ignore,
     )
 
 
