@@ -81,13 +81,9 @@ class FrameMotion:
                     f"{size} px; check the unit of amplitudes (px) and image motion (px/s)"
                 )
 
-    def reaches(self, num_rows: int) -> list[int]:
+    def displacement_bounds(self, num_rows: int) -> list[int]:
         """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
-        return [math.ceil(reach + 0.5) for reach in self._bounds(num_rows)[..., 0].amax(1).tolist()]
-
-    def reach(self, num_rows: int) -> int:
-        """The largest of ``reaches``."""
-        return max(self.reaches(num_rows))
+        return [math.ceil(bound + 0.5) for bound in self._bounds(num_rows)[..., 0].amax(1).tolist()]
 
     def row_starts(self, frame_rows: Tensor) -> Tensor:
         """Exposure starts of frame rows (B, T, S) in seconds."""

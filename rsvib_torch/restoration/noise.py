@@ -358,7 +358,7 @@ def _residual_power(
     count = min(num_frequencies, width // 4)
     chosen = torch.linspace(width // 4, width // 2, count, device=images.device, dtype=torch.float32).long()
     sample = sample_rows(images, kernels, chosen)
-    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), prior_weight)])
+    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), strength=prior_weight)])
     power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())
     return power.to(images.dtype)
 

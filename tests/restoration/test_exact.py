@@ -338,7 +338,7 @@ def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
     problems = [
         scene.problem(Partition())
         for strip in model_stacks(strips, of_frames, noise=0.005, strips=5)
-        for scene in strip.scenes([([0], 0)], 1.0)
+        for scene in strip.tasks([([0], 0)], 1.0)
     ]
     assert [isinstance(problem, Extended) for problem in problems] == [True, False, False, False, True]
 
@@ -354,7 +354,7 @@ def test_scenes_filled_together_equal_single_ones(amplitude, shapes):
     scenes = [
         scene
         for images, motion in zip(frames, motions, strict=True)
-        for scene in stack_of(images, timing, motion, noise=0.01).scenes(joint_groups(3, False), 1.0)
+        for scene in stack_of(images, timing, motion, noise=0.01).tasks(joint_groups(3, False), 1.0)
     ]
     assert len({scene.problem(Partition()).problem.data.shape for scene in scenes}) == shapes
     found, single = (

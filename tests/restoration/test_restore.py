@@ -325,8 +325,8 @@ def test_arrays_and_orientation(scene_and_frames):
     plain = restore(frames, TIMING, MOTION.vibration(), method="dewarp")
     torch.testing.assert_close(restore(frames.numpy(), TIMING, MOTION.vibration(), method="dewarp"), plain)
     turned = replace(TIMING, scan_axis=-1)
-    half = detection_of(Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1]))
-    half.reliable, half.reasons = torch.tensor([True, False]), ((), ("blind",))
+    swapped = Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1])
+    half = detection_of(swapped, reliable=(True, False), reasons=((), ("blind",)))
     with pytest.warns(RestorationWarning, match="y is not restored"):
         found = restore(frames.transpose(-2, -1), turned, half, method="dewarp", check=False)
     only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)

@@ -46,7 +46,7 @@ class Prior:
 def gaussian(problem: SceneProblem, regularisation: float) -> Tensor:
     """The autoregressive prior across rows, whose precision the problem contains: one solution."""
     solver = problem.solver()
-    return solver.scene(solver.fit(problem.data))
+    return solver.image(solver.fit(problem.data))
 
 
 def edges(problem: SceneProblem, regularisation: float) -> Tensor:
@@ -78,7 +78,7 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
         precision[:order, :order] += 0.03 * problem.precision
         solver = replace(problem, precision=precision).solver()
         coefficients = solver.solve(right_side + expected)
-    return solver.scene(coefficients)
+    return solver.image(coefficients)
 
 
 # The function of a prior is called as function(problem, regularisation) -> scene, with the factor > 0 on its strength

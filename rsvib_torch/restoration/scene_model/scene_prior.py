@@ -45,7 +45,7 @@ class RowPrior:
     matrix is banded.
 
     Attributes:
-        power: (U,) variance of a coefficient.
+        power: (U,) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1.
         reflections: (p, U) partial correlations, within -1 ... 1.
         interpolation_power: (U,) power of the interpolation error between rows, which counts as noise; (T, U) of each
             frame.
@@ -86,23 +86,23 @@ class RowPrior:
             power[0].exp(), reflections, interpolation.exp().reshape(*self.interpolation_power.shape[:-1], count)
         )
 
-    def precision(self, noise_power: Tensor, strength: float, reach: float = 0.0) -> Tensor:
+    def precision(self, noise_power: Tensor, *, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
 
         The precision of interior rows at distance d is the sum over k. The first and the last rows are predicted from
         fewer rows: for row j it is the sum of the first j + 1 products.
 
         Args:
-            noise_power: Power of the noise of data of weight 1.
+            noise_power: Variance of the noise of data of weight 1, () or (U,).
             strength: Factor on the precision.
-            reach: Largest displacement along the row in px during an exposure, from its middle.
+            blur_reach: Of ``RowKernels``.
         """
         a = self.filter()
         ratio = (noise_power + self.interpolation_power) * strength / self.innovation()
         # noise power over variance of e. Above 1e3, the systems lose digits in single precision without a gain; below
         # 1e-4, rows displaced by half a pixel lose them. Long exposures observe every place from many rows, and allow
         # a bound lower by the length of the blur in px.
-        ratio = ratio.clamp(1e-4 / (1 + reach), 1e3)
+        ratio = ratio.clamp(1e-4 / (1 + blur_reach), 1e3)
         count = len(a)
         products = a.new_zeros(count, count, a.shape[1])
         for d in range(count):
@@ -308,7 +308,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         aliases = aliases + spectrum.blur(alias_v=-cycle).mean(1) * interpolation_error(v, [cycle])
     observed, weight, noise = spectrum.weighted(transfer)
     passed = (weight * transfer).sum((0, 1))
-    prior = autoregressive_prior(observed * length, passed, aliases, noise * length)
+    prior = autoregressive_prior(observed, passed, aliases, noise)
     return prior.resampled(length // 2 + 1)
 
 
@@ -392,23 +392,27 @@ class PolynomialPrior:
     coefficients: Tensor
     period: int
 
-    def precision(self, noise: Tensor, strength: float, reach: float = 0.0) -> Tensor:
+    def of(self, members: list[int]) -> "PolynomialPrior":
+        """The prior for restoring a scene from some of the frames."""
+        return self
+
+    def precision(self, noise_power: Tensor, *, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
         """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
 
         Args:
-            noise: Variance of the noise of data of weight 1.
+            noise_power: Variance of the noise of data of weight 1.
             strength: Factor on the precision.
-            reach: Largest displacement along the row in px during an exposure, from its middle.
+            blur_reach: Of ``RowKernels``.
         """
-        u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise.device)
+        u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise_power.device)
         u = torch.stack([u, u - 1])
         # bounds as for ``RowPrior.precision``: below, the elimination in single precision loses digits. The upper one
         # must not bound the precision at half a cycle per px, where one coefficient of degree 6 has 1/4096 of its
         # largest value: 1e3 lost 1.1 dB in soft scenes; 1e6 and single precision differ from double by -79 dB at most
         m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=u.device),) * 2, indexing="ij")
-        a = self.coefficients * (noise.to(torch.float64) * strength / SCALE)
+        a = self.coefficients * (noise_power.to(torch.float64) * strength / SCALE)
         a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n))
-        a[0, 0] += 1e-5 / (1 + reach)
+        a[0, 0] += 1e-5 / (1 + blur_reach)
         powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=u.device)[:, None, None]
         return torch.einsum("mn,nau->mau", a, powers) / _pixel(u)
 
