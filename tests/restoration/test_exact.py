@@ -106,7 +106,9 @@ def test_boundaries_are_not_periodic(short):
     other[:, :, :8] = 1.0
     stack, changed = (stack_of(images, TIMING, motion.vibration(), noise=0.01) for images in (frames, other))
     # with one prior, so that results depend on the frames only through the solution
-    change = solved(changed, prior=stack.prior, strengths=FixedStrength()) - solved(stack, strengths=FixedStrength())
+    change = solved(changed, prior=stack.prior, strength_cache=FixedStrength()) - solved(
+        stack, strength_cache=FixedStrength()
+    )
     assert change[:, :4, :4].abs().max() > 0.1
     assert change[:, 64:, -32:].abs().max() < 0.01
     assert change[:, -32:, 64:].abs().max() < 0.01

@@ -296,9 +296,7 @@ class SceneTask:
         height, width = stack.frames.shape[-2:]
 
         # Data with zero mean, rows extended to a period.
-        neighbours = members == list(range(members[0], members[-1] + 1))  # a view instead of a copy
-        frames = stack.frames[members[0] : members[-1] + 1] if neighbours else stack.frames[members]
-        data = extend_rows(frames, stack.period) - stack.mean
+        data = extend_rows(stack.frames[members] - stack.mean, stack.period)
 
         # Observation operator, and precision of the prior.
         kernels = stack.kernels(members, self.reference)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
@@ -280,15 +280,11 @@ class _Frames:
         """
         count, width, level = len(self.images), self.images.shape[-1], self.level
         mean = self.images.mean((0, 2, 3))[:, None, None]
-        data = extend_rows(self.images, self.length) - mean
+        data = extend_rows(self.images - mean, self.length)
         inside = measured_values(along, None, data.shape, width, ends=True)
         assert inside is not None
-        measured = torch.zeros_like(inside)
-        measured[..., :width] = self.measured
-        measured &= inside
-        filled = torch.zeros_like(inside)
-        filled[..., :width] = ~self.measured.any(1, keepdim=True)
-        filled &= inside
+        nowhere = ~self.measured.any(1, keepdim=True)
+        measured, filled = (pad(mask, (0, self.length - width)) & inside for mask in (self.measured, nowhere))
         full = self.images.detach()
 
         def solver(strength: float) -> MosaicSolver:

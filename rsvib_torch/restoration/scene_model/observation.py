@@ -139,13 +139,8 @@ def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1
     Returns:
         Power of the same shape.
     """
-    return (
-        kernel_spectrum(
-            frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
-        )
-        .square()
-        .sum(-1)
-    )
+    aliases = frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
+    return kernel_spectrum(aliases).square().sum(-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,22 +19,17 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.frames.orientation import reasons_from_row_order
+from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.frame_motion import joint_groups, motion_in_row_order
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restoration_warning import RestorationWarning
-from rsvib_torch.restoration.verdict.pairs import (
-    FramePair,
-    equally_bright,
-    judged_strip,
-    misfit,
-    pairs_to_judge,
-    shared_part,
-)
+from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = [
@@ -54,6 +49,7 @@ _PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a 
 _WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
 _GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
 
+_STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
 
 
@@ -367,6 +363,29 @@ def _at_pixels(restored: Tensor, frames: PreparedFrames, count: int) -> Tensor:
     return restored[..., ::step, ::step]
 
 
+def _judged_strip(
+    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: Motion, timing: RowTiming
+) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
+    """The part of the frames of a stack by which their restoration is judged, and its motion.
+
+    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
+    Arguments and results are as in ``shared_part``, except for the motion (1) in row order and the timing.
+    """
+    count, (height, width) = len(raw), raw.shape[-2:]
+    if motion.same_for_all_columns:
+        of_frames = frame_motion(motion, timing, count, height)
+        of_frames.check_fits(height, width)
+        return raw, restored, ignore, of_frames
+    strip = min(_STRIP, width // 2)
+    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
+    both = torch.cat([raw[0][..., half] for half in halves], -1)
+    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
+    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
+    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
+    ignore = None if ignore is None else ignore[..., half]
+    return raw[..., half], restored[..., half], ignore, frame_motion(of_strip, timing, count, height)
+
+
 @torch.no_grad()
 def judge_prepared(
     frames: PreparedFrames,
@@ -401,7 +420,7 @@ def judge_prepared(
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     taken, still = (images[stack].to(dtype) for images in frames.compared(restored))
     ignore = None if frames.missing is None else frames.missing[stack]
-    raw, image, ignore, of_part = judged_strip(taken, still, ignore, motion, frames.timing)
+    raw, image, ignore, of_part = _judged_strip(taken, still, ignore, motion, frames.timing)
 
     # The verdict on each pair of frames.
     count = len(raw)

@@ -17,21 +17,9 @@ from rsvib_torch.core.splines import correlated
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
-from rsvib_torch.motion.field import ColumnMotion
-from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
+from rsvib_torch.restoration.frame_motion import FrameMotion
 
-__all__ = [
-    "FramePair",
-    "TooLittleInCommonError",
-    "equally_bright",
-    "judged_strip",
-    "misfit",
-    "pairs_to_judge",
-    "reblur",
-    "shared_part",
-]
+__all__ = ["FramePair", "TooLittleInCommonError", "equally_bright", "misfit", "pairs_to_judge", "reblur", "shared_part"]
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
@@ -78,36 +66,6 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
         return pairs
     chosen = torch.linspace(0, len(pairs) - 1, most, dtype=torch.float32, device="cpu").round().to(torch.int64).tolist()
     return [pairs[index] for index in chosen]
-
-
-def judged_strip(
-    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: Motion, timing: RowTiming, *, columns: int = 160
-) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
-    """The part of the frames of a stack by which their restoration is judged, and its motion.
-
-    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
-
-    Args:
-        raw: (T, C, H, W) in row order.
-        restored: (T, C, H, W) or (1, C, H, W).
-        ignore: Mask shaped like ``raw`` of pixels that were not measured.
-        motion: (1) in row order.
-        timing: The sensor.
-        columns: Width of the strip.
-    """
-    count, (height, width) = len(raw), raw.shape[-2:]
-    if motion.same_for_all_columns:
-        of_frames = frame_motion(motion, timing, count, height)
-        of_frames.check_fits(height, width)
-        return raw, restored, ignore, of_frames
-    strip = min(columns, width // 2)
-    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
-    both = torch.cat([raw[0][..., half] for half in halves], -1)
-    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
-    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
-    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
-    ignore = None if ignore is None else ignore[..., half]
-    return raw[..., half], restored[..., half], ignore, frame_motion(of_strip, timing, count, height)
 
 
 def shared_part(
