@@ -25,10 +25,10 @@ _NEAR = 24
 
 @dataclass(frozen=True, eq=False)
 class Incomplete:
-    """A scene with missing values, whose data have any values there.
+    """A problem with missing values, whose data have any values there.
 
     Attributes:
-        problem: The scene.
+        problem: The problem of the scene.
         measured: (M, C, R, L) mask of measured values.
         floor: (M, C, R, L) lower bound of the missing values (saturated pixels), or None.
     """
@@ -40,10 +40,10 @@ class Incomplete:
 
 @dataclass(frozen=True, eq=False)
 class Extended:
-    """A scene of which only the boundary extension was not measured.
+    """A problem of which only the boundary extension was not measured.
 
     Attributes:
-        problem: The scene.
+        problem: The problem of the scene.
         width: Columns of the frames, the first of the data; the others are the extension.
     """
 

@@ -302,8 +302,8 @@ class _Frames:
             predicted = first.predict(coefficients)
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
             if count > 1:
-                found, gain = _residual_level(first, data - predicted, measured)
-                level = self._checked(found, level, unknown_level)
+                residual_level, gain = _residual_level(first, data - predicted, measured)
+                level = self._checked(residual_level, level, unknown_level)
             if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
                 measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
         second = solver(regularisation)
@@ -317,16 +317,16 @@ class _Frames:
         image: Tensor = pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
         return image
 
-    def _checked(self, found: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
+    def _checked(self, residual: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
         """The standard deviation of the noise to use: that of the residual if none is stated.
 
         Warns if the residual is larger than the stated noise explains.
         """
         if unknown:
-            return found
-        if bool(found > most * stated):
+            return residual
+        if bool(residual > most * stated):
             warn_of_restoration(
-                f"the frames differ from their model by {float(found / stated):.1f} times the stated noise: the "
+                f"the frames differ from their model by {float(residual / stated):.1f} times the stated noise: the "
                 "vibration is not accurate enough, the scene changes between the frames, or noise is too low; colours "
                 "may be false"
             )

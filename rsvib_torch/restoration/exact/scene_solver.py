@@ -170,7 +170,8 @@ class SceneSolver:
         self._normal = normal.in_windows(self._windows)
         self._keep = keep
         self._interpolated: InterpolatedFactors | None = None
-        if not keep and not self._differentiates() and (nodes := self._nodes()) is not None:
+        nodes = None if keep or self._differentiates() else self._nodes()
+        if nodes is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
             self._interpolated = InterpolatedFactors.of(systems, nodes)
 
@@ -359,11 +360,11 @@ class SolversSideBySide:
                 continue
             rights = [solver.whole_right_side(data[number]) for solver, number in zip(solvers, group, strict=True)]
             rows = max(map(len, rights))
-            right = torch.cat([functional.pad(one, (0, 0, 0, 0, 0, rows - len(one))) for one in rights], -1)
+            right = torch.cat([functional.pad(side, (0, 0, 0, 0, 0, rows - len(side))) for side in rights], -1)
             solutions = solve_skewed(self._factors.get(place) or self._system(group), right)
             parts = solutions.split([solver.num_systems for solver in solvers], -1)
             coefficients += [
-                solver.joined(part[: len(one)]) for solver, part, one in zip(solvers, parts, rights, strict=True)
+                solver.joined(part[: len(side)]) for solver, part, side in zip(solvers, parts, rights, strict=True)
             ]
         return coefficients
 

@@ -223,8 +223,8 @@ class StrengthCache:
             choose: Returns the strength; called unless that of a scene with the same power, to 20 %, was chosen before.
         """
         logarithm = float(noise.detach().log())
-        for other, strength in self._chosen:
-            if abs(logarithm - other) < 0.2:
+        for earlier, strength in self._chosen:
+            if abs(logarithm - earlier) < 0.2:
                 return strength
         self._chosen.append((logarithm, choose()))
         return self._chosen[-1][1]

@@ -33,7 +33,7 @@ from rsvib_torch.imaging.blur import row_taps, row_transfer
 
 __all__ = [
     "GRIDS",
-    "REACH",
+    "KERNEL_REACH",
     "SCALE",
     "SCENE_REACH",
     "TAPS",
@@ -55,8 +55,8 @@ __all__ = [
     "spline_transfer",
 ]
 
-REACH = 3  # rows on either side; support of the kernel
-TAPS = 2 * REACH
+KERNEL_REACH = 3  # rows on either side; support of the kernel
+TAPS = 2 * KERNEL_REACH
 SCENE_REACH = 5  # rows on either side; support of the weights of a scene row
 SCALE = 2  # points per px of the finer grid, and unknowns per frequency
 _MARGIN = 16  # most rows by which a scene extends beyond the frame; rows displaced further have weight 0
@@ -77,8 +77,8 @@ _POLYNOMIAL = (
 
 
 def _kernel(distance: Tensor) -> Tensor:
-    """Kernel at distances of at most ``REACH``."""
-    square = (distance / REACH).square()
+    """Kernel at distances of at most ``KERNEL_REACH``."""
+    square = (distance / KERNEL_REACH).square()
     value = torch.full_like(square, _POLYNOMIAL[-1])
     for coefficient in _POLYNOMIAL[-2::-1]:
         value = value * square + coefficient
@@ -94,20 +94,20 @@ def kernel_weights(fraction: Tensor) -> Tensor:
     Returns:
         Weights (S, 6); their sum is 1 to 5e-4.
     """
-    taps = torch.arange(TAPS, dtype=fraction.dtype, device=fraction.device) - (REACH - 1)
+    taps = torch.arange(TAPS, dtype=fraction.dtype, device=fraction.device) - (KERNEL_REACH - 1)
     return _kernel(fraction[..., None] - taps)
 
 
 def kernel_samples() -> tuple[float, ...]:
     """The kernel at the rows -2 ... 2."""
-    return tuple(_kernel(torch.arange(1 - REACH, REACH, dtype=torch.float64, device="cpu")).tolist())
+    return tuple(_kernel(torch.arange(1 - KERNEL_REACH, KERNEL_REACH, dtype=torch.float64, device="cpu")).tolist())
 
 
 def kernel_spectrum(frequencies: Tensor) -> Tensor:
     """Fourier transform of the kernel at frequencies in cycles per row."""
     nodes, weights = gauss_legendre(32)  # of one side
-    places = (nodes * REACH).to(frequencies)
-    values = 2 * REACH * weights.to(frequencies) * _kernel(places)
+    places = (nodes * KERNEL_REACH).to(frequencies)
+    values = 2 * KERNEL_REACH * weights.to(frequencies) * _kernel(places)
     return torch.cos(2 * torch.pi * frequencies[..., None] * places) @ values
 
 
@@ -199,7 +199,7 @@ def row_kernels(
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = rows[:, None] - displacement[..., 1]
     first, taps = row_taps(place, node_weights, kernel_weights)
-    first, low, high = first - (REACH - 1), -margin - taps.shape[-2], num_rows + margin
+    first, low, high = first - (KERNEL_REACH - 1), -margin - taps.shape[-2], num_rows + margin
     weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
     return RowKernels(first.clamp(low, high), taps, *_about_middle(displacement[..., 0]), weight)
 

@@ -188,7 +188,7 @@ def outcome_of_pair(
         finest: Misfit in px that is negligible in any image.
         crosstalk: Error of ``after`` along one axis, relative to the displacement along the other.
     """
-    found: list[tuple[Outcome, Reason | None]] = []
+    outcomes: list[tuple[Outcome, Reason | None]] = []
     motion_is_complete = True
     for axis, name in enumerate("xy"):
         least, size, rest = max(resolution[axis], finest), before[axis], after[axis]
@@ -198,25 +198,25 @@ def outcome_of_pair(
         visible = max(size, offset[axis])
         details = {"before": size}
         if math.isinf(least):
-            found.append(("unknown", Reason("no_contrast", name)))
+            outcomes.append(("unknown", Reason("no_contrast", name)))
         elif rest <= max(least, crosstalk * before[1 - axis]):
             is_visible = visible > least
-            found.append(
+            outcomes.append(
                 ("helps", None) if is_visible else ("unknown", Reason("displaced_alike", name, visible, least))
             )
         elif rest > _WORSE_RESIDUAL * size:
             # less noise may outweigh a motion that was not undone, but not a motion that does not exist
             outweighed = size > least and gain > _GAIN_ERROR and not one_image
             remains = Reason("motion_remains", name, rest, _WORSE_RESIDUAL * size, details)
-            found.append(("partly" if outweighed else "worse", remains))
+            outcomes.append(("partly" if outweighed else "worse", remains))
         elif rest > _PARTLY_RESIDUAL * size:
-            found.append(("partly", Reason("motion_remains", name, rest, _PARTLY_RESIDUAL * size, details)))
+            outcomes.append(("partly", Reason("motion_remains", name, rest, _PARTLY_RESIDUAL * size, details)))
         else:
-            found.append(("helps", None))
-    if not found:
+            outcomes.append(("helps", None))
+    if not outcomes:
         return "unknown", (Reason("nothing_undone"),)
-    outcome = max((outcome for outcome, _ in found), key=_OUTCOMES.index)
-    reasons = tuple(reason for kind, reason in found if kind == outcome and reason is not None)
+    outcome = max((outcome for outcome, _ in outcomes), key=_OUTCOMES.index)
+    reasons = tuple(reason for kind, reason in outcomes if kind == outcome and reason is not None)
     if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
         return outcome, reasons
     if gain < -_GAIN_ERROR:

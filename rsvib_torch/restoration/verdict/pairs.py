@@ -104,27 +104,27 @@ def shared_part(
     before, after = (_overlap(step, raw.shape[-2:]) for step in ((y, x), (-y, -x)))
     first, second = raw[earlier][before], raw[later][after]
     single = len(restored) == 1
-    scene = restored[0 if single else earlier][before]
-    other = scene if single else restored[later][after]
+    still = restored[0 if single else earlier][before]
+    still_later = still if single else restored[later][after]
     strip = slice(0, width)
     if columns is not None:
         detailed = detailed_columns(second[..., rim_x : width - rim_x], columns)
         strip = slice(detailed.start, detailed.stop + 2 * rim_x)
     cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
-    first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
-    predicted, formed_later = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0)).chunk(2)
+    first, second, still, still_later = (image[..., strip] for image in (first, second, still, still_later))
+    predicted, formed_later = reblur(torch.cat([still, still_later]), motion, later, first_row=max(y, 0)).chunk(2)
     if ignore is not None:
         masks = torch.stack([ignore[earlier][before], ignore[later][after]])[..., strip]
-        first = torch.where(masks[0], reblur(scene, motion, earlier, first_row=max(-y, 0)), first)
+        first = torch.where(masks[0], reblur(still, motion, earlier, first_row=max(-y, 0)), first)
         second = torch.where(masks[1], predicted, second)
         ignore = masks[(slice(None), *cut)]
     return FramePair(
         first[cut],
         second[cut],
-        scene[cut],
-        None if single else other[cut],
+        still[cut],
+        None if single else still_later[cut],
         predicted[cut],
-        formed_later[cut] - other[cut],
+        formed_later[cut] - still_later[cut],
         (moved[1] - moved[0]).square().mean(0).sqrt(),
         ignore,
     )
