@@ -74,15 +74,16 @@ def trusted_vibration(
         The vibration, and a ``Reason`` for each axis that is not restored.
 
     Example:
-        >>> from types import SimpleNamespace
-        >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
-        >>> found = Vibration([3.0, 2.0], [50.0, 30.0])
-        >>> names = ("amplitude", "frequency", "period", "phase", "image_motion", "image_acceleration")
-        >>> small = SimpleNamespace(**{name: 0.01 * torch.ones_like(getattr(found, name)) for name in names})
-        >>> doubtful = SimpleNamespace(vibration=found, std=small, reliable=(True, False), reasons=((), ("blind",)))
-        >>> vibration, (reason,) = trusted_vibration(doubtful, timing, 2, 512)
-        >>> vibration.amplitude.flatten().tolist(), str(reason)
-        ([3.0, 0.0], 'y is not restored: its vibration is not reliable (blind)')
+        >>> from dataclasses import replace
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> doubtful = replace(rsv.detect_vibration(frames, timing), reliable=torch.tensor([True, False]))
+        >>> vibration, (reason,) = trusted_vibration(doubtful, timing, *frames.shape[:2])
+        >>> vibration.moving_axes().tolist(), reason.code, reason.axis
+        ([True, False], 'axis_not_reliable', 'y')
     """
     check_whole_number("num_frames", num_frames, at_least=1)
     check_whole_number("num_rows", num_rows, at_least=1)
