@@ -17,8 +17,8 @@ def stack_of(frames, timing, vibration, **options):
 def solved(stack, *, joint=False, regularisation=1.0, **changes):
     """Restored frames (T', H', W') of a stack, of whose model some quantities are replaced."""
     stack = replace(stack, **changes)
-    scenes = stack.scenes(joint_groups(len(stack.frames), joint), regularisation)
-    images, _ = solve_scenes(scenes, PRIORS["gaussian"], regularisation, Partition())
+    tasks = stack.tasks(joint_groups(len(stack.frames), joint), regularisation)
+    images, _ = solve_scenes(tasks, PRIORS["gaussian"], regularisation, Partition())
     return images[:, 0]
 
 

@@ -148,7 +148,9 @@ def restore_banded(
     check_choice("interpolation", interpolation, tuple(_TRANSFERS))
     weights = _noise_to_signal(frames, noise_to_signal)
     B, T, C, H, W = frames.shape
-    length = extended_length(W, motion.reach(H) + 8)  # a Wiener filter extends at least 8 px beyond the displacement
+    length = extended_length(
+        W, max(motion.displacement_bounds(H)) + 8
+    )  # a Wiener filter extends at least 8 px beyond the displacement
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)

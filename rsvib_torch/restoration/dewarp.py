@@ -36,7 +36,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128
     rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
     along, rows = motion.mean_displacement(rows)[..., 0].flatten(0, 1), rows.flatten(0, 1)
 
-    length = extended_length(W, motion.reach(H))
+    length = extended_length(W, max(motion.displacement_bounds(H)))
     spectra = spline_spectra(frames, degree, length)
     count = spectra.shape[-1]
     cell = rows.detach().floor()

@@ -20,13 +20,13 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
-from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_showing
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 
-__all__ = ["FrameMotion", "frame_motion", "joint_groups", "judged_strip", "restore_in_strips", "visible_pixels"]
+__all__ = ["FrameMotion", "frame_motion", "joint_groups", "motion_in_row_order", "restore_in_strips", "visible_pixels"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,8 @@ class FrameMotion:
         timing: The sensor, in row order.
         frame_starts: (T,) seconds.
         shift: (B, T, 2) whole px, axes (x, y), float64.
-        neglected: Standard deviation in px of the differences of the columns, where the motion is that of one of them.
+        neglected: Standard deviation in px of the displacement of the columns of a strip about that of its middle,
+            which is that of all columns in this motion. Only the exact method with ``scale=2`` uses it.
     """
 
     vibration: Motion
@@ -80,13 +81,9 @@ class FrameMotion:
                     f"{size} px; check the unit of amplitudes (px) and image motion (px/s)"
                 )
 
-    def reaches(self, num_rows: int) -> list[int]:
+    def displacement_bounds(self, num_rows: int) -> list[int]:
         """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
-        return [math.ceil(reach + 0.5) for reach in self._bounds(num_rows)[..., 0].amax(1).tolist()]
-
-    def reach(self, num_rows: int) -> int:
-        """The largest of ``reaches``."""
-        return max(self.reaches(num_rows))
+        return [math.ceil(bound + 0.5) for bound in self._bounds(num_rows)[..., 0].amax(1).tolist()]
 
     def row_starts(self, frame_rows: Tensor) -> Tensor:
         """Exposure starts of frame rows (B, T, S) in seconds."""
@@ -112,13 +109,29 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
     return FrameMotion(vibration, timing, starts, shift)
 
 
+def motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
+    """The vibration in row order on the frames' device, batch shape (B,).
+
+    Raises:
+        ValueError: If there is neither one vibration nor one for each stack of a batch.
+    """
+    batch = frames.images.shape[0]
+    if vibration.batch_shape not in ((), (batch,)) or (vibration.batch_shape and not frames.batched):
+        raise ValueError(
+            f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape {frames.shape}; "
+            "one vibration, or one per stack of a (B, T, C, H, W) batch"
+        )
+    motion = vibration.to_row_order(frames.image_timing).to(frames.images.device)
+    return motion if motion.batch_shape else motion.expanded(batch)
+
+
 @checks_arguments
 def visible_pixels(
     timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int
 ) -> tuple[Tensor, Tensor]:
     """Pixels of the restored frames that were exposed, and the shift of every restored frame.
 
-    Pixels outside the mask were never exposed; restoration extends the frame there by mirroring.
+    Pixels outside the mask were never exposed: ``restore`` extrapolates or mirrors the frame there.
 
     Args:
         timing: The sensor.
@@ -251,35 +264,3 @@ def restore_in_strips(
         cut["strips"] = len(strips.firsts)
     restored = method(strips.cut(images), of_frames, **cut)
     return strips.finer(restored.shape[-1] // strips.width).joined(restored)
-
-
-def judged_strip(
-    raw: Tensor, restored: Tensor, hidden: Tensor | None, motion: Motion, timing: RowTiming, *, columns: int = 160
-) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
-    """The part of the frames of a stack by which their restoration is judged, and its motion.
-
-    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
-
-    Args:
-        raw: (T, C, H, W) in row order.
-        restored: (T, C, H, W) or (1, C, H, W); of a finer grid, the points at the pixels are judged.
-        hidden: Mask shaped like ``raw`` of pixels that were not measured.
-        motion: (1) in row order.
-        timing: The sensor.
-        columns: Width of the strip.
-    """
-    count, (height, width) = len(raw), raw.shape[-2:]
-    points = restored.shape[-1] // width
-    restored = restored[..., ::points, ::points]
-    if motion.same_for_all_columns:
-        of_frames = frame_motion(motion, timing, count, height)
-        of_frames.check_fits(height, width)
-        return raw, restored, hidden, of_frames
-    strip = min(columns, width // 2)
-    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
-    both = torch.cat([raw[0][..., half] for half in halves], -1)
-    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
-    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
-    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
-    masked = None if hidden is None else hidden[..., half]
-    return raw[..., half], restored[..., half], masked, frame_motion(of_strip, timing, count, height)

@@ -176,23 +176,24 @@ def noise_of_blurred_frames(
     nothing = torch.full((len(frames),), math.nan, dtype=torch.float64, device=device)
     if min(shape) < 2 * _SIDE:
         return nothing
+    # transfer of the blur of squares spread over the frame; the estimator needs frequencies that it blocks
     counts = _square_counts(shape, min(max(256 // len(frames), 25), 64))
     rows, columns = _spread_squares(shape, counts, device)
     u = torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=device)
     v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=device)
-    used = _pooled_before_last(torch.hypot(u[:, None], v)) > min_frequency
+    used = _pooled(torch.hypot(u[:, None], v)) > min_frequency
     times = motion.frame_starts[:, None, None] + rows * motion.timing.row_time
-    transfer = _pooled_before_last(_power_transfer(motion, stack, times[..., row_step // 2 :: row_step], u, v))[
-        ..., used
-    ]
+    transfer = _pooled(_power_transfer(motion, stack, times[..., row_step // 2 :: row_step], u, v))[..., used]
     if float((transfer < max_transfer).double().mean()) < min_share:
         return nothing
+    # power of the squares, mean over channels, with rows moved back by their displacement
     squares = _tapered(_cut_squares(frames, rows, columns))  # (T, C, n, m, rows, columns)
     mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
     unshift = waves(mean, -u).to(frames.dtype.to_complex())  # aligns neighbouring rows along the row axis
     power = squared_modulus(torch.fft.fft(torch.fft.rfft(squares) * unshift[:, None, :, None], dim=-2)).mean(1)
-    power = _pooled_before_last(power.transpose(-2, -1).to(torch.float64))[..., used]
+    power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., used]
     power, transfer = power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2)
+    # squares that count; frames with too few of them have no estimate
     usable = (power > 0).any(-1)
     if ignore is not None:
         missing = _cut_squares(ignore.any(1), rows, columns).double().mean((-2, -1)).flatten(1)
@@ -224,6 +225,7 @@ def fit_noise(
     texture = torch.ones_like(power[..., :1])
     scene = mean(power - noise).clamp(min=0.1 * noise) / mean(transfer)
     for _ in range(iterations):
+        # step of scene and noise
         by_scene = texture * transfer  # derivative of the model with respect to the scene
         model = by_scene * scene + noise
         weight, residual = share / model.square(), power - model
@@ -236,6 +238,7 @@ def fit_noise(
         step = step.clamp(min=-max_decrease * noise, max=noise)
         scene = torch.maximum(scene + (gradient - mixed * step) / curvature, max_decrease * scene)
         noise = noise + step
+        # step of the texture, whose mean is one by definition
         by_texture = transfer * scene
         model = texture * by_texture + noise
         weight, residual = model.square().reciprocal(), power - model
@@ -264,7 +267,7 @@ def _power_transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v
     return (transfer * (window / window.sum())[:, None, None]).sum(-3)
 
 
-def _pooled_before_last(values: Tensor) -> Tensor:
+def _pooled(values: Tensor) -> Tensor:
     """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
     inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
     pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
@@ -308,6 +311,7 @@ def noise_of_frame_pair(
     members = usable[middle : middle + 2]
     if len(members) < 2:
         return nothing
+    # rows and columns of the scene that both frames contain
     x, y = (int(step) for step in (motion.shift[stack, members[1]] - motion.shift[stack, members[0]]).tolist())
     columns, rows = width - abs(x), height - abs(y)
     if min(columns, rows) < max(min(_MIN_SIDE, height, width), 8):
@@ -320,13 +324,14 @@ def noise_of_frame_pair(
         places = zip(members, first_rows, first_columns, strict=True)
         return torch.stack([values[m, :, i : i + num_rows, j : j + columns] for m, i, j in places])
 
-    images, missing = shared(frames), None if ignore is None else shared(ignore)
-    measured_share = 1.0 if missing is None else 1.0 - float(missing.any(0).double().mean())
+    images, ignored = shared(frames), None if ignore is None else shared(ignore)
+    measured_share = 1.0 if ignored is None else 1.0 - float(ignored.any(0).double().mean())
     if measured_share < 1.0 - max_missing:
         return nothing
+    # noise of both frames, and texture that the high-pass estimate counts as noise
     rows_of_both = torch.tensor(first_rows, device=frames.device)
     noise = _residual_power(images, motion, stack, rows_of_both, members) / measured_share
-    alone = estimate_noise(images, missing).square().mean(-1)
+    alone = estimate_noise(images, ignored).square().mean(-1)
     texture = (alone.mean() - noise).clamp(min=0.0)
     # neither frame has more noise than both together; blur may leave one of them more texture than the other
     upper = 2.0 * noise + (high_pass - alone.amax()).clamp(min=0.0)
@@ -349,6 +354,7 @@ def _residual_power(
     Only ``num_frequencies`` horizontal frequencies of the upper half are used, where scenes are weakest. A smoothness
     prior of ``prior_weight``, relative to the data, fills in rows of the scene that neither frame contains.
     """
+    # kernels of the rows of both frames, and their spectra at the chosen frequencies
     num_rows, width = images.shape[-2:]
     rows = first_rows[:, None] + torch.arange(num_rows, dtype=torch.float64, device=images.device)
     starts = motion.frame_starts[members][:, None] + rows * motion.timing.row_time
@@ -358,7 +364,7 @@ def _residual_power(
     count = min(num_frequencies, width // 4)
     chosen = torch.linspace(width // 4, width // 2, count, device=images.device, dtype=torch.float32).long()
     sample = sample_rows(images, kernels, chosen)
-    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), prior_weight)])
+    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), strength=prior_weight)])
     power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())
     return power.to(images.dtype)
 
@@ -419,10 +425,10 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None, *, min_frequency: 
     images = frames.reshape(-1, height, width)
     if min(height, width) < _SIDE:
         return images.new_full(frames.shape[:-2], math.nan, dtype=torch.float64)
-    power = _pooled_last(_spectrum(images, None if ignore is None else ignore.reshape(images.shape)))  # (N, V, U)
-    u = _pooled_last(torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=frames.device).expand(2, -1))[0]
+    power = _pooled(_spectrum(images, None if ignore is None else ignore.reshape(images.shape)).mT)  # (N, U, V)
+    u = _pooled(torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=frames.device)[:, None].expand(-1, 2))
     v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=frames.device).unflatten(0, (-1, 2)).mean(-1)
-    frequency, direction = torch.hypot(u, v[:, None]), torch.atan2(v[:, None], u)
+    frequency, direction = torch.hypot(u, v), torch.atan2(v, u)
     used = frequency > min_frequency
     sector = ((direction[used] / math.pi + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
     return _fit_floor(power[:, used], frequency[used], sector).reshape(frames.shape[:-2])
@@ -439,12 +445,6 @@ def _spectrum(images: Tensor, ignore: Tensor | None, *, squares_per_axis: int = 
     missing = _cut_squares(ignore, rows, columns).double().mean((-2, -1)).flatten(1)
     usable = _mostly_measured(missing, (-1,))
     return (power * usable[..., None, None]).sum(1) / usable.sum(1)[:, None, None]
-
-
-def _pooled_last(values: Tensor) -> Tensor:
-    """Means over 2 x 2 neighbouring frequencies of (..., V, U), without the lowest and the two highest u."""
-    pooled: Tensor = values[..., 1:-2].unflatten(-1, (-1, 2)).unflatten(-3, (-1, 2)).mean((-3, -1))
-    return pooled
 
 
 def _fit_floor(
@@ -468,6 +468,7 @@ def _fit_floor(
         iterations: Scoring steps.
         max_step: Largest change of a parameter in one step.
     """
+    # start from half of the lowest power as floor, and from half of the mean power of each sector as scene
     inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)
     frequency = frequency / 0.4  # in units of a typical one, so that levels and exponents are nearly independent
     scale = power.mean(-1, keepdim=True)
@@ -480,6 +481,7 @@ def _fit_floor(
     prior = parameters.new_tensor([1e-3] * (2 + _SECTORS) + [steepness_std**-2] * _SECTORS)
     log_frequency, square = frequency.log(), frequency.square()
     for _ in range(iterations):
+        # expected power, and the derivatives of its logarithm
         floor, blur, log_level, exponent = parameters.split([1, 1, _SECTORS, _SECTORS], dim=-1)
         scene = (log_level[:, sector] - exponent[:, sector] * log_frequency - blur * square).exp()
         model = floor.exp() + scene
@@ -489,6 +491,7 @@ def _fit_floor(
             [(floor.exp() / model)[..., None], -(share * square)[..., None], parts, -parts * log_frequency[:, None]],
             dim=-1,
         )
+        # step of bounded size
         normal = slope.transpose(-2, -1) @ slope + torch.diag(prior)
         gradient = (slope.transpose(-2, -1) @ (power / model - 1.0)[..., None])[..., 0]
         gradient[:, 1:] += ((expected - parameters) * prior)[:, 1:]

@@ -21,7 +21,7 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
@@ -179,8 +179,7 @@ def restoration_mtf(
         raise ValueError(f"one stack of frames of at least 32 x 32 px required, got shape {prepared.shape}")
     vibration, _ = vibration_to_undo(vibration, timing, count, size[0])
     check_two_axes(vibration, "the MTF of a restoration")
-    rowwise = vibration.to_row_order(timing).to(prepared.images.device)
-    motion = frame_motion(rowwise if rowwise.batch_shape else rowwise.expanded(1), prepared.timing, count, size[0])
+    motion = frame_motion(motion_in_row_order(prepared, vibration), prepared.timing, count, size[0])
     points = options.get("scale", 1)
     # neighbours and their aliases 1 - u are at least half a step apart: more than the taper mixes
     cycles = max(4, min(40, min(size) // 5))

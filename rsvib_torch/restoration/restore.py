@@ -33,11 +33,11 @@ from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.frame_motion import judged_strip, restore_in_strips
+from rsvib_torch.restoration.frame_motion import motion_in_row_order, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.verdict.judge import judge_frames
-from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError, pairs_to_judge
+from rsvib_torch.restoration.verdict.judge import judge_prepared
+from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = [
@@ -215,12 +215,14 @@ def restore(
     """Restore frames taken by a vibrating rolling-shutter camera: geometry and sharpness.
 
     A restored frame contains the scene at rest. With a uniform image motion, the scene is moved by that motion at the
-    middle of the frame, in whole pixels. Pixels that were never exposed, a rim as wide as the displacement, are filled
-    by mirroring. ``visible_pixels`` returns both the shift and the mask of these pixels.
+    middle of the frame, in whole pixels. ``visible_pixels`` returns both the shift and the mask of exposed pixels.
+    Others, a rim as wide as the displacement, are extrapolated by method ``"exact"``: rows by its prior, columns by the
+    smooth extension of the rows to a period. The other methods mirror rows at the ends of frames.
 
     Pixels without data (NaN, or ``ignore``) do not count, and saturated ones only give a lower bound: method
-    ``"exact"`` estimates both from all other pixels. ``"richardson-lucy"`` excludes pixels without data; ``"banded"``
-    and ``"dewarp"`` replace them by local means. These three methods treat saturated pixels as measured.
+    ``"exact"`` estimates both from all other pixels, and holds the bounds approximately. ``"richardson-lucy"`` excludes
+    pixels without data; ``"banded"`` and ``"dewarp"`` replace them by local means. These three methods treat saturated
+    pixels as measured.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) in image orientation: a tensor, an array, a list of
@@ -292,8 +294,8 @@ def restore(
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.get("joint", False), options.get("scale", 1))
     restored = restore_prepared(prepared, vibration, method, options)
-    if check:
-        _warn_if_worse(prepared, restored.detach(), vibration, options.get("joint", False))
+    if check:  # before frames are sharpened: the verdict compares them with raw frames, which the optics have blurred
+        _warn_if_worse(prepared, restored, vibration, options.get("joint", False))
     if camera is not None:
         restored = sharpened(restored, camera, options.get("scale", 1))
     return prepared.from_row_order(restored)
@@ -304,7 +306,7 @@ def restore(
 def restore_prepared(
     frames: PreparedFrames, vibration: Motion, method: str = "exact", options: Mapping[str, Any] | None = None
 ) -> Tensor:
-    """``restore`` of frames that are already prepared, without a check of the result.
+    """``restore`` of prepared frames, without a check of motion and result, and without sharpening by ``optics``.
 
     Args:
         frames: The frames.
@@ -327,7 +329,7 @@ def restore_prepared(
         options["colours"] = frames.colours
     if chosen.strips:
         options["strips"] = 1
-    motion = _motion_in_row_order(frames, vibration)
+    motion = motion_in_row_order(frames, vibration)
     return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options)
 
 
@@ -346,47 +348,19 @@ def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) 
     return frames.from_row_order(enlarged(images[:, middle : middle + 1] if joint is True else images, scale))
 
 
-def _motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
-    """The vibration in row order on the frames' device, batch shape (B,).
-
-    Raises:
-        ValueError: If there is neither one vibration nor one for each stack of a batch.
-    """
-    batch = frames.images.shape[0]
-    if vibration.batch_shape not in ((), (batch,)) or (vibration.batch_shape and not frames.batched):
-        raise ValueError(
-            f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape {frames.shape}; "
-            "one vibration, or one per stack of a (B, T, C, H, W) batch"
-        )
-    motion = vibration.to_row_order(frames.image_timing).to(frames.images.device)
-    return motion if motion.batch_shape else motion.expanded(batch)
-
-
 def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, joint: bool | int) -> None:
-    """Judge each stack of a batch on a strip of 160 columns of two pairs of frames."""
-    count = frames.images.shape[1]
-    if count < 2:
+    """Judge each stack of a batch that moves on a strip of 160 columns of two pairs of frames."""
+    if frames.images.shape[1] < 2:
         return
-    raw, restored = (images.detach() for images in frames.compared(restored))
-    motion = _motion_in_row_order(frames, vibration)
-    pairs = pairs_to_judge(count, joint, 2)
-    shared = count if joint is True else max(int(joint), 1)
-    for stack in range(len(raw)):
-        still = motion[stack].detached()
-        if not bool(still.moving_axes().any()):
-            continue
-        missing = None if frames.missing is None else frames.missing[stack]
-        seen = judged_strip(raw[stack], restored[stack], missing, still.expanded(1), frames.timing)
+    moving = vibration.moving_axes().any(-1).expand(len(restored)).nonzero().flatten().tolist()
+    for stack in moving:
         try:
-            verdict = judge_frames(
-                seen[0], seen[1], seen[3], pairs, shared=min(shared, count), columns=160, hidden=seen[2]
-            )
+            verdict = judge_prepared(frames, restored, vibration, joint=joint, most_pairs=2, columns=160, stack=stack)
         except TooLittleInCommonError:
             continue  # frames that share no scene cannot be compared
         if verdict.overall in ("partly", "worse"):
-            where = f"stack {stack}: " if len(raw) > 1 else ""
-            summary = verdict.in_image_axes(frames.image_timing).sentence
-            warn_of_restoration(f"{where}{summary}")
+            where = f"stack {stack}: " if len(restored) > 1 else ""
+            warn_of_restoration(f"{where}{verdict.sentence}")
 
 
 class VibrationRestorer(nn.Module):

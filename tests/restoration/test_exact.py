@@ -106,7 +106,9 @@ def test_boundaries_are_not_periodic(short):
     other[:, :, :8] = 1.0
     stack, changed = (stack_of(images, TIMING, motion.vibration(), noise=0.01) for images in (frames, other))
     # with one prior, so that results depend on the frames only through the solution
-    change = solved(changed, prior=stack.prior, strengths=FixedStrength()) - solved(stack, strengths=FixedStrength())
+    change = solved(changed, prior=stack.prior, strength_cache=FixedStrength()) - solved(
+        stack, strength_cache=FixedStrength()
+    )
     assert change[:, :4, :4].abs().max() > 0.1
     assert change[:, 64:, -32:].abs().max() < 0.01
     assert change[:, -32:, 64:].abs().max() < 0.01
@@ -338,7 +340,7 @@ def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
     problems = [
         scene.problem(Partition())
         for strip in model_stacks(strips, of_frames, noise=0.005, strips=5)
-        for scene in strip.scenes([([0], 0)], 1.0)
+        for scene in strip.tasks([([0], 0)], 1.0)
     ]
     assert [isinstance(problem, Extended) for problem in problems] == [True, False, False, False, True]
 
@@ -354,7 +356,7 @@ def test_scenes_filled_together_equal_single_ones(amplitude, shapes):
     scenes = [
         scene
         for images, motion in zip(frames, motions, strict=True)
-        for scene in stack_of(images, timing, motion, noise=0.01).scenes(joint_groups(3, False), 1.0)
+        for scene in stack_of(images, timing, motion, noise=0.01).tasks(joint_groups(3, False), 1.0)
     ]
     assert len({scene.problem(Partition()).problem.data.shape for scene in scenes}) == shapes
     found, single = (

@@ -169,11 +169,13 @@ def test_gradient_of_the_least_squares_solution():
     kernels = finer_kernels(displacement[0], node_weights, torch.ones(2), 24)
     observation = FinerObservation(kernels, 24, 32, torch.float64)
     prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64), 32)
-    precisions = [prior.precision(torch.tensor(1e-4 * factor), 1.0, kernels.reach) for factor in (1.0, 4.0, 4.0)]
+    precisions = [
+        prior.precision(torch.tensor(1e-4 * factor), blur_reach=kernels.blur_reach) for factor in (1.0, 4.0, 4.0)
+    ]
     weights = (torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64) < 0.4).double()
     solver = MosaicSolver(observation, weights, precisions, Partition())
     check_gradient(
-        lambda data: solver.scene(solver.fit(data, iterations=12)).square().mean(),
+        lambda data: solver.image(solver.fit(data, iterations=12)).square().mean(),
         torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64),
         rel=1e-3,
     )

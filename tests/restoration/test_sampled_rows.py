@@ -28,7 +28,7 @@ def slab_data(request):
     kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS)
     prior = fit_prior(frames, motion, 0, torch.full((2,), NOISE), WIDTH).of([0, 1])
     chosen = torch.arange(8, 120, 8)
-    precision = prior.precision(torch.tensor(NOISE**2 * WIDTH), 1.0, kernels.reach)[..., chosen]
+    precision = prior.precision(torch.tensor(NOISE**2), blur_reach=kernels.blur_reach)[..., chosen]
     assert frames.shape == (2, 1, NUM_ROWS, WIDTH)
     return frames, kernels, chosen, precision
 

@@ -13,7 +13,7 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
-from rsvib_torch.restoration.scene_model.cross_validation import Strengths
+from rsvib_torch.restoration.scene_model.cross_validation import StrengthCache
 from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
@@ -34,7 +34,7 @@ SCENES = {
 }
 
 
-class CountedStrengths(Strengths):
+class CountedStrengthCache(StrengthCache):
     """Counts the strengths that are selected from the frames."""
 
     def __init__(self):
@@ -69,7 +69,9 @@ def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint
     found = decibel(restore(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
     stack = stack_of(frames, timing, MOTION.vibration())
     by_hand = {
-        factor: decibel(solved(stack, joint=joint, regularisation=factor, strengths=FixedStrength())[0], crop(scene))
+        factor: decibel(
+            solved(stack, joint=joint, regularisation=factor, strength_cache=FixedStrength())[0], crop(scene)
+        )
         for factor in (0.03, 0.1, 0.3, 1.0, 3.0)
     }
     assert found > max(by_hand.values()) - within
@@ -102,9 +104,9 @@ def test_frames_of_the_same_noise_share_a_strength(name, rows, noise, choices):
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
     stack = stack_of(frames, timing, MOTION.vibration())
     for joint, expected in ((False, choices), (True, 1)):
-        counted = replace(stack, strengths=CountedStrengths())
-        counted.scenes(joint_groups(2, joint), 1.0)
-        assert counted.strengths.selected == expected
+        counted = replace(stack, strength_cache=CountedStrengthCache())
+        counted.tasks(joint_groups(2, joint), 1.0)
+        assert counted.strength_cache.selected == expected
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -112,8 +114,8 @@ def test_power_of_pure_noise_is_close_to_zero(count):
     noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))
     motion = frame_motion(MOTION.vibration().expanded(1), TIMING, count, 512)
     prior = fit_prior(0.5 + 0.02 * noise, motion, 0, torch.full((count,), 0.02), 576)
-    assert prior.power.mean() < 0.08 * 0.02**2 * 576
-    assert fit_prior(0.5 + 0.04 * noise, motion, 0, torch.full((count,), 0.02), 576).power.mean() > 2 * 0.02**2 * 576
+    assert prior.power.mean() < 0.08 * 0.02**2
+    assert fit_prior(0.5 + 0.04 * noise, motion, 0, torch.full((count,), 0.02), 576).power.mean() > 2 * 0.02**2
 
 
 @pytest.mark.parametrize(("across", "along"), [(0.2, 0.05), (0.02, 0.1)])

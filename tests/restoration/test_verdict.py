@@ -327,7 +327,7 @@ def test_dtypes_and_detections_of_restore_are_accepted(scene):
         ({"joint": 2.7}, TypeError, "joint must be True or False or a whole number, got 2.7"),
         ({"joint": "all"}, TypeError, "joint must be True or False or a whole number, got 'all'"),
         ({"vibration": 3.0}, TypeError, "vibration must be a Motion or a DetectedVibration .*, got 3.0"),
-        ({"vibration": Vibration(1.0, 50.0).expanded(2)}, ValueError, r"vibration must be one for the stack"),
+        ({"vibration": Vibration(1.0, 50.0).expanded(2)}, ValueError, r"does not fit frames of shape"),
         ({"timing": Vibration(1.0, 50.0)}, TypeError, "timing must be a SensorTiming, got Vibration"),
         ({"restored": torch.full((2, 96, 96), math.nan)}, ValueError, "restored must be finite"),
         ({"frames": torch.full((2, 96, 96), math.nan)}, ValueError, "no pixel with data"),

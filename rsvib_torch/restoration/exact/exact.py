@@ -4,6 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -14,13 +15,13 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
-from rsvib_torch.restoration.exact.filling import FILLED_REACH, Extended, Incomplete, filled, measured_values
-from rsvib_torch.restoration.exact.finer_scene import Misfit, finer_scene, warn_of_frames
+from rsvib_torch.restoration.exact.filling import FILLED_BLUR_REACH, Extended, Incomplete, filled, measured_values
+from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.priors import PRIORS, Prior, check_prior
 from rsvib_torch.restoration.exact.scene_solver import SIDE_BY_SIDE, Partition, SceneProblem, SolversSideBySide
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.scene_model.cross_validation import Strengths, prior_strength
+from rsvib_torch.restoration.scene_model.cross_validation import StrengthCache, prior_strength
 from rsvib_torch.restoration.scene_model.observation import GRIDS, SCALE, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import (
     PolynomialPrior,
@@ -30,7 +31,7 @@ from rsvib_torch.restoration.scene_model.scene_prior import (
     fit_prior,
 )
 
-__all__ = ["Scene", "StackModel", "given_level", "model_stacks", "restore_exact", "scene_periods", "solve_scenes"]
+__all__ = ["SceneTask", "StackModel", "given_level", "model_stacks", "restore_exact", "scene_periods", "solve_scenes"]
 
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 
@@ -73,10 +74,11 @@ def restore_exact(
             ``noise_levels``.
         regularisation: Factor on the prior; 1 is the strength estimated from the frames.
         ignore: Boolean mask shaped like the frames of missing pixels, whose values are estimated from all others.
-        clipped: Boolean mask of saturated pixels, whose values are lower bounds.
-        chunk_frequencies: Frequencies solved at a time; bounds the memory, does not change the result. None: as many
-            as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by more
-            than a pixel during an exposure.
+        clipped: Boolean mask of saturated pixels, whose values are lower bounds, which are held approximately.
+        chunk_frequencies: Frequencies solved at a time; fewer need less memory and do not change the result. None: as
+            many as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by
+            more than a pixel during an exposure. While missing values or the boundary extension are filled, the factors
+            of all frequencies stay in memory, and this option does not bound it.
         segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
             None: segments of at least 512 rows on a CPU, 256 on a GPU.
             Always one where the displacement changes by more than a pixel during an exposure: rows then depend on
@@ -104,14 +106,14 @@ def restore_exact(
     stacks = model_stacks(frames, motion, noise=noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips)
 
     # 3. Select the strength of the prior of each scene, by cross-validation.
-    scenes = [scene for stack in stacks for scene in stack.scenes(groups, factor)]
+    tasks = [task for stack in stacks for task in stack.tasks(groups, factor)]
 
     # 4. Fill missing values, and solve the banded systems of all frequencies.
-    images, misfits = solve_scenes(scenes, PRIORS[prior], factor, partition, motion.neglected)
+    images, differences = solve_scenes(tasks, PRIORS[prior], factor, partition, motion.neglected)
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if scale != 1:
-        warn_of_frames(misfits, (scene.stack.places(scene.members) for scene in scenes))
+        warn_of_frames(differences, (task.stack.places(task.members) for task in tasks))
     restored: Tensor = images.unflatten(0, (len(frames), -1))
     return restored
 
@@ -130,11 +132,11 @@ class StackModel:
         level_is_certain: Whether it is given or estimated from several frames.
         mean: (C, 1, 1) brightness; the prior is for deviations from it.
         prior: Of all frames.
-        strengths: Factors on the prior that were already selected.
+        strength_cache: Factors on the prior that were already selected.
         period: L, the period of the restored scenes in px.
         scale: Points of the restored scenes per px.
-        missing: (T, C, H, W) bool, missing and saturated pixels; None for none.
-        clipped: Likewise, the saturated ones.
+        unknown: (T, C, H, W) bool, pixels without data and saturated ones; None for none.
+        clipped: (T, C, H, W) bool, the saturated ones.
         fills_ends: Whether the boundary extension may be filled: not that of inner strips of columns, which end where
             they have no weight (half the time, 0.00 dB).
     """
@@ -148,10 +150,10 @@ class StackModel:
     level_is_certain: bool
     mean: Tensor
     prior: RowPrior | PolynomialPrior
-    strengths: Strengths
+    strength_cache: StrengthCache
     period: int
     scale: int
-    missing: Tensor | None
+    unknown: Tensor | None
     clipped: Tensor | None
     fills_ends: bool
 
@@ -164,30 +166,30 @@ class StackModel:
         """Mean displacement (M, R, 2) of the rows of some frames."""
         return (self.displacement[members].detach() * self.node_weights[:, None]).sum(-2)
 
-    def scenes(self, groups: list[tuple[list[int], int]], regularisation: float) -> list["Scene"]:
+    def tasks(self, groups: list[tuple[list[int], int]], regularisation: float) -> list["SceneTask"]:
         """The scenes that are restored from groups of frames (``joint_groups``), with the strengths of their priors."""
-        if self.missing is not None:
+        if self.unknown is not None:
             # frames with at most 5 % measured pixels do not contribute, unless there are no others
-            share = (~self.missing).double().flatten(1).mean(1).tolist()
+            share = (~self.unknown).double().flatten(1).mean(1).tolist()
             groups = [([m for m in members if share[m] > 0.05] or members, reference) for members, reference in groups]
         return [
-            Scene(self, members, reference, regularisation * self.strength(members, reference))
+            SceneTask(self, members, reference, regularisation * self.strength_of(members, reference))
             for members, reference in groups
         ]
 
-    def strength(self, members: list[int], reference: int) -> float:
+    def strength_of(self, members: list[int], reference: int) -> float:
         """Factor on the prior, estimated from those frames whose columns are the same as in the restored one."""
         if isinstance(self.prior, PolynomialPrior):
-            return 1.0
+            return 1.0  # its strength is not selected
         same_columns = [frame for frame in members if torch.equal(self.shift[frame], self.shift[reference])]
-        prior, power = self.prior.of(members), self.level.square() * self.period
+        prior, power = self.prior.of(members), self.level.square()
 
         def choose() -> float:
             kernels = self.kernels(same_columns, reference)
             return prior_strength(self.frames[same_columns], kernels, prior, power, certain=self.level_is_certain)
 
         noise = power / self.weights[same_columns].mean() + prior.interpolation_power.mean()
-        return self.strengths.of(noise, choose)
+        return self.strength_cache.of(noise, choose)
 
 
 def model_stacks(
@@ -202,7 +204,7 @@ def model_stacks(
 ) -> list[StackModel]:
     """Displacement, period, noise levels and prior of each stack; arguments as in ``restore_exact``."""
     B, T, _, H, W = frames.shape
-    missing = ignore if clipped is None else clipped if ignore is None else ignore | clipped
+    unknown = ignore if clipped is None else clipped if ignore is None else ignore | clipped
     mean = brightness(frames).mean(1)[..., None, None]
 
     # Displacement of each row during its exposure, and the period of the scene that it requires.
@@ -218,13 +220,13 @@ def model_stacks(
         chosen = sorted({strips // 4, strips - 1 - strips // 4})
         for first in range(0, B, strips):
             measured = [
-                noise_levels(frames[index].detach(), motion, index, None if missing is None else missing[index])
+                noise_levels(frames[index].detach(), motion, index, None if unknown is None else unknown[index])
                 for index in (first + strip for strip in chosen)
             ]
             powers[first : first + strips] = torch.stack(measured).square().mean(0)
     levels = powers.sqrt().clamp(min=_MIN_LEVEL)
     frame_weights = levels.square().reciprocal()
-    typical = frame_weights.mean(1).reciprocal()
+    unit_variance = frame_weights.mean(1).reciprocal()
 
     # Prior of each stack, fitted to its frames.
     fit = fit_prior if scale == 1 else fit_polynomial_prior
@@ -238,15 +240,15 @@ def model_stacks(
                 displacement=displacement[index],
                 node_weights=node_weights,
                 shift=motion.shift[index],
-                weights=frame_weights[index] * typical[index],
-                level=typical[index].sqrt(),
+                weights=frame_weights[index] * unit_variance[index],
+                level=unit_variance[index].sqrt(),
                 level_is_certain=given is not None or T > 1,
                 mean=mean[index],
                 prior=fit(frames[index], motion, index, levels[index], period),
-                strengths=stacks[-1].strengths if strip else Strengths(),
+                strength_cache=stacks[-1].strength_cache if strip else StrengthCache(),
                 period=period,
                 scale=scale,
-                missing=None if missing is None else missing[index],
+                unknown=None if unknown is None else unknown[index],
                 clipped=None if clipped is None else clipped[index],
                 fills_ends=strip in (0, strips - 1),
             )
@@ -258,11 +260,13 @@ def scene_periods(motion: FrameMotion, displacement: Tensor, width: int) -> list
     """Period of the scenes of each stack of ``width`` px with displacement (B, T, R, N, 2) during the exposures."""
     along = displacement[..., 0].detach()
     # the boundary extension of blurred rows is filled; that of others is longer
-    extended = ((along.amax(-1) - along.amin(-1)).amax((1, 2)) > 2 * FILLED_REACH).tolist()
+    filled = ((along.amax(-1) - along.amin(-1)).amax((1, 2)) > 2 * FILLED_BLUR_REACH).tolist()
     # px beyond the displacement that influence the ends
-    margins = [8 + reach for reach in motion.reaches(displacement.shape[2])]
-    lengths = zip(extended, margins, strict=True)
-    return [fast_length(width + 2 * margin) if fill else extended_length(width, margin) for fill, margin in lengths]
+    margins = [8 + bound for bound in motion.displacement_bounds(displacement.shape[2])]
+    return [
+        fast_length(width + 2 * margin) if is_filled else extended_length(width, margin)
+        for is_filled, margin in zip(filled, margins, strict=True)
+    ]
 
 
 def given_level(noise: float) -> float:
@@ -271,8 +275,8 @@ def given_level(noise: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """A scene that is restored from frames of one stack.
+class SceneTask:
+    """A scene that is to be restored from frames of one stack.
 
     Attributes:
         stack: The stack.
@@ -292,29 +296,25 @@ class Scene:
         height, width = stack.frames.shape[-2:]
 
         # Data with zero mean, rows extended to a period.
-        neighbours = members == list(range(members[0], members[-1] + 1))  # a view instead of a copy
-        frames = stack.frames[members[0] : members[-1] + 1] if neighbours else stack.frames[members]
-        data = extend_rows(frames, stack.period).sub_(stack.mean)
+        data = extend_rows(stack.frames[members] - stack.mean, stack.period)
 
         # Observation operator, and precision of the prior.
         kernels = stack.kernels(members, self.reference)
         observation = GRIDS[stack.scale][1](kernels, height, stack.period, data.dtype)
-        if isinstance(stack.prior, RowPrior):
-            noise_power = stack.level.square() * stack.period
-            precision = stack.prior.of(members).precision(noise_power, self.strength, kernels.reach)
-        else:
-            precision = stack.prior.precision(stack.level.square(), self.strength, kernels.reach)
+        precision = stack.prior.of(members).precision(
+            stack.level.square(), strength=self.strength, blur_reach=kernels.blur_reach
+        )
         problem = SceneProblem(data, observation, precision, stack.level, partition)
 
         # Values that are missing: the boundary extension of blurred rows, and pixels without data.
         along = stack.shift[members, 0] - stack.shift[self.reference, 0]
-        missing = None if stack.missing is None else stack.missing[members]
-        ends = (kernels.reach > FILLED_REACH and stack.fills_ends) or stack.scale > 1
-        if missing is None and ends and not bool(along.any()):
+        unknown = None if stack.unknown is None else stack.unknown[members]
+        ends = (kernels.blur_reach > FILLED_BLUR_REACH and stack.fills_ends) or stack.scale > 1
+        if unknown is None and ends and not bool(along.any()):
             # on the finer grid, extensions of different frames contradict each other beyond half a cycle per px:
             # filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002)
             return Extended(problem, width)
-        measured = measured_values(along, missing, data.shape, width, ends=ends)
+        measured = measured_values(along, unknown, data.shape, width, ends=ends)
         if measured is None:
             return problem
         floor = None
@@ -324,93 +324,100 @@ class Scene:
         return Incomplete(problem, measured, floor)
 
 
-_FILLED_TOGETHER = 8  # tasks; four frames of 1024 rows take 0.79 s together, 1.19 s two by two in two threads
+_FILLED_TOGETHER = 8  # batches; four frames of 1024 rows take 0.79 s together, 1.19 s two by two in two threads
 
 
 def solve_scenes(
-    scenes: list[Scene],
+    tasks: list[SceneTask],
     prior: Prior,
     regularisation: float,
     partition: Partition,
     neglected: float = 0.0,
     filled_together: int = _FILLED_TOGETHER,
-) -> tuple[Tensor, list[Misfit]]:
+) -> tuple[Tensor, list[FrameDifference]]:
     """Images of scenes of one size.
 
     Args:
-        scenes: The scenes.
+        tasks: The scenes.
         prior: Prior of all scenes.
         regularisation: Factor on the strength of the prior.
         partition: Parts solved at a time.
         neglected: As in ``FrameMotion``.
-        filled_together: Tasks whose missing values are filled together: more are faster and need more memory.
+        filled_together: Batches whose missing values are filled together: more are faster and need more memory.
 
     Returns:
-        Images (N, C, S H, S W), and, on the finer grid, the misfits of the scenes.
+        Images (N, C, S H, S W), and, on the finer grid, the differences of the frames of each scene.
     """
-    stack = scenes[0].stack
-
-    def solve(problems: list[SceneProblem]) -> list[tuple[Tensor, Misfit | None]]:
-        """Deviations of scenes from their brightness, and misfits, for data without missing values."""
-        solved: list[tuple[Tensor, Misfit | None]]
-        if stack.scale != 1:
-            solved = [finer_scene(problem, stack.frames.shape[-1], neglected) for problem in problems]
-        elif prior.is_precision and len(problems) > 1:
-            together = SolversSideBySide(problems).scenes([problem.data for problem in problems])
-            solved = [(image, None) for image in together]
-        else:
-            solved = [(prior.function(problem, regularisation), None) for problem in problems]
-        width = stack.scale * stack.frames.shape[-1]
-        return [(image[..., :width], misfit) for image, misfit in solved]
+    stack = tasks[0].stack
+    device, (_, channels, height, width) = stack.frames.device, stack.frames.shape
+    solve = partial(_solutions, stack=stack, prior=prior, regularisation=regularisation, neglected=neglected)
 
     # With gradients, one scene after the other.
-    given = (value for scene in scenes for value in (scene.stack.frames, scene.stack.displacement))
-    if torch.is_grad_enabled() and any(value.requires_grad for value in given):
-        results = [result for scene in scenes for result in solve(filled([scene.problem(partition)]))]
-        deviations = zip(scenes, results, strict=True)
-        restored = torch.stack([image + scene.stack.mean for scene, (image, _) in deviations])
-        return restored, [misfit for _, misfit in results if misfit is not None]
+    inputs = (value for task in tasks for value in (task.stack.frames, task.stack.displacement))
+    if torch.is_grad_enabled() and any(value.requires_grad for value in inputs):
+        solutions = [solution for task in tasks for solution in solve(filled([task.problem(partition)]))]
+        restored = torch.stack([image + task.stack.mean for task, (image, _) in zip(tasks, solutions, strict=True)])
+        return restored, [difference for _, difference in solutions if difference is not None]
 
-    # Scenes of few frequencies are solved together in one task, as many as two threads leave for each. Those in the
-    # coordinates of the same frame have systems of about one size, and need no extension.
-    device = stack.frames.device
-    threads = Partition.threads(device)
-    together = 1
-    if prior.is_precision and stack.scale == 1:
-        frequencies = max(scene.stack.period for scene in scenes) // 2 + 1
-        together = max(1, min(SIDE_BY_SIDE // frequencies, -(-len(scenes) // threads)))
-    tasks: list[list[int]] = []
-    for reference in sorted({scene.reference for scene in scenes}):
-        same = [number for number, scene in enumerate(scenes) if scene.reference == reference]
-        tasks += [same[place] for place in runs(len(same), together)]
-    threads = min(threads, len(tasks))
+    batches = _batches(tasks, together=prior.is_precision and stack.scale == 1)
+    threads = min(Partition.threads(device), len(batches))
     # each thread has its own memory
     partitions = [partition, *(Partition(partition.chunk, partition.segments) for _ in range(threads - 1))]
+    images = stack.frames.new_empty(len(tasks), channels, stack.scale * height, stack.scale * width)
+    differences: list[FrameDifference] = []
+    advance = steps(len(batches), "frames")
 
-    _, channels, height, width = stack.frames.shape
-    images = stack.frames.new_empty(len(scenes), channels, stack.scale * height, stack.scale * width)
-    misfits: list[Misfit] = []
-    advance = steps(len(tasks), "frames")
-
-    def solve_share(thread: int, share: list[tuple[list[int], list[SceneProblem]]]) -> None:
-        """Solve the tasks of a thread."""
-        for task, problems in share:
-            solved = solve([replace(problem, partition=partitions[thread]) for problem in problems])
-            for number, (image, misfit) in zip(task, solved, strict=True):
-                images[number] = image + scenes[number].stack.mean
-                if misfit is not None:
-                    misfits.append(misfit)
+    def solve_share(block: list[list[int]], problems: dict[int, SceneProblem], thread: int) -> None:
+        """Solve the batches of a block that a thread takes."""
+        for batch in block[thread::threads]:
+            solutions = solve([replace(problems[number], partition=partitions[thread]) for number in batch])
+            for number, (image, difference) in zip(batch, solutions, strict=True):
+                images[number] = image + tasks[number].stack.mean
+                if difference is not None:
+                    differences.append(difference)
             advance()
 
-    # Some tasks at a time: their problems are built, missing values are filled, and the systems are solved.
-    for block in runs(len(tasks), filled_together):
-        built = in_parallel(lambda task: [scenes[number].problem(partition) for number in task], tasks[block], device)
+    for place in runs(len(batches), filled_together):
+        # Build the problems of a block of batches.
+        numbers = [number for batch in batches[place] for number in batch]
+        incomplete = in_parallel(lambda number: tasks[number].problem(partition), numbers, device)
+        # Fill missing values before the threads share the block: the extensions of all its scenes are solved together.
         with torch.no_grad():
-            complete = iter(filled([problem for problems in built for problem in problems]))
-        problems = [(task, [next(complete) for _ in task]) for task in tasks[block]]
-        in_parallel(
-            lambda thread: solve_share(thread, problems[thread::threads]),  # noqa: B023 - called in this round
-            range(threads),
-            device,
-        )
-    return images, misfits
+            problems = dict(zip(numbers, filled(incomplete), strict=True))
+        # Solve the systems of the complete data.
+        in_parallel(partial(solve_share, batches[place], problems), range(threads), device)
+    return images, differences
+
+
+def _batches(tasks: list[SceneTask], *, together: bool) -> list[list[int]]:
+    """Numbers of the scenes whose systems are solved in one batch, or of single scenes.
+
+    Scenes of few frequencies are solved together, as many as two threads leave for each. Those in the coordinates of
+    the same frame have systems of about one size, and need no extension.
+    """
+    size = 1
+    if together:
+        frequencies = max(task.stack.period for task in tasks) // 2 + 1
+        threads = Partition.threads(tasks[0].stack.frames.device)
+        size = max(1, min(SIDE_BY_SIDE // frequencies, -(-len(tasks) // threads)))
+    batches: list[list[int]] = []
+    for reference in sorted({task.reference for task in tasks}):
+        numbers = [number for number, task in enumerate(tasks) if task.reference == reference]
+        batches += [numbers[place] for place in runs(len(numbers), size)]
+    return batches
+
+
+def _solutions(
+    problems: list[SceneProblem], stack: StackModel, prior: Prior, regularisation: float, neglected: float
+) -> list[tuple[Tensor, FrameDifference | None]]:
+    """Deviations (C, S H, S W) of scenes from their brightness for complete data, and differences on the finer grid."""
+    width = stack.frames.shape[-1]
+    solutions: list[tuple[Tensor, FrameDifference | None]]
+    if stack.scale != 1:
+        solutions = [finer_scene(problem, width, neglected) for problem in problems]
+    elif prior.is_precision and len(problems) > 1:
+        images = SolversSideBySide(problems).images([problem.data for problem in problems])
+        solutions = [(image, None) for image in images]
+    else:
+        solutions = [(prior.function(problem, regularisation), None) for problem in problems]
+    return [(image[..., : stack.scale * width], difference) for image, difference in solutions]

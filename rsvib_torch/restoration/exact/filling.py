@@ -13,9 +13,11 @@ from torch import Tensor
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SolversSideBySide
 
-__all__ = ["FILLED_REACH", "Extended", "Incomplete", "filled", "measured_values"]
+__all__ = ["FILLED_BLUR_REACH", "Extended", "Incomplete", "filled", "measured_values"]
 
-FILLED_REACH = 1.0  # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it
+FILLED_BLUR_REACH = (
+    1.0  # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it
+)
 # px beyond four times the reach. With 64, frames behind exposures of 200 and 400 rows gain up to 0.03 dB with 3 px and
 # 0.3 dB with 8 px, and their extensions take 1.2 times as long
 _NEAR = 24
@@ -23,10 +25,10 @@ _NEAR = 24
 
 @dataclass(frozen=True, eq=False)
 class Incomplete:
-    """A scene with missing values, whose data have any values there.
+    """A problem with missing values, whose data have any values there.
 
     Attributes:
-        problem: The scene.
+        problem: The problem of the scene.
         measured: (M, C, R, L) mask of measured values.
         floor: (M, C, R, L) lower bound of the missing values (saturated pixels), or None.
     """
@@ -38,10 +40,10 @@ class Incomplete:
 
 @dataclass(frozen=True, eq=False)
 class Extended:
-    """A scene of which only the boundary extension was not measured.
+    """A problem of which only the boundary extension was not measured.
 
     Attributes:
-        problem: The scene.
+        problem: The problem of the scene.
         width: Columns of the frames, the first of the data; the others are the extension.
     """
 
@@ -49,101 +51,111 @@ class Extended:
     width: int
 
 
-def filled(scenes: Sequence[SceneProblem | Incomplete | Extended]) -> list[SceneProblem]:
-    """The scenes with all missing values replaced by what the restored scene predicts.
+def filled(problems: Sequence[SceneProblem | Incomplete | Extended]) -> list[SceneProblem]:
+    """The problems with all missing values replaced by what the restored scene predicts.
 
     Boundary extensions of scenes with data of one shape are filled together. Whole frames with missing pixels are
     filled one by one: their systems are large, and their factors need memory.
     """
-    problems: dict[int, SceneProblem] = {}
-    alike: dict[torch.Size, list[int]] = {}
-    for number, scene in enumerate(scenes):
-        if isinstance(scene, Extended):
-            alike.setdefault(scene.problem.data.shape, []).append(number)
+    complete: dict[int, SceneProblem] = {}
+    of_shape: dict[torch.Size, dict[int, Extended]] = {}
+    for number, problem in enumerate(problems):
+        if isinstance(problem, Extended):
+            of_shape.setdefault(problem.problem.data.shape, {})[number] = problem
+        elif isinstance(problem, Incomplete):
+            [complete[number]] = _filled_by_conjugate_gradients([problem], iterations=8)
         else:
-            problems[number] = _with_values([scene], iterations=8)[0] if isinstance(scene, Incomplete) else scene
-    for numbers in alike.values():
-        extended = [scene for number in numbers if isinstance(scene := scenes[number], Extended)]
-        problems.update(zip(numbers, _with_extension(extended), strict=True))
-    return [problems[number] for number in range(len(scenes))]
+            complete[number] = problem
+    for extended in of_shape.values():
+        complete.update(zip(extended, _with_extension(list(extended.values())), strict=True))
+    return [complete[number] for number in range(len(problems))]
 
 
 def measured_values(
-    along: Tensor, missing: Tensor | None, shape: torch.Size, width: int, *, ends: bool = False
+    along: Tensor, unknown: Tensor | None, shape: torch.Size, width: int, *, ends: bool = False
 ) -> Tensor | None:
     """Mask of the measured values (M, C, R, L) of the frames; None if all count as measured.
 
     Args:
         along: (M,) px by which the frames are moved relative to the restored one. The boundary extension of rows counts
             as measured if all are 0, as it is right only for frames with the same columns.
-        missing: (M, C, R, W) bool, missing pixels, or None.
+        unknown: (M, C, R, W) bool, pixels without data and saturated ones, or None.
         shape: (M, C, R, L) of the data.
         width: W.
         ends: The boundary extension counts as missing in any case.
     """
     moved = ends or bool(along.any())
-    if missing is None and not moved:
+    if unknown is None and not moved:
         return None
     columns = torch.arange(shape[-1], device=along.device)
-    scene = columns - along[:, None]
-    inside = (columns < width) & (scene >= 0) & (scene < width) | (not moved)
+    scene_columns = columns - along[:, None]
+    inside = (columns < width) & (scene_columns >= 0) & (scene_columns < width) | (not moved)
     measured = inside[:, None, None].expand(shape).clone()
-    if missing is not None:
-        measured[..., :width] &= ~missing
+    if unknown is not None:
+        measured[..., :width] &= ~unknown
     return measured
 
 
-def _with_values(scenes: Sequence[Incomplete], iterations: int, tolerance: float = 0.05) -> list[SceneProblem]:
-    """Scenes whose missing values are replaced by what the solution for all other data predicts.
+def _filled_by_conjugate_gradients(
+    incomplete: Sequence[Incomplete], iterations: int, tolerance: float = 0.05
+) -> list[SceneProblem]:
+    """Problems whose missing values are replaced by what the solution for all other data predicts.
 
     The missing values x solve ``x = (K c(x))`` where they are, with the solution c(x) for the filled data. Conjugate
-    gradients, each step of which is one fast solution, start from the solution of the most complete frames.
+    gradients, each step of which is one fast solution, start from the solution of the most complete frames. Lower
+    bounds are held approximately, by two rounds of an active set: at the beginning of each, values that are predicted
+    below their bound are set to it, and count as measured from then on.
 
     Args:
-        scenes: With data of one shape, and all or none with a lower bound.
+        incomplete: With data of one shape, and all or none with a lower bound.
         iterations: Largest number of iterations.
         tolerance: Residual of the missing values, in units of the noise level, at which iterations stop.
     """
-    problems = [scene.problem for scene in scenes]
+    problems = [scene.problem for scene in incomplete]
     solvers = SolversSideBySide(problems, keep=True)
-    complete = [_of_complete_frames(scene) for scene in scenes]
-    starts = solvers if complete == problems else SolversSideBySide(complete)
-    data, measured = (
-        torch.stack(values) for values in zip(*((s.problem.data, s.measured) for s in scenes), strict=True)
-    )
+    data = torch.stack([problem.data for problem in problems])
+    measured = torch.stack([scene.measured for scene in incomplete])
+
+    # The inner product of conjugate gradients weights rows as the least-squares problem does.
     weights = torch.stack([problem.observation.kernels.weight for problem in problems]).to(data.dtype)
-    levels, scale = torch.stack([problem.level for problem in problems]), weights[:, :, None, :, None]
+    levels, row_weight = torch.stack([problem.level for problem in problems]), weights[:, :, None, :, None]
 
     def dot(first: Tensor, second: Tensor) -> Tensor:
-        return (scale * first * second).sum((1, 2, 3, 4), keepdim=True)
+        return (row_weight * first * second).sum((1, 2, 3, 4), keepdim=True)
 
+    def residual_of(values: Tensor, missing: Tensor) -> Tensor:
+        return torch.where(missing, values - torch.stack(solvers.predictions(values)), 0.0)
+
+    # Start from the prediction of the most complete frames.
+    complete = [_of_complete_frames(scene) for scene in incomplete]
+    all_complete = all(part is problem for part, problem in zip(complete, problems, strict=True))
+    starts = solvers if all_complete else SolversSideBySide(complete)
     data = torch.where(measured, data, torch.stack(starts.predictions(data)))
-    floors = [scene.floor for scene in scenes if scene.floor is not None]
+
+    floors = [scene.floor for scene in incomplete if scene.floor is not None]
     rounds = 2 if floors else 1
     for _ in range(rounds):
+        # Values predicted below their bound are set to it.
         if floors:
             floor = torch.stack(floors)
             low = ~measured & (data < floor)
             data, measured = torch.where(low, floor, data), measured | low
+        # Conjugate gradients for the others, until the residual of each scene is small beside the noise.
         missing = ~measured
         enough = (tolerance * levels[:, None, None, None, None]).square() * dot(missing.to(data.dtype), missing)
-
-        def residual_of(values: Tensor, missing: Tensor = missing) -> Tensor:
-            return torch.where(missing, values - torch.stack(solvers.predictions(values)), 0.0)
-
-        residual = -residual_of(data)
-        step, energy = residual, dot(residual, residual)
+        residual = -residual_of(data, missing)
+        direction, energy = residual, dot(residual, residual)
         for _ in range(iterations // rounds):
             inexact = energy > enough
             if not bool(inexact.any()):
                 break
-            image = residual_of(step)
-            length = torch.where(inexact, energy / dot(step, image), 0.0)
-            data = data + length * step
-            residual = residual - length * image
+            product = residual_of(direction, missing)
+            length = torch.where(inexact, energy / dot(direction, product), 0.0)
+            data = data + length * direction
+            residual = residual - length * product
             before, energy = energy, dot(residual, residual)
-            step = residual + torch.where(inexact, energy / before, 0.0) * step
-    return [replace(problem, data=own) for problem, own in zip(problems, data, strict=True)]
+            direction = residual + torch.where(inexact, energy / before, 0.0) * direction
+    return [replace(problem, data=values) for problem, values in zip(problems, data, strict=True)]
 
 
 def _of_complete_frames(scene: Incomplete) -> SceneProblem:
@@ -156,24 +168,24 @@ def _of_complete_frames(scene: Incomplete) -> SceneProblem:
     return replace(scene.problem, observation=scene.problem.observation.weighted(weight * complete[:, None]))
 
 
-def _with_extension(scenes: Sequence[Extended]) -> list[SceneProblem]:
-    """Scenes whose boundary extension is replaced by the prediction of the scene near the ends of the rows.
+def _with_extension(extended: Sequence[Extended]) -> list[SceneProblem]:
+    """Problems whose boundary extension is replaced by the prediction of the scene near the ends of the rows.
 
     Only a strip of columns on either side is solved, by itself and joined at the extension.
 
     Args:
-        scenes: With data of one shape.
+        extended: With data of one shape.
     """
-    data, width = torch.stack([scene.problem.data for scene in scenes]), scenes[0].width
-    reach = max(scene.problem.observation.kernels.reach for scene in scenes)
-    near = min(_NEAR + 4 * math.ceil(reach), width // 2)
+    data, width = torch.stack([scene.problem.data for scene in extended]), extended[0].width
+    blur_reach = max(scene.problem.observation.kernels.blur_reach for scene in extended)
+    near = min(_NEAR + 4 * math.ceil(blur_reach), width // 2)
     gap = slice(near, near + data.shape[-1] - width)
     strips = torch.cat([data[..., width - near :], data[..., :near]], dim=-1)
     length = fast_length(strips.shape[-1] + data.shape[-1] - width)
     columns = torch.arange(length, device=data.device)
     measured = (columns < gap.start) | ((columns >= gap.stop) & (columns < strips.shape[-1]))
     joined = []
-    for scene, strip in zip(scenes, extend_rows(strips, length), strict=True):
+    for scene, strip in zip(extended, extend_rows(strips, length), strict=True):
         flat = scene.problem.precision.flatten(0, 1)[None]
         precision = torch.nn.functional.interpolate(flat, length // 2 + 1, mode="linear", align_corners=True)
         precision = precision[0].unflatten(0, scene.problem.precision.shape[:2])
@@ -181,8 +193,8 @@ def _with_extension(scenes: Sequence[Extended]) -> list[SceneProblem]:
         problem = replace(scene.problem, data=strip, observation=observation, precision=precision)
         joined.append(Incomplete(problem, measured.expand_as(strip)))
     # the extension is hardly mixed into the frame by a blur below 1 px, on the finer grid: more iterations gain 0.01 dB
-    found = _with_values(joined, iterations=40 if reach > FILLED_REACH else 6)
+    solved = _filled_by_conjugate_gradients(joined, iterations=40 if blur_reach > FILLED_BLUR_REACH else 6)
     return [
-        replace(scene.problem, data=torch.cat([scene.problem.data[..., :width], own.data[..., gap]], dim=-1))
-        for scene, own in zip(scenes, found, strict=True)
+        replace(scene.problem, data=torch.cat([scene.problem.data[..., :width], strip.data[..., gap]], dim=-1))
+        for scene, strip in zip(extended, solved, strict=True)
     ]

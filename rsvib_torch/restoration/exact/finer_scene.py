@@ -14,7 +14,7 @@ from rsvib_torch.core.fourier import squared_modulus
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 
-__all__ = ["Misfit", "finer_scene", "phase_spread", "warn_of_frames"]
+__all__ = ["FrameDifference", "finer_scene", "phase_spread", "warn_of_frames"]
 
 _BLOCK = 16  # rows of a frame whose displacement error is measured together
 _SOLUTIONS = 10  # at most; one in general
@@ -29,7 +29,7 @@ _MAX_EFFECT, _MAX_RESIDUAL = 0.1, 1.5
 
 
 @dataclass(frozen=True)
-class Misfit:
+class FrameDifference:
     """Differences of frames from the prediction of their scene.
 
     Attributes:
@@ -57,8 +57,8 @@ class Misfit:
 
 
 @torch.no_grad()
-def _misfit(problem: SceneProblem, predicted: Tensor, width: int, neglected: float) -> Misfit:
-    """Misfit of frames of ``width`` px, without the ends of rows and columns.
+def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected: float) -> FrameDifference:
+    """Differences of frames of ``width`` px, without the ends of rows and columns.
 
     The displacement error of a block of rows is the least-squares factor of the gradient of the prediction in the
     residual. The variance that noise of the residual causes in it is subtracted.
@@ -88,7 +88,7 @@ def _misfit(problem: SceneProblem, predicted: Tensor, width: int, neglected: flo
     steepness = slopes.square().mean((0, 1, 2))
     effect, expected = (squares * steepness).sum().sqrt(), neglected * steepness.amax().sqrt()
     figures = torch.stack([power.mean().sqrt() / level, squares.sum().sqrt(), effect / level, expected / level])
-    return Misfit(*figures.tolist())
+    return FrameDifference(*figures.tolist())
 
 
 @torch.no_grad()
@@ -103,8 +103,8 @@ def _excess(problem: SceneProblem, predicted: Tensor, width: int) -> Tensor:
     return (mean / problem.level.square()).to(problem.precision.dtype)
 
 
-def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Tensor, Misfit]:
-    """Scene on the finer grid, and the misfit of its frames of ``width`` px.
+def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Tensor, FrameDifference]:
+    """Scene on the finer grid, and the differences of its frames of ``width`` px.
 
     A fine pattern in a scene with otherwise little detail is far above the spectrum of the prior, and remains in the
     residual at its horizontal frequencies. The prior is weakened there by the power of the residual: gratings at 0.75
@@ -127,20 +127,20 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
         solver = replace(problem, precision=factor / relaxed * problem.precision).solver()
         coefficients = solver.fit(problem.data)
         predicted = solver.predict(coefficients.detach())
-        misfit, excess = _misfit(problem, predicted, width, neglected), _excess(problem, predicted, width)
+        difference, excess = _difference(problem, predicted, width, neglected), _excess(problem, predicted, width)
         before, largest = largest, float(excess.amax())
         # a pattern leaves a tenth of its effect, a wrong motion at least a fifth
-        allowed = max(_MAX_EFFECT, 0.15 * misfit.effect) if before == math.inf else allowed
+        allowed = max(_MAX_EFFECT, 0.15 * difference.effect) if before == math.inf else allowed
         narrow = float((excess > _MAX_EXCESS).double().mean()) < _MOST_FREQUENCIES
         if narrow and factor == 1 and _MAX_EXCESS < largest < 0.7 * before:
             relaxed = relaxed * excess.clamp(min=1.0)
             continue
-        noticed = misfit.exceeds(allowed, _MAX_RESIDUAL)
-        differs = misfit.effect > allowed or misfit.residual > _MAX_RESIDUAL
-        if not differs or misfit.power < 1.2 * factor:
+        noticed = difference.exceeds(allowed, _MAX_RESIDUAL)
+        differs = difference.effect > allowed or difference.residual > _MAX_RESIDUAL
+        if not differs or difference.power < 1.2 * factor:
             break
-        factor, relaxed = misfit.power, torch.ones_like(relaxed)
-    return solver.scene(coefficients), replace(misfit, noticed=noticed)
+        factor, relaxed = difference.power, torch.ones_like(relaxed)
+    return solver.image(coefficients), replace(difference, noticed=noticed)
 
 
 def phase_spread(places: Tensor, frequency: float) -> Tensor:
@@ -154,18 +154,18 @@ def phase_spread(places: Tensor, frequency: float) -> Tensor:
     return 1 - mean.square()
 
 
-def warn_of_frames(misfits: list[Misfit], places: Iterable[Tensor], *, least: float = 0.1) -> None:
+def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor], *, least: float = 0.1) -> None:
     """Warn if frames on a finer grid do not fit their model, or do not sample between each other's pixels.
 
     Args:
-        misfits: Of each scene.
+        differences: Of each scene.
         places: Mean displacements (M, R, 2) of the rows of the frames of each scene.
         least: Of ``phase_spread`` at 1 cycle per px, the factor on the information on aliased detail. 0.5 on average
             for two frames, more for several.
     """
-    noticed = [misfit for misfit in misfits if misfit.noticed]
+    noticed = [difference for difference in differences if difference.noticed]
     if noticed:
-        worst = max(noticed, key=lambda misfit: misfit.power)
+        worst = max(noticed, key=lambda difference: difference.power)
         warn_of_restoration(
             f"the frames differ from their model by {worst.residual:.1f} times the noise, rows are displaced by about "
             f"{worst.error:.2g} px more than the vibration states: it is not accurate enough for scale=2, or the scene "

@@ -8,7 +8,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
@@ -134,9 +134,9 @@ class MosaicSolver:
             step = next_step + (energy / before).to(data.dtype) * step
         return result
 
-    def scene(self, coefficients: Tensor) -> Tensor:
+    def image(self, coefficients: Tensor) -> Tensor:
         """Colours (3, 2 R, 2 L) of the scene at half pixels."""
-        return _colours(self._observation.scene(coefficients)[None])[0]
+        return _colours(self._observation.image(coefficients)[None])[0]
 
 
 def restore_mosaic(
@@ -171,8 +171,8 @@ def restore_mosaic(
             frame it is hardly known, and too low rather than too high.
         regularisation: Factor on the priors.
         ignore: (B, T, 1, H, W) bool, missing pixels; None for none.
-        clipped: Likewise, saturated pixels, whose values are lower bounds.
-        chunk_frequencies: As in ``restore_exact``, and likewise the next one.
+        clipped: (B, T, 1, H, W) bool, saturated pixels, whose values are lower bounds; None for none.
+        chunk_frequencies: As in ``restore_exact``.
         segments: Segments of rows solved side by side.
         scale: Points of the result per pixel.
 
@@ -215,7 +215,7 @@ def restore_mosaic(
                 stack,
                 lengths[stack],
             )
-            if len(members) == 1 or _alike(moved.detach(), node_weights):
+            if len(members) == 1 or _same_colours(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height)
             observation = FinerObservation(kernels, height, lengths[stack], frames.dtype)
@@ -280,15 +280,11 @@ class _Frames:
         """
         count, width, level = len(self.images), self.images.shape[-1], self.level
         mean = self.images.mean((0, 2, 3))[:, None, None]
-        data = extend_rows(self.images, self.length).sub_(mean)
+        data = extend_rows(self.images - mean, self.length)
         inside = measured_values(along, None, data.shape, width, ends=True)
         assert inside is not None
-        measured = torch.zeros_like(inside)
-        measured[..., :width] = self.measured
-        measured &= inside
-        filled = torch.zeros_like(inside)
-        filled[..., :width] = ~self.measured.any(1, keepdim=True)
-        filled &= inside
+        nowhere = ~self.measured.any(1, keepdim=True)
+        measured, filled = (pad(mask, (0, self.length - width)) & inside for mask in (self.measured, nowhere))
         full = self.images.detach()
 
         def solver(strength: float) -> MosaicSolver:
@@ -306,12 +302,12 @@ class _Frames:
             predicted = first.predict(coefficients)
             full = torch.where(self.measured, full, predicted[..., :width] + mean)
             if count > 1:
-                found, gain = _residual_level(first, data - predicted, measured)
-                level = self._checked(found, level, unknown_level)
+                residual_level, gain = _residual_level(first, data - predicted, measured)
+                level = self._checked(residual_level, level, unknown_level)
             if self.floor is not None:  # saturated values are lower bounds: only those above the prediction count
                 measured[..., :width] &= (predicted[..., :width] + mean <= self.floor) | self.floor.isinf()
         second = solver(regularisation)
-        scene = second.scene(second.fit(data, coefficients, iterations=20)) + mean
+        scene = second.image(second.fit(data, coefficients, iterations=20)) + mean
         scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
         if gain is None:
             return scene
@@ -321,16 +317,16 @@ class _Frames:
         image: Tensor = pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)
         return image
 
-    def _checked(self, found: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
+    def _checked(self, residual: Tensor, stated: Tensor, unknown: bool, *, most: float = 1.5) -> Tensor:
         """The standard deviation of the noise to use: that of the residual if none is stated.
 
         Warns if the residual is larger than the stated noise explains.
         """
         if unknown:
-            return found
-        if bool(found > most * stated):
+            return residual
+        if bool(residual > most * stated):
             warn_of_restoration(
-                f"the frames differ from their model by {float(found / stated):.1f} times the stated noise: the "
+                f"the frames differ from their model by {float(residual / stated):.1f} times the stated noise: the "
                 "vibration is not accurate enough, the scene changes between the frames, or noise is too low; colours "
                 "may be false"
             )
@@ -343,13 +339,13 @@ class _Frames:
         levels = level.expand(len(images))
         return [
             fit_polynomial_prior(image[:, None], self.motion, self.stack, levels, self.length).precision(
-                level.square(), regularisation, observation.kernels.reach
+                level.square(), strength=regularisation, blur_reach=observation.kernels.blur_reach
             )
             for image in _components(images).unbind(1)
         ]
 
 
-def _alike(displacement: Tensor, node_weights: Tensor, *, least: float = 0.1) -> bool:
+def _same_colours(displacement: Tensor, node_weights: Tensor, *, least: float = 0.1) -> bool:
     """Whether the frames of a scene measure the same colour at the same points along both axes; with a warning.
 
     Args:
@@ -358,13 +354,13 @@ def _alike(displacement: Tensor, node_weights: Tensor, *, least: float = 0.1) ->
         least: Of ``phase_spread`` at 1/2 cycle per px, the pattern of the colours.
     """
     place = (displacement * node_weights[:, None]).sum(-2)
-    alike = bool((phase_spread(place, 0.5).median(0).values < least).all())
-    if alike:
+    same = bool((phase_spread(place, 0.5).median(0).values < least).all())
+    if same:
         warn_of_restoration(
             "the frames of a scene measure the same colours at the same points of it: the other colours are "
             "interpolated, as from one frame; restore more vibrating frames jointly"
         )
-    return alike
+    return same
 
 
 def _residual_level(solver: MosaicSolver, residual: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
@@ -377,4 +373,4 @@ def _residual_level(solver: MosaicSolver, residual: Tensor, measured: Tensor) ->
     coefficients = solver.fit(noise, iterations=8)
     left = noise - solver.predict(coefficients)
     level = ((residual * measured).square().sum() / (noise * left).sum().clamp(min=1.0)).sqrt()
-    return level, solver.scene(coefficients).square().mean().sqrt()
+    return level, solver.image(coefficients).square().mean().sqrt()

@@ -13,7 +13,7 @@ from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
-from rsvib_torch.restoration.scene_model.observation import REACH, kernel_samples
+from rsvib_torch.restoration.scene_model.observation import KERNEL_REACH, kernel_samples
 
 __all__ = ["PRIORS", "Prior", "check_prior", "shrink_patches"]
 
@@ -46,7 +46,7 @@ class Prior:
 def gaussian(problem: SceneProblem, regularisation: float) -> Tensor:
     """The autoregressive prior across rows, whose precision the problem contains: one solution."""
     solver = problem.solver()
-    return solver.scene(solver.fit(problem.data))
+    return solver.image(solver.fit(problem.data))
 
 
 def edges(problem: SceneProblem, regularisation: float) -> Tensor:
@@ -78,7 +78,7 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
         precision[:order, :order] += 0.03 * problem.precision
         solver = replace(problem, precision=precision).solver()
         coefficients = solver.solve(right_side + expected)
-    return solver.scene(coefficients)
+    return solver.image(coefficients)
 
 
 # The function of a prior is called as function(problem, regularisation) -> scene, with the factor > 0 on its strength
@@ -115,7 +115,7 @@ def _cosines_of_neighbours(like: Tensor) -> Tensor:
     waves = torch.cos(torch.pi * order[:, None] * (order + 0.5) / _PATCH) * math.sqrt(2.0 / _PATCH)
     waves[0] /= math.sqrt(2.0)
     ends = [(_STEP * k, _STEP * (_NEIGHBOURS - 1 - k)) for k in range(_NEIGHBOURS)]
-    return torch.cat([functional.pad(waves, each) for each in ends]).to(like)
+    return torch.cat([functional.pad(waves, before_and_after) for before_and_after in ends]).to(like)
 
 
 def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int] = (0, 0)) -> Tensor:
@@ -159,12 +159,12 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
 
     parts = runs(counts[0], _LINES)  # less memory, and faster
     if torch.is_grad_enabled() and images.requires_grad:
-        each = [shrunk(part) for part in parts]
+        results = [shrunk(part) for part in parts]
     else:
-        each = in_parallel(shrunk, parts, images.device)
-    total, weights = torch.zeros_like(padded), torch.cat([weight for _, weight in each], 1)
-    for part, (own, _) in zip(parts, each, strict=True):
-        total[:, _PATCH * part.start :][:, : own.shape[1]] += own
+        results = in_parallel(shrunk, parts, images.device)
+    total, weights = torch.zeros_like(padded), torch.cat([weight for _, weight in results], 1)
+    for part, (pixels, _) in zip(parts, results, strict=True):
+        total[:, _PATCH * part.start :][:, : pixels.shape[1]] += pixels
     reach = _NEIGHBOURS - 1
     sums = functional.avg_pool2d(functional.pad(weights, (reach,) * 4), _NEIGHBOURS, stride=1) * _NEIGHBOURS**2
     mean = total / sums.repeat_interleave(_STEP, 1).repeat_interleave(_STEP, 2)
@@ -176,7 +176,7 @@ def _sampled(values: Tensor) -> Tensor:
 
     With the samples of the kernel: the more numerous ``scene_weights`` would widen the band of ``E^T E``.
     """
-    edge = values.new_zeros(REACH - 1, *values.shape[1:])
+    edge = values.new_zeros(KERNEL_REACH - 1, *values.shape[1:])
     padded, total = torch.cat([edge, values, edge]), torch.zeros_like(values)
     for k, weight in enumerate(kernel_samples()):
         total.add_(padded[k : k + len(values)], alpha=weight)

@@ -170,7 +170,8 @@ class SceneSolver:
         self._normal = normal.in_windows(self._windows)
         self._keep = keep
         self._interpolated: InterpolatedFactors | None = None
-        if not keep and not self._differentiates() and (nodes := self._nodes()) is not None:
+        nodes = None if keep or self._differentiates() else self._nodes()
+        if nodes is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
             self._interpolated = InterpolatedFactors.of(systems, nodes)
 
@@ -195,11 +196,11 @@ class SceneSolver:
         The systems change with the frequency as the prior does, over 1/64 cycles per px, and as kernels that extend r
         px along the row do, over 1/(140 r). Above 1.5 px, systems are too close to singular for interpolation.
         """
-        reach = self.observation.kernels.reach
-        step = self.observation.period * min(1 / 64, 1 / (140 * max(reach, 1e-9)))
+        blur_reach = self.observation.kernels.blur_reach
+        step = self.observation.period * min(1 / 64, 1 / (140 * max(blur_reach, 1e-9)))
         nodes = node_frequencies(len(self.u), step, self.precision.device)
         # above a fifth of the frequencies, interpolation takes as long as factoring
-        return nodes if reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
+        return nodes if blur_reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
 
     def _differentiates(self, *given: Tensor) -> bool:
         values = (*given, self._normal.left, self.precision)
@@ -279,9 +280,9 @@ class SceneSolver:
         images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
         return images
 
-    def scene(self, coefficients: Tensor) -> Tensor:
+    def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scene where the frame at rest would observe them, (C, R, L); twice as many on the finer grid."""
-        return self.observation.scene(coefficients)
+        return self.observation.image(coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,24 +352,26 @@ class SolversSideBySide:
 
     def fit(self, data: Sequence[Tensor] | Tensor) -> list[Tensor]:
         """Coefficients of every scene for its data, as from ``SceneSolver.fit``."""
-        found: list[Tensor] = []
+        coefficients: list[Tensor] = []
         for place, group in enumerate(self._groups):
             solvers = [self.solvers[number] for number in group]
             if len(group) == 1:
-                found.append(solvers[0].fit(data[group[0]]))
+                coefficients.append(solvers[0].fit(data[group[0]]))
                 continue
             rights = [solver.whole_right_side(data[number]) for solver, number in zip(solvers, group, strict=True)]
             rows = max(map(len, rights))
-            right = torch.cat([functional.pad(one, (0, 0, 0, 0, 0, rows - len(one))) for one in rights], -1)
+            right = torch.cat([functional.pad(side, (0, 0, 0, 0, 0, rows - len(side))) for side in rights], -1)
             solutions = solve_skewed(self._factors.get(place) or self._system(group), right)
             parts = solutions.split([solver.num_systems for solver in solvers], -1)
-            found += [solver.joined(part[: len(one)]) for solver, part, one in zip(solvers, parts, rights, strict=True)]
-        return found
+            coefficients += [
+                solver.joined(part[: len(side)]) for solver, part, side in zip(solvers, parts, rights, strict=True)
+            ]
+        return coefficients
 
-    def scenes(self, data: Sequence[Tensor]) -> list[Tensor]:
-        """The scenes (C, R, L) for their data."""
-        return [solver.scene(own) for solver, own in zip(self.solvers, self.fit(data), strict=True)]
+    def images(self, data: Sequence[Tensor]) -> list[Tensor]:
+        """Images (C, R, L) of the scenes for their data."""
+        return [solver.image(fitted) for solver, fitted in zip(self.solvers, self.fit(data), strict=True)]
 
     def predictions(self, data: Sequence[Tensor] | Tensor) -> list[Tensor]:
         """Noiseless frames of the scenes for their data."""
-        return [solver.predict(own) for solver, own in zip(self.solvers, self.fit(data), strict=True)]
+        return [solver.predict(fitted) for solver, fitted in zip(self.solvers, self.fit(data), strict=True)]

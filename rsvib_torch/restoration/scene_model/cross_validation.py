@@ -12,7 +12,7 @@ from rsvib_torch.core.fourier import squared_modulus, waves
 from rsvib_torch.restoration.scene_model.observation import RowKernels, SmoothBand, smooth_band, smooth_kernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior
 
-__all__ = ["Explained", "SampledRows", "Strengths", "prior_strength", "sample_rows", "select_strength"]
+__all__ = ["Explained", "SampledRows", "StrengthCache", "prior_strength", "sample_rows", "select_strength"]
 
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
 
@@ -161,7 +161,7 @@ def prior_strength(
         images: (M, C, R, W) of one scene, in row order.
         kernels: Kernels of the images.
         prior: Fitted to them.
-        noise_power: In the units of the prior.
+        noise_power: Variance of the noise of images of weight 1.
         certain: Whether the noise level is given or estimated from several frames. That of a single frame includes
             texture, so that the prior cannot be too weak.
 
@@ -183,10 +183,11 @@ def prior_strength(
     # less noise than 200 times the interpolation error of the kernel cannot be distinguished from it
     certain = certain and bool(noise_power > 200.0 * prior.interpolation_power.mean())
     strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
-    reach = kernels.reach
-    return select_strength(
-        strengths, [prior.precision(noise_power, strength, reach)[..., place] for strength in strengths], sample.explain
-    )
+    precisions = [
+        prior.precision(noise_power, strength=strength, blur_reach=kernels.blur_reach)[..., place]
+        for strength in strengths
+    ]
+    return select_strength(strengths, precisions, sample.explain)
 
 
 def select_strength(
@@ -208,7 +209,7 @@ def select_strength(
     return strengths[choice]
 
 
-class Strengths:
+class StrengthCache:
     """Strengths of the prior for the scenes of a stack: those with about the same noise share one."""
 
     def __init__(self) -> None:
@@ -222,8 +223,8 @@ class Strengths:
             choose: Returns the strength; called unless that of a scene with the same power, to 20 %, was chosen before.
         """
         logarithm = float(noise.detach().log())
-        for other, strength in self._chosen:
-            if abs(logarithm - other) < 0.2:
+        for earlier, strength in self._chosen:
+            if abs(logarithm - earlier) < 0.2:
                 return strength
         self._chosen.append((logarithm, choose()))
         return self._chosen[-1][1]

@@ -33,7 +33,7 @@ from rsvib_torch.imaging.blur import row_taps, row_transfer
 
 __all__ = [
     "GRIDS",
-    "REACH",
+    "KERNEL_REACH",
     "SCALE",
     "SCENE_REACH",
     "TAPS",
@@ -55,11 +55,11 @@ __all__ = [
     "spline_transfer",
 ]
 
-REACH = 3  # rows on either side; support of the kernel
-TAPS = 2 * REACH
+KERNEL_REACH = 3  # rows on either side; support of the kernel
+TAPS = 2 * KERNEL_REACH
 SCENE_REACH = 5  # rows on either side; support of the weights of a scene row
 SCALE = 2  # points per px of the finer grid, and unknowns per frequency
-_MARGIN = 16  # px by which a scene extends beyond the frame; rows displaced further have weight 0
+_MARGIN = 16  # most rows by which a scene extends beyond the frame; rows displaced further have weight 0
 _FINER_DEGREE = 3
 _FINER_SCENE_REACH = 5  # half rows on either side; support of the weights of a scene row on the finer grid
 # The kernel is (1 - z^2)^2 times this polynomial in z^2, z the distance divided by the reach. It has the least error of
@@ -77,8 +77,8 @@ _POLYNOMIAL = (
 
 
 def _kernel(distance: Tensor) -> Tensor:
-    """Kernel at distances of at most ``REACH``."""
-    square = (distance / REACH).square()
+    """Kernel at distances of at most ``KERNEL_REACH``."""
+    square = (distance / KERNEL_REACH).square()
     value = torch.full_like(square, _POLYNOMIAL[-1])
     for coefficient in _POLYNOMIAL[-2::-1]:
         value = value * square + coefficient
@@ -94,20 +94,20 @@ def kernel_weights(fraction: Tensor) -> Tensor:
     Returns:
         Weights (S, 6); their sum is 1 to 5e-4.
     """
-    taps = torch.arange(TAPS, dtype=fraction.dtype, device=fraction.device) - (REACH - 1)
+    taps = torch.arange(TAPS, dtype=fraction.dtype, device=fraction.device) - (KERNEL_REACH - 1)
     return _kernel(fraction[..., None] - taps)
 
 
 def kernel_samples() -> tuple[float, ...]:
     """The kernel at the rows -2 ... 2."""
-    return tuple(_kernel(torch.arange(1 - REACH, REACH, dtype=torch.float64, device="cpu")).tolist())
+    return tuple(_kernel(torch.arange(1 - KERNEL_REACH, KERNEL_REACH, dtype=torch.float64, device="cpu")).tolist())
 
 
 def kernel_spectrum(frequencies: Tensor) -> Tensor:
     """Fourier transform of the kernel at frequencies in cycles per row."""
     nodes, weights = gauss_legendre(32)  # of one side
-    places = (nodes * REACH).to(frequencies)
-    values = 2 * REACH * weights.to(frequencies) * _kernel(places)
+    places = (nodes * KERNEL_REACH).to(frequencies)
+    values = 2 * KERNEL_REACH * weights.to(frequencies) * _kernel(places)
     return torch.cos(2 * torch.pi * frequencies[..., None] * places) @ values
 
 
@@ -139,13 +139,8 @@ def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1
     Returns:
         Power of the same shape.
     """
-    return (
-        kernel_spectrum(
-            frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
-        )
-        .square()
-        .sum(-1)
-    )
+    aliases = frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
+    return kernel_spectrum(aliases).square().sum(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +162,8 @@ class RowKernels:
     weight: Tensor
 
     @cached_property
-    def reach(self) -> float:
-        """Largest distance along the row from the middle in px."""
+    def blur_reach(self) -> float:
+        """Largest distance along the row in px during an exposure from the middle of its range."""
         return float(self.along.detach().abs().amax())
 
     symmetric = True  # kernels at -u are the conjugates of those at u
@@ -176,7 +171,7 @@ class RowKernels:
     @property
     def blurred(self) -> bool:
         """Whether the displacement changes by more than 1 px during an exposure."""
-        return max(2.0 * self.reach, float(self.taps.shape[-2] - TAPS)) > 1.0
+        return max(2.0 * self.blur_reach, float(self.taps.shape[-2] - TAPS)) > 1.0
 
     def needed(self, num_rows: int) -> tuple[int, int]:
         """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
@@ -204,7 +199,7 @@ def row_kernels(
     rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
     place = rows[:, None] - displacement[..., 1]
     first, taps = row_taps(place, node_weights, kernel_weights)
-    first, low, high = first - (REACH - 1), -margin - taps.shape[-2], num_rows + margin
+    first, low, high = first - (KERNEL_REACH - 1), -margin - taps.shape[-2], num_rows + margin
     weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
     return RowKernels(first.clamp(low, high), taps, *_about_middle(displacement[..., 0]), weight)
 
@@ -278,9 +273,9 @@ class SmoothKernels:
 
 def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
     """Kernels of all rows at the Chebyshev nodes."""
-    nodes, _ = interpolation_matrix(kernels.reach, kernels.middle.new_zeros(1), dtype, symmetric=kernels.symmetric)
+    nodes, _ = interpolation_matrix(kernels.blur_reach, kernels.middle.new_zeros(1), dtype, symmetric=kernels.symmetric)
     left = _stacked(kernels.at(nodes)).to(dtype).flatten(0, 1).transpose(0, 1).contiguous()
-    return SmoothKernels(left, kernels.reach, kernels.symmetric)
+    return SmoothKernels(left, kernels.blur_reach, kernels.symmetric)
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,7 +362,7 @@ def smooth_band(kernels: RowKernels, top: int, count: int, order: int, dtype: to
         lags[: count - d, width + d, d] = 1
         lags[d:count, width - d, d] = 1
     matrix = torch.cat([matrices, lags], dim=-1)
-    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.reach, order)
+    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.blur_reach, order)
 
 
 def normal_matrices(kernels: RowKernels, top: int, count: int, width: int, dtype: torch.dtype) -> Tensor:
@@ -381,7 +376,7 @@ def normal_matrices(kernels: RowKernels, top: int, count: int, width: int, dtype
         dtype: dtype of the frames, which determines the number of nodes.
     """
     zero = kernels.middle.new_zeros(1)
-    nodes, _ = interpolation_matrix(2 * kernels.reach, zero, dtype, symmetric=kernels.symmetric)
+    nodes, _ = interpolation_matrix(2 * kernels.blur_reach, zero, dtype, symmetric=kernels.symmetric)
     values = kernels.at(nodes)
     weighted = values * kernels.weight[..., None, None]
     base = (kernels.first - top).flatten()
@@ -474,7 +469,7 @@ class Observation:
             total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
         return total
 
-    def scene(self, coefficients: Tensor) -> Tensor:
+    def image(self, coefficients: Tensor) -> Tensor:
         """Rows of the scene where the frame at rest would observe them, (C, R, L)."""
         first = -SCENE_REACH - self.top
         near = coefficients[first : first + self.num_rows + 2 * SCENE_REACH]
@@ -493,7 +488,7 @@ class FinerKernels(RowKernels):
     @property
     def blurred(self) -> bool:
         """Whether the displacement changes by more than 1 px during an exposure."""
-        return max(2.0 * self.reach, (self.taps.shape[-2] / SCALE - _FINER_DEGREE - 1) / SCALE) > 1.0
+        return max(2.0 * self.blur_reach, (self.taps.shape[-2] / SCALE - _FINER_DEGREE - 1) / SCALE) > 1.0
 
     def needed(self, num_rows: int) -> tuple[int, int]:
         """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
@@ -582,10 +577,10 @@ class FinerObservation(Observation):
                 place = slice(width - SCALE * order, width + SCALE * order + 1, SCALE)
                 prior[alias : self.count : SCALE, place, :, alias] = powers
             left = torch.cat([matrices, prior.flatten(2)], dim=-1).to(self.dtype)
-            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.reach, order)
+            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.blur_reach, order)
         return self._normal[order]
 
-    def scene(self, coefficients: Tensor) -> Tensor:
+    def image(self, coefficients: Tensor) -> Tensor:
         """The scene at half pixels, (C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
         first = -SCALE * _FINER_SCENE_REACH - self.top
         count = SCALE * self.num_rows

@@ -45,7 +45,7 @@ class RowPrior:
     matrix is banded.
 
     Attributes:
-        power: (U,) variance of a coefficient.
+        power: (U,) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1.
         reflections: (p, U) partial correlations, within -1 ... 1.
         interpolation_power: (U,) power of the interpolation error between rows, which counts as noise; (T, U) of each
             frame.
@@ -86,23 +86,23 @@ class RowPrior:
             power[0].exp(), reflections, interpolation.exp().reshape(*self.interpolation_power.shape[:-1], count)
         )
 
-    def precision(self, noise_power: Tensor, strength: float, reach: float = 0.0) -> Tensor:
+    def precision(self, noise_power: Tensor, *, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
         """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
 
         The precision of interior rows at distance d is the sum over k. The first and the last rows are predicted from
         fewer rows: for row j it is the sum of the first j + 1 products.
 
         Args:
-            noise_power: Power of the noise of data of weight 1.
+            noise_power: Variance of the noise of data of weight 1, () or (U,).
             strength: Factor on the precision.
-            reach: Largest displacement along the row in px during an exposure, from its middle.
+            blur_reach: Of ``RowKernels``.
         """
         a = self.filter()
         ratio = (noise_power + self.interpolation_power) * strength / self.innovation()
         # noise power over variance of e. Above 1e3, the systems lose digits in single precision without a gain; below
         # 1e-4, rows displaced by half a pixel lose them. Long exposures observe every place from many rows, and allow
         # a bound lower by the length of the blur in px.
-        ratio = ratio.clamp(1e-4 / (1 + reach), 1e3)
+        ratio = ratio.clamp(1e-4 / (1 + blur_reach), 1e3)
         count = len(a)
         products = a.new_zeros(count, count, a.shape[1])
         for d in range(count):
@@ -165,11 +165,12 @@ def autoregressive_prior(
     Returns:
         The prior.
     """
+    # cosines of the lags of autocovariances, and of the products a_k a_(k + d) of a filter
     v = torch.fft.fftfreq(observed.shape[-1], dtype=observed.dtype, device=observed.device)
     lags = torch.arange(order + 1, dtype=observed.dtype, device=observed.device)
     angles = 2 * torch.pi * v[:, None] * lags
     cosine = torch.cos(angles)
-    both = torch.where(lags > 0, 2 * cosine, cosine).T  # of the products a_k a_(k + d) of a filter
+    both = torch.where(lags > 0, 2 * cosine, cosine).T
 
     def dot(first: Sequence[Tensor], second: Sequence[Tensor]) -> Tensor:
         total = first[0] * second[0]
@@ -185,11 +186,13 @@ def autoregressive_prior(
     excess = torch.where(excess < level, _pooled(excess).minimum(level), excess)
     scene = torch.maximum(excess, 0.002 * noise_power) * transfer / (transfer.square() + 1e-2)
     for _ in range(iterations):
+        # the model of the expected spectrum of the scene
         moments = (pooling @ (scene @ cosine)).unbind(-1)
         reflections, filter_, innovation = _levinson(moments)
         products = torch.stack([dot(filter_[: order + 1 - d], filter_[d:]) for d in range(order + 1)], -1)
         # squared modulus of the filter, whose terms are of order 1: at least their rounding error
         penalty = (products @ both).clamp(min=1e-14) * (noise_power / innovation[:, None])
+        # the expected spectrum for this model: variance and square of the Wiener estimate
         gain = (penalty + transfer).reciprocal()
         scene = torch.addcmul(gain * noise_power, gain.square(), through)
     tiny = torch.finfo(scene.dtype).tiny
@@ -254,6 +257,7 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, stack: int, levels: T
         levels: (T,) standard deviation of the noise of each frame.
         length: Length of the Fourier transform along rows.
     """
+    # places of the pieces, their taper and frequencies
     size = [min(piece, whole) for piece, whole in zip((64, 256), frames.shape[-2:], strict=True)]
     starts = _spread_pieces(frames.shape[-2:], size)  # rows, columns
     tops, lefts = (begin.tolist() for begin in starts)
@@ -265,11 +269,13 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, stack: int, levels: T
     u = torch.fft.rfftfreq(size[1], dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size[0], dtype=torch.float64, device=frames.device)
 
+    # phases that move rows back by their displacement, and the taper across rows
     vibration = motion.vibration[stack]
     times = motion.frame_starts[:, None] + rows.flatten().to(torch.float64) * motion.timing.row_time
     mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
     back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
     back = back * tapers[0][:, None]
+    # power of the pieces, mean over channels
     bright = brightness(frames)[..., None, None, None]
     step = 4 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time, which stay in the cache
     powers = []
@@ -280,14 +286,12 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, stack: int, levels: T
         spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
         powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
     power = torch.cat(powers, dim=1).to(torch.float64)  # (T, pieces, U, V)
-    few = (
-        torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device, dtype=torch.float32)
-        .round()
-        .to(torch.int64)
-    )
+    # power of a few strips of whole rows with their boundary extension
+    few = torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device, dtype=torch.float32).round().long()
     strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
     whole = _power_of_rows(strips_of_rows, length, len(u)) / length
 
+    # blur of the middle row of each piece
     displacement, weights = exposure_trajectory(
         vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
     )
@@ -308,7 +312,7 @@ def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, l
         aliases = aliases + spectrum.blur(alias_v=-cycle).mean(1) * interpolation_error(v, [cycle])
     observed, weight, noise = spectrum.weighted(transfer)
     passed = (weight * transfer).sum((0, 1))
-    prior = autoregressive_prior(observed * length, passed, aliases, noise * length)
+    prior = autoregressive_prior(observed, passed, aliases, noise)
     return prior.resampled(length // 2 + 1)
 
 
@@ -392,23 +396,27 @@ class PolynomialPrior:
     coefficients: Tensor
     period: int
 
-    def precision(self, noise: Tensor, strength: float, reach: float = 0.0) -> Tensor:
+    def of(self, members: list[int]) -> "PolynomialPrior":
+        """The prior for restoring a scene from some of the frames."""
+        return self
+
+    def precision(self, noise_power: Tensor, *, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
         """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
 
         Args:
-            noise: Variance of the noise of data of weight 1.
+            noise_power: Variance of the noise of data of weight 1.
             strength: Factor on the precision.
-            reach: Largest displacement along the row in px during an exposure, from its middle.
+            blur_reach: Of ``RowKernels``.
         """
-        u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise.device)
+        u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise_power.device)
         u = torch.stack([u, u - 1])
         # bounds as for ``RowPrior.precision``: below, the elimination in single precision loses digits. The upper one
         # must not bound the precision at half a cycle per px, where one coefficient of degree 6 has 1/4096 of its
         # largest value: 1e3 lost 1.1 dB in soft scenes; 1e6 and single precision differ from double by -79 dB at most
         m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=u.device),) * 2, indexing="ij")
-        a = self.coefficients * (noise.to(torch.float64) * strength / SCALE)
+        a = self.coefficients * (noise_power.to(torch.float64) * strength / SCALE)
         a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n))
-        a[0, 0] += 1e-5 / (1 + reach)
+        a[0, 0] += 1e-5 / (1 + blur_reach)
         powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=u.device)[:, None, None]
         return torch.einsum("mn,nau->mau", a, powers) / _pixel(u)
 
@@ -434,6 +442,7 @@ def fit_polynomial_prior(
     spectrum = observed_spectrum(frames, motion, stack, levels, length)
     u, v = spectrum.u[:, None], spectrum.v
     observed, weight, noise = spectrum.weighted(smeared(spectrum.blur()))
+    # transfer function and powers of the Laplacians at each alias
     gains, features = [], []
     rising, order = _rising_powers(frames.device), torch.arange(_DEGREE + 1, device=frames.device)
     for alias_u in (0, 1):
@@ -447,9 +456,11 @@ def fit_polynomial_prior(
     gain, feature = torch.stack(gains), torch.stack(features)  # (aliases, U, V), (aliases, U, V, powers)
     # frequencies within the taper of zero contain the mean
     used = (u > 1.5 * (u[1] - u[0])) | (v.abs() > 1.5 / len(v))
+    # start from a white spectrum of the mean level
     middle = (observed - noise).clamp(min=0.01 * noise)[used].log().mean().exp()
     logs = torch.full((len(_POWERS),), -float(middle.log()), dtype=torch.float64, device=frames.device)
     for _ in range(iterations):
+        # expected power of the frames, and its derivative with respect to the logarithms
         terms = feature * logs.exp()
         polynomial = terms.sum(-1)
         scene = gain / polynomial

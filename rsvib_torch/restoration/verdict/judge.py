@@ -5,7 +5,6 @@ between the two and the estimated gain in PSNR determine the outcome of every pa
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
@@ -20,12 +19,14 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.frames.orientation import reasons_from_row_order
+from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups, judged_strip
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
@@ -35,7 +36,6 @@ __all__ = [
     "Outcome",
     "RestorationVerdict",
     "RestorationWarning",
-    "judge_frames",
     "judge_prepared",
     "judge_restoration",
     "outcome_of_pair",
@@ -49,6 +49,7 @@ _PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a 
 _WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
 _GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
 
+_STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
 
 
@@ -187,7 +188,7 @@ def outcome_of_pair(
         finest: Misfit in px that is negligible in any image.
         crosstalk: Error of ``after`` along one axis, relative to the displacement along the other.
     """
-    found: list[tuple[Outcome, Reason | None]] = []
+    outcomes: list[tuple[Outcome, Reason | None]] = []
     motion_is_complete = True
     for axis, name in enumerate("xy"):
         least, size, rest = max(resolution[axis], finest), before[axis], after[axis]
@@ -197,25 +198,25 @@ def outcome_of_pair(
         visible = max(size, offset[axis])
         details = {"before": size}
         if math.isinf(least):
-            found.append(("unknown", Reason("no_contrast", name)))
+            outcomes.append(("unknown", Reason("no_contrast", name)))
         elif rest <= max(least, crosstalk * before[1 - axis]):
             is_visible = visible > least
-            found.append(
+            outcomes.append(
                 ("helps", None) if is_visible else ("unknown", Reason("displaced_alike", name, visible, least))
             )
         elif rest > _WORSE_RESIDUAL * size:
             # less noise may outweigh a motion that was not undone, but not a motion that does not exist
             outweighed = size > least and gain > _GAIN_ERROR and not one_image
             remains = Reason("motion_remains", name, rest, _WORSE_RESIDUAL * size, details)
-            found.append(("partly" if outweighed else "worse", remains))
+            outcomes.append(("partly" if outweighed else "worse", remains))
         elif rest > _PARTLY_RESIDUAL * size:
-            found.append(("partly", Reason("motion_remains", name, rest, _PARTLY_RESIDUAL * size, details)))
+            outcomes.append(("partly", Reason("motion_remains", name, rest, _PARTLY_RESIDUAL * size, details)))
         else:
-            found.append(("helps", None))
-    if not found:
+            outcomes.append(("helps", None))
+    if not outcomes:
         return "unknown", (Reason("nothing_undone"),)
-    outcome = max((outcome for outcome, _ in found), key=_OUTCOMES.index)
-    reasons = tuple(reason for kind, reason in found if kind == outcome and reason is not None)
+    outcome = max((outcome for outcome, _ in outcomes), key=_OUTCOMES.index)
+    reasons = tuple(reason for kind, reason in outcomes if kind == outcome and reason is not None)
     if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
         return outcome, reasons
     if gain < -_GAIN_ERROR:
@@ -229,7 +230,7 @@ def _mean_square(difference: Tensor) -> Tensor:
 
 def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing: float = 0.5) -> RestorationVerdict:
     """Verdict on one pair, its values without a leading axis; not judged if more than ``max_missing`` is missing."""
-    noise = estimate_noise(torch.stack([pair.earlier, pair.later]), pair.missing).square().nanmean().double()
+    noise = estimate_noise(torch.stack([pair.earlier, pair.later]), pair.ignore).square().nanmean().double()
     noise = noise.nan_to_num(nan=0.0).clamp(min=_MIN_NOISE**2)
     pair = equally_bright(pair, noise)
     # an image restored from both frames lies between them, so that its distance from either is the smaller
@@ -251,7 +252,7 @@ def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing:
     outcome, reasons = outcome_of_pair(*misfits, moves, pair.offset.tolist(), float(gain), one_image=one_image)
     if (outcome == "worse" and gain > 0) or (outcome in ("helps", "partly") and gain < 0):
         gain = torch.full_like(gain, math.nan)
-    missing = 0.0 if pair.missing is None else float(pair.missing.any(0).double().mean())
+    missing = 0.0 if pair.ignore is None else float(pair.ignore.any(0).double().mean())
     if missing > max_missing:
         outcome, reasons = "unknown", (Reason("pixels_missing", None, missing, max_missing),)
     return RestorationVerdict(
@@ -266,45 +267,6 @@ def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing:
         outcome=(outcome,),
         findings=(reasons,),
     )
-
-
-@torch.no_grad()
-def judge_frames(
-    raw: Tensor,
-    restored: Tensor,
-    motion: FrameMotion,
-    pairs: Sequence[tuple[int, int]],
-    *,
-    shared: int = 1,
-    columns: int | None = None,
-    hidden: Tensor | None = None,
-) -> RestorationVerdict:
-    """Judge a stack in row order: ``judge_restoration`` after input preparation.
-
-    Args:
-        raw: (T, C, H, W).
-        restored: (T, C, H, W), or (1, C, H, W) in the coordinates of the first frame of every pair.
-        motion: Motion of the frames, batch of one.
-        pairs: Frames to compare.
-        shared: Number of frames that each restored one was made from.
-        columns: Judge on so many columns only, those with the most detail.
-        hidden: Mask shaped like ``raw`` of pixels that were not measured.
-
-    Raises:
-        TooLittleInCommonError: If two frames have too little in common.
-    """
-    moves = motion.vibration.moving_axes()[0].tolist()
-    verdicts, advance = [], steps(len(pairs), "pairs")
-    for frames in pairs:
-        verdicts.append(_judge_pair(shared_part(raw, restored, motion, frames, columns, hidden), moves, shared))
-        advance()
-    joined = {
-        field.name: torch.cat([getattr(verdict, field.name) for verdict in verdicts])
-        for field in fields(RestorationVerdict)
-        if field.name not in ("outcome", "findings")
-    }
-    outcome = tuple(verdict.outcome[0] for verdict in verdicts)
-    return RestorationVerdict(**joined, outcome=outcome, findings=tuple(verdict.findings[0] for verdict in verdicts))
 
 
 @checks_arguments
@@ -401,6 +363,30 @@ def _at_pixels(restored: Tensor, frames: PreparedFrames, count: int) -> Tensor:
     return restored[..., ::step, ::step]
 
 
+def _judged_strip(
+    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: Motion, timing: RowTiming
+) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
+    """The part of the frames of a stack by which their restoration is judged, and its motion.
+
+    With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
+    Arguments and results are as in ``shared_part``, except for the motion (1) in row order and the timing.
+    """
+    count, (height, width) = len(raw), raw.shape[-2:]
+    if motion.same_for_all_columns:
+        of_frames = frame_motion(motion, timing, count, height)
+        of_frames.check_fits(height, width)
+        return raw, restored, ignore, of_frames
+    strip = min(_STRIP, width // 2)
+    halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
+    both = torch.cat([raw[0][..., half] for half in halves], -1)
+    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
+    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
+    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
+    ignore = None if ignore is None else ignore[..., half]
+    return raw[..., half], restored[..., half], ignore, frame_motion(of_strip, timing, count, height)
+
+
+@torch.no_grad()
 def judge_prepared(
     frames: PreparedFrames,
     restored: Tensor,
@@ -408,28 +394,47 @@ def judge_prepared(
     *,
     joint: bool | int = False,
     most_pairs: int | None = None,
+    columns: int | None = None,
+    stack: int = 0,
 ) -> RestorationVerdict:
-    """``judge_restoration`` of one stack that is already prepared.
+    """``judge_restoration`` of one stack of frames that are already prepared.
 
     Args:
         frames: The raw frames.
-        restored: (1, T, C, H, W), or (1, 1, C, H, W), in row order.
-        vibration: The vibration that was undone, in image axes.
+        restored: (B, T, C, H, W), or (B, 1, C, H, W), in row order.
+        vibration: The vibration that was undone, in image axes, batch shape () or (B,).
         joint: As in ``judge_restoration``.
         most_pairs: As in ``judge_restoration``.
+        columns: Judge on so many columns only, those with the most detail; None for all.
+        stack: Index of the stack.
 
     Returns:
         The verdict in image axes.
+
+    Raises:
+        TooLittleInCommonError: If two frames have too little in common.
     """
+    # Frames, restored frames and motion of the stack; with roll or zoom, of a strip of columns.
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
-    if vibration.batch_shape:
-        raise ValueError(f"vibration must be one for the stack, got batch shape {tuple(vibration.batch_shape)}")
-    count = frames.images.shape[1]
-    shared = len(joint_groups(count, joint)[0][0])
+    motion = motion_in_row_order(frames, vibration)[stack].expanded(1)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
-    motion = vibration.to_row_order(frames.image_timing).to(frames.images.device).expanded(1)
-    missing = None if frames.missing is None else frames.missing[0]
-    taken, still = (images[0].to(dtype) for images in frames.compared(restored))
-    raw, image, hidden, of_part = judged_strip(taken, still, missing, motion, frames.timing)
-    verdict = judge_frames(raw, image, of_part, pairs_to_judge(count, joint, limit), shared=shared, hidden=hidden)
-    return verdict.in_image_axes(frames.image_timing)
+    taken, still = (images[stack].to(dtype) for images in frames.compared(restored))
+    ignore = None if frames.missing is None else frames.missing[stack]
+    raw, image, ignore, of_part = _judged_strip(taken, still, ignore, motion, frames.timing)
+
+    # The verdict on each pair of frames.
+    count = len(raw)
+    shared, pairs = len(joint_groups(count, joint)[0][0]), pairs_to_judge(count, joint, limit)
+    moves = motion.moving_axes()[0].tolist()
+    verdicts, advance = [], steps(len(pairs), "pairs")
+    for pair in pairs:
+        verdicts.append(_judge_pair(shared_part(raw, image, of_part, pair, columns, ignore), moves, shared))
+        advance()
+    joined = {
+        field.name: torch.cat([getattr(verdict, field.name) for verdict in verdicts])
+        for field in fields(RestorationVerdict)
+        if field.name not in ("outcome", "findings")
+    }
+    outcome = tuple(verdict.outcome[0] for verdict in verdicts)
+    findings = tuple(verdict.findings[0] for verdict in verdicts)
+    return RestorationVerdict(**joined, outcome=outcome, findings=findings).in_image_axes(frames.image_timing)

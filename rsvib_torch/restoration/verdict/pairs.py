@@ -42,8 +42,8 @@ class FramePair:
         predicted: The later raw frame, formed from ``restored``.
         changed_later: Change of the restored later frame by the motion of that frame.
         offset: (2,) px, root-mean-square displacement between the two frames by the motion, axes (x, y).
-        missing: (2, C, h, w) bool, pixels of the raw frames that were not measured; they hold the values that the
-            restored frames predict. None for none.
+        ignore: (2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames
+            predict. None for none.
     """
 
     earlier: Tensor
@@ -53,7 +53,7 @@ class FramePair:
     predicted: Tensor
     changed_later: Tensor
     offset: Tensor
-    missing: Tensor | None = None
+    ignore: Tensor | None = None
 
 
 def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> list[tuple[int, int]]:
@@ -74,7 +74,7 @@ def shared_part(
     motion: FrameMotion,
     frames: tuple[int, int],
     columns: int | None,
-    hidden: Tensor | None = None,
+    ignore: Tensor | None = None,
     *,
     margin: int = 4,
 ) -> FramePair:
@@ -86,7 +86,7 @@ def shared_part(
         motion: Motion of the frames, batch of one.
         frames: Indices of the two frames.
         columns: Cut to so many columns, those with the most detail; None for all.
-        hidden: Mask shaped like ``raw`` of pixels that were not measured.
+        ignore: Mask shaped like ``raw`` of pixels that were not measured.
         margin: px between the compared pixels and those outside the frame.
 
     Raises:
@@ -104,30 +104,29 @@ def shared_part(
     before, after = (_overlap(step, raw.shape[-2:]) for step in ((y, x), (-y, -x)))
     first, second = raw[earlier][before], raw[later][after]
     single = len(restored) == 1
-    scene = restored[0 if single else earlier][before]
-    other = scene if single else restored[later][after]
+    still = restored[0 if single else earlier][before]
+    still_later = still if single else restored[later][after]
     strip = slice(0, width)
     if columns is not None:
         detailed = detailed_columns(second[..., rim_x : width - rim_x], columns)
         strip = slice(detailed.start, detailed.stop + 2 * rim_x)
     cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
-    first, second, scene, other = (image[..., strip] for image in (first, second, scene, other))
-    predicted, formed_later = reblur(torch.cat([scene, other]), motion, later, first_row=max(y, 0)).chunk(2)
-    missing = None
-    if hidden is not None:
-        masks = torch.stack([hidden[earlier][before], hidden[later][after]])[..., strip]
-        first = torch.where(masks[0], reblur(scene, motion, earlier, first_row=max(-y, 0)), first)
+    first, second, still, still_later = (image[..., strip] for image in (first, second, still, still_later))
+    predicted, formed_later = reblur(torch.cat([still, still_later]), motion, later, first_row=max(y, 0)).chunk(2)
+    if ignore is not None:
+        masks = torch.stack([ignore[earlier][before], ignore[later][after]])[..., strip]
+        first = torch.where(masks[0], reblur(still, motion, earlier, first_row=max(-y, 0)), first)
         second = torch.where(masks[1], predicted, second)
-        missing = masks[(slice(None), *cut)]
+        ignore = masks[(slice(None), *cut)]
     return FramePair(
         first[cut],
         second[cut],
-        scene[cut],
-        None if single else other[cut],
+        still[cut],
+        None if single else still_later[cut],
         predicted[cut],
-        formed_later[cut] - other[cut],
+        formed_later[cut] - still_later[cut],
         (moved[1] - moved[0]).square().mean(0).sqrt(),
-        missing,
+        ignore,
     )
 
 
