@@ -40,6 +40,7 @@ def write_video(
         video = output.add_stream(codec, rate=rate or round(1 / PERIOD), options=options or {})
         video.height, video.width = frames.shape[1:3]
         video.pix_fmt = encoded or layout
+        video.codec_context.thread_count = 1  # rate control of several threads depends on the load of the machine
         video.codec_context.time_base = video.time_base = unit
         if rotation is not None:
             video.set_display_rotation(rotation)
