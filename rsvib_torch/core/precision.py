@@ -7,6 +7,7 @@ from functools import wraps
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -99,6 +100,7 @@ def without_gradients(function: Callable[P, R]) -> Callable[P, R]:
 
     Operations on small tensors take 10 to 15 % less time than with ``torch.no_grad`` (detection in two frames of
     512 x 512 px, and a frame of ``VibrationTracker``). Derivatives that the function itself computes would be zero.
+    NumPy does not warn of NaN and infinite values in the tables of fits, as PyTorch does not of those in tensors.
 
     Example:
         >>> doubled = without_gradients(lambda values: 2 * values)
@@ -108,7 +110,7 @@ def without_gradients(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def in_inference_mode(*args: P.args, **kwargs: P.kwargs) -> R:
-        with torch.inference_mode():
+        with torch.inference_mode(), np.errstate(all="ignore"):
             result = function(*args, **kwargs)
         return outside_inference(result)
 

@@ -7,9 +7,10 @@ in rad and zoom relative.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
-from torch import Tensor
 
+from rsvib_torch.core.tables import Array
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -34,7 +35,7 @@ def assembled(
     fit: ToneFit,
     std: VibrationStd,
     curve: OffsetCurve,
-    fitted: Tensor,
+    fitted: Array,
     findings: Sequence[Findings],
     timing: SensorTiming,
     *,
@@ -56,12 +57,13 @@ def assembled(
         interval: Seconds between two frames, for the gain.
     """
     row_timing = timing.in_row_order()
-    units = scale.units(fitted)
+    predicted = torch.from_numpy(fitted).to(curve.offsets.device)
+    units = scale.units(predicted)
     vibration = scale.motion(motion_of_fit(fit)).from_row_order(timing)
     sensitivity = timing_sensitivity(fit, row_timing, num_frames, scale.height)
     sensitivity = sensitivity.mapped(lambda values: magnitudes_from_row_order(values, timing, -2))
     heights = sequence_from_row_order(curve.heights, timing)
-    residual = (curve.offsets - fitted).abs().nanmean(dim=(1, 2))
+    residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
     reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
     return DetectionResult(
         vibration=vibration,
@@ -72,10 +74,10 @@ def assembled(
             std=None if curve.std is None else magnitudes_from_row_order(curve.std * units, timing),
             heights=(heights[0], heights[1]),
         ),
-        fitted=offsets_from_row_order(fitted * units, timing),
+        fitted=offsets_from_row_order(predicted * units, timing),
         gain=vibration.gain(interval),
         residual=magnitudes_from_row_order(residual * units, timing),
-        reliable=magnitudes_from_row_order(torch.tensor(reliable, device=fitted.device), timing),
+        reliable=magnitudes_from_row_order(torch.tensor(reliable, device="cpu"), timing),
         findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
         sensitivity=sensitivity,
         assumptions=tuple(
@@ -83,12 +85,16 @@ def assembled(
             for index in range(len(findings))
         ),
         timing=timing,
-    )
+    ).to(curve.offsets.device)
 
 
 def offset_curve(
-    measurements: Measurements, fit: ToneFit, robust_weights: Tensor, group_frames: Sequence[int]
-) -> tuple[OffsetCurve, Tensor]:
+    measurements: Measurements,
+    fit: ToneFit,
+    robust_weights: Array,
+    group_frames: Sequence[int],
+    device: torch.device,
+) -> tuple[OffsetCurve, Array]:
     """Measured offsets between consecutive frames, and those (B, P, N, A) in px that a fit predicts.
 
     Args:
@@ -96,6 +102,7 @@ def offset_curve(
         fit: The fit to them.
         robust_weights: As in ``FittedRows``.
         group_frames: Number of frames of each group; neighbouring groups share a frame.
+        device: Device of the curve.
     """
     count = measurements.displacements.shape[1] // len(group_frames)
     parts = [
@@ -104,30 +111,30 @@ def offset_curve(
         for frame in range(frames - 1)
     ]
 
-    def of_pairs(values: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (B, N, G, ...) of the earlier and the later frame of each pair, (B, P, N, ...)."""
-        earlier, later = torch.stack([values[:, rows, frames] for rows, frames in parts], 1).unbind(3)
-        return earlier, later
+    def of_pairs(values: Array) -> Array:
+        """Values (B, N, G, ...) of the earlier and the later frame of each pair, (2, B, P, N, ...)."""
+        return np.moveaxis(np.stack([values[:, rows, frames] for rows, frames in parts], 1), 3, 0)
 
-    def of_rows(values: Tensor) -> Tensor:
-        return torch.stack([values[:, rows] for rows, _ in parts], 1)
+    def of_rows(values: Array) -> Array:
+        return np.stack([values[:, rows] for rows, _ in parts], 1)
 
     starts, later_starts = of_pairs(measurements.exposure_starts)
     before, after = of_pairs(measurements.displacements)
-    everywhere = replace(measurements, visible=torch.ones_like(measurements.visible))
+    everywhere = replace(measurements, visible=np.ones_like(measurements.visible))
     fitted_before, fitted_after = of_pairs(model_displacements(everywhere, fit))
-    visible = torch.stack(of_pairs(measurements.visible)).amin(0) > 0
+    visible = of_pairs(measurements.visible).min(0) > 0
     weights, robust = of_rows(measurements.weights), of_rows(robust_weights)
     measured = visible & (weights > 0).any(-1)
-    frames = torch.arange(len(parts), device=starts.device)
-    curve = OffsetCurve(
-        pairs=torch.stack([frames, frames + 1], -1),
-        rows=BLOCK_ROWS * (torch.arange(count, dtype=torch.float64, device=starts.device) + 0.5) - 0.5,
-        times=starts,
-        later_times=later_starts,
-        offsets=torch.where(measured[..., None], after - before, torch.nan),
-        quality=torch.where(measured, robust.amin(-1), 0.0),
-        heights=(BLOCK_ROWS, BLOCK_ROWS),
-        std=torch.where(weights > 0, (2.0 * robust / weights).sqrt(), torch.nan),  # of a difference of two
-    )
+    frames = np.arange(len(parts))
+    values = {
+        "pairs": np.stack([frames, frames + 1], -1),
+        "rows": BLOCK_ROWS * (np.arange(count) + 0.5) - 0.5,
+        "times": starts,
+        "later_times": later_starts,
+        "offsets": np.where(measured[..., None], after - before, np.nan),
+        "quality": np.where(measured, robust.min(-1), 0.0),
+        "std": np.sqrt(np.where(weights > 0, 2.0 * robust / np.maximum(weights, 1e-300), np.nan)),  # of a difference
+    }
+    on_device = {name: torch.from_numpy(array).to(device) for name, array in values.items()}
+    curve = OffsetCurve(**on_device, heights=(BLOCK_ROWS, BLOCK_ROWS))
     return curve, fitted_after - fitted_before

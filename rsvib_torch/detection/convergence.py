@@ -9,13 +9,12 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import itertools
 from dataclasses import dataclass, field, replace
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from rsvib_torch.core.tables import Array, split_axis
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import ToneFit, residual_of
+from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residual_of
 from rsvib_torch.detection.tones.selection import robust_fit
-from rsvib_torch.motion.motion import Motion
 
 __all__ = ["Acceleration", "Step", "is_converged"]
 
@@ -34,30 +33,27 @@ class Step:
         change: ``fitted`` less the displacements by the motion that the frames were warped by.
     """
 
-    fitted: Tensor
-    change: Tensor
+    fitted: Array
+    change: Array
 
     @classmethod
-    def between(cls, measurements: Measurements, warped_by: Motion, fitted: Motion) -> "Step":
+    def between(cls, measurements: Measurements, warped_by: ToneFit, fitted: ToneFit) -> "Step":
         """Step from the motion that the frames were warped by to the fitted motion."""
-        before, after = (
-            measurements.relative(motion.mean_displacement(measurements.exposure_starts, measurements.exposure_time))
-            for motion in (warped_by, fitted)
-        )
+        before, after = (model_displacements(measurements, fit) for fit in (warped_by, fitted))
         return cls(after, after - before)
 
-    def ratio_to(self, previous: "Step") -> Tensor:
+    def ratio_to(self, previous: "Step") -> Array:
         """(B,) length of the step over the length of the previous one."""
-        square, previous_square = (step.change.square().sum((1, 2, 3)) for step in (self, previous))
-        return (square / previous_square.clamp(min=1e-30)).sqrt()
+        square, previous_square = (np.square(step.change).sum((1, 2, 3)) for step in (self, previous))
+        return np.sqrt(square / np.maximum(previous_square, 1e-30))
 
-    def is_inexact_after(self, previous: "Step") -> Tensor:
+    def is_inexact_after(self, previous: "Step") -> Array:
         """(B,) bool, whether the previous step was too short or too long by more than 30 %: this one corrects it."""
         product = (self.change * previous.change).sum((1, 2, 3))
-        return (product / previous.change.square().sum((1, 2, 3)).clamp(min=1e-30)).abs() > _INEXACT
+        return np.abs(product / np.maximum(np.square(previous.change).sum((1, 2, 3)), 1e-30)) > _INEXACT
 
 
-def is_converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tensor:
+def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
     """(B, A) bool, whether the next round is expected to change the tones of an axis by 8 % of their std.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
@@ -69,19 +65,18 @@ def is_converged(previous: ToneFit, fit: ToneFit, ratio: Tensor | None) -> Tenso
         ratio: (B,) length of the last step over that of the step before; None if unknown.
     """
     if previous.active.shape != fit.active.shape:
-        return torch.zeros_like(fit.active[..., 0])
-    deviation = fit.covariance.diagonal(dim1=-2, dim2=-1)
-    deviation = deviation.unflatten(-1, (fit.coefficients.shape[1], -1)).clamp(min=0.0).sqrt()
-    std = deviation[..., : 3 * fit.frequencies.shape[-1]].unflatten(-1, (-1, 3))  # of Re C, Im C and f
-    change = (previous.about(fit.centre).coefficients - fit.coefficients).abs()
-    max_change_std = change.new_full((), 0.5)
+        return np.zeros_like(fit.active[..., 0])
+    deviation = fit.covariance.diagonal(axis1=-2, axis2=-1)
+    deviation = np.sqrt(np.maximum(split_axis(deviation, -1, fit.coefficients.shape[1], -1), 0.0))
+    std = split_axis(deviation[..., : 3 * fit.frequencies.shape[-1]], -1, -1, 3)  # of Re C, Im C and f
+    change = np.abs(previous.about(fit.centre).coefficients - fit.coefficients)
+    max_change_std = np.array(0.5)
     if ratio is not None:
-        max_change_std = (0.08 / ratio.clamp(min=1e-3)).clamp(0.5, 3.0)[:, None, None]
-    small = (change <= max_change_std * std[..., :2].amax(-1)) & (
-        (previous.frequencies - fit.frequencies).abs() <= max_change_std * std[..., 2]
+        max_change_std = np.clip(0.08 / np.maximum(ratio, 1e-3), 0.5, 3.0)[:, None, None]
+    small = (change <= max_change_std * std[..., :2].max(-1)) & (
+        np.abs(previous.frequencies - fit.frequencies) <= max_change_std * std[..., 2]
     )
-    converged: Tensor = (small | ~fit.active).all(-1)
-    return converged
+    return (small | ~fit.active).all(-1)
 
 
 @dataclass(eq=False)
@@ -98,7 +93,7 @@ class Acceleration:
 
     steps: list[Step] = field(default_factory=list)
 
-    def ratio(self, step: Step) -> Tensor | None:
+    def ratio(self, step: Step) -> Array | None:
         """(B,) length of a step over the length of the last one; None if there is none."""
         return step.ratio_to(self.steps[-1]) if self.steps else None
 
@@ -121,16 +116,16 @@ class Acceleration:
         residual = residual_of(corrected, fit)
         return robust_fit(corrected, fit.frequencies, fit.active, fit.model, residual, steps=1)[0]
 
-    def _correction(self, where: Tensor) -> Tensor:
+    def _correction(self, where: Array) -> Array:
         """Displacements (B, N, G, A) in px to subtract, 0 in the stacks that ``where`` (B,) does not contain."""
         pairs = list(itertools.pairwise(self.steps))
-        fitted = torch.stack([after.fitted - before.fitted for before, after in pairs], -1)
+        fitted = np.stack([after.fitted - before.fitted for before, after in pairs], -1)
         # the combination of differences of changes that is nearest to the last change, (B, n, M) for M differences
-        change = torch.stack([after.change - before.change for before, after in pairs], -1).flatten(1, -2)
-        gram, right = change.mT @ change, change.mT @ self.steps[-1].change.flatten(1)[..., None]
-        ridge = 1e-3 * gram.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=1e-30)
-        eye = torch.eye(len(pairs), dtype=torch.float32, device="cpu").to(gram)
-        share = torch.linalg.solve(gram + ridge[:, None, None] * eye, right)[..., 0]
-        share = share.clamp(-_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION) * where[:, None]
-        correction: Tensor = (fitted * share[:, None, None, None]).sum(-1)
+        changes = [(after.change - before.change).reshape(len(where), -1) for before, after in pairs]
+        change = np.stack(changes, -1)
+        gram, right = change.mT @ change, change.mT @ self.steps[-1].change.reshape(len(where), -1, 1)
+        ridge = 1e-3 * np.maximum(gram.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
+        share = np.linalg.solve(gram + ridge[:, None, None] * np.eye(len(pairs)), right)[..., 0]
+        share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION) * where[:, None]
+        correction: Array = (fitted * share[:, None, None, None]).sum(-1)
         return correction

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Literal
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.option_types import Registration
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.tables import Array, split_axis, table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -178,7 +178,7 @@ def _diagnosis(
 
     # 1. The candidates, each with the frequencies of one tone of each axis if they are known. The rows of a frame and
     # the phase from frame to frame agree with one period of the frames.
-    candidates: list[tuple[SensorTiming, Tensor | None]] = []
+    candidates: list[tuple[SensorTiming, Array | None]] = []
     measurements = found.fitted.measurements.mapped(itemgetter(only))
     agreeing = None
     if num_frames > 2:
@@ -228,7 +228,7 @@ _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual 
 
 def period_factor(
     measurements: Measurements, timing: RowTiming, num_frames: int, block_rows: int
-) -> tuple[float, Tensor] | None:
+) -> tuple[float, Array] | None:
     """Factor of the frame start times with which one tone along each axis explains the measurements best.
 
     A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the
@@ -245,48 +245,47 @@ def period_factor(
         c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements
         clearly better than 1.
     """
-    starts = timing.frame_starts(num_frames, measurements.exposure_starts.device)
+    starts = table(timing.frame_starts(num_frames))
     interval = max(block_rows * timing.row_time, 0.5 * timing.exposure_time)
 
-    def fits(factors: Tensor, rows: int, frequencies: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def fits(factors: Array, rows: int, frequencies: Array | None = None) -> tuple[Array, Array]:
         """Square of the residual of one tone along each axis and its frequency, for each factor."""
         every = max(1, measurements.exposure_starts.shape[1] // rows)
         trial = measurements.thinned(every).repeated(len(factors))
-        frame = torch.searchsorted(starts, trial.exposure_starts.contiguous(), right=True).clamp(min=1) - 1
+        frame = np.maximum(np.searchsorted(starts, trial.exposure_starts, side="right"), 1) - 1
         moved = (factors[:, None, None] - 1.0) * (starts - starts[0])[frame]
         trial = replace(trial, exposure_starts=trial.exposure_starts + moved)
         if frequencies is None:
             fit = find_tones(trial, interval, 1, stretches=False, iterations=_ITERATIONS)
         else:
-            active = torch.ones_like(frequencies, dtype=torch.bool)
+            active = np.ones_like(frequencies, dtype=bool)
             fit, _ = robust_fit(trial, frequencies, active, MotionModel(), iterations=_ITERATIONS)
         return typical_size(trial, fit), fit.frequencies
 
-    ends = starts.new_tensor([1.0, -1.0])
-    coarse = torch.arange(_SHORTEST, _LONGEST, _STEP, dtype=starts.dtype, device=starts.device)
-    sizes, frequencies = fits(torch.cat([ends, coarse]), _ROWS[0])
+    # 1. The stated timing, reversed readout, and other frame periods on a coarse grid.
+    coarse = np.arange(_SHORTEST, _LONGEST, _STEP)
+    sizes, frequencies = fits(np.concatenate([[1.0, -1.0], coarse]), _ROWS[0])
     (stated, reverse), reversed_tones, sizes, frequencies = sizes[:2], frequencies[1:2], sizes[2:], frequencies[2:]
-    if bool(reverse < torch.minimum(sizes.min(), _SMALLER * stated)):
+    if reverse < min(sizes.min(), _SMALLER * stated):
         return -1.0, reversed_tones
-    # a tone has the same phase after 1 / f more, so that several frame periods may agree: the next to 1 is probable
+    # 2. The best minima of the grid, each refined in steps four times smaller.
     inner = (sizes[1:-1] < sizes[:-2]) & (sizes[1:-1] < sizes[2:])
-    minima = (inner.nonzero()[:, 0] + 1).tolist()
-    minima = sorted(minima, key=sizes.tolist().__getitem__)[:_MINIMA]
+    minima = sorted(np.flatnonzero(inner) + 1, key=sizes.__getitem__)[:_MINIMA]
     if not minima:
         return None
     factors, frequencies, step = coarse[minima], frequencies[minima], _STEP
     for _ in range(_LEVELS):
-        around = step * torch.linspace(-1.0, 1.0, _POINTS, dtype=starts.dtype, device=starts.device)
-        near = factors[:, None] + around
-        sizes, found = fits(near.flatten(), _ROWS[1], frequencies.repeat_interleave(_POINTS, 0))
-        least, best = sizes.unflatten(0, near.shape).min(1)
-        factors = near.gather(1, best[:, None])[:, 0]
-        frequencies = found.unflatten(0, near.shape)[torch.arange(len(best), device=best.device), best]
+        near = factors[:, None] + step * np.linspace(-1.0, 1.0, _POINTS)
+        sizes, found = fits(near.ravel(), _ROWS[1], np.repeat(frequencies, _POINTS, 0))
+        sizes, found = sizes.reshape(near.shape), split_axis(found, 0, *near.shape)
+        best = np.arange(len(near)), sizes.argmin(1)
+        least, factors, frequencies = sizes[best], near[best], found[best]
         step /= 4.0
-        if bool((least >= _SMALLER * stated).all()):
+        if (least >= _SMALLER * stated).all():
             return None
-    distance = torch.where(least <= _EQUAL * least.min(), (factors - 1.0).abs(), torch.inf)
+    # 3. A tone has the same phase after 1 / f more, so that several frame periods may agree: the next to 1 is probable.
+    distance = np.where(least <= _EQUAL * least.min(), np.abs(factors - 1.0), np.inf)
     chosen = int(distance.argmin())
-    if bool(least[chosen] >= _SMALLER * stated):
+    if least[chosen] >= _SMALLER * stated:
         return None
     return float(factors[chosen]), frequencies[chosen : chosen + 1]

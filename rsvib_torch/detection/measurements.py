@@ -9,8 +9,9 @@ from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
-import torch
-from torch import Tensor
+import numpy as np
+
+from rsvib_torch.core.tables import Array, median, valid_mean, without_nan
 
 __all__ = ["Measurements", "OtherMotion", "cholesky_root", "trimmed_mean"]
 
@@ -39,30 +40,30 @@ class Measurements:
         independent: Fraction of the measurements that are independent (bands may overlap), one for all stacks or (B,).
     """
 
-    exposure_starts: Tensor
-    displacements: Tensor
-    visible: Tensor
-    information: Tensor
+    exposure_starts: Array
+    displacements: Array
+    visible: Array
+    information: Array
     exposure_time: float
     average_times: tuple[float, float] = (0.0, 0.0)
-    independent: float | Tensor = 1.0
+    independent: float | Array = 1.0
 
     @classmethod
     def of_pairs(
         cls,
-        starts: Tensor,
-        later_starts: Tensor,
-        offsets: Tensor,
-        information: Tensor,
+        starts: Array,
+        later_starts: Array,
+        offsets: Array,
+        information: Array,
         exposure_time: float,
         average_times: tuple[float, float] = (0.0, 0.0),
         independent: float = 1.0,
     ) -> "Measurements":
         """Measurements of offsets (B, N, 2) between rows whose exposures start at the two given times (B, N)."""
         return cls(
-            torch.stack([starts, later_starts], dim=-1),
-            torch.stack([-0.5 * offsets, 0.5 * offsets], dim=-2),
-            torch.ones(*starts.shape, 2, dtype=torch.float64, device=starts.device),
+            np.stack([starts, later_starts], -1),
+            np.stack([-0.5 * offsets, 0.5 * offsets], -2),
+            np.ones((*starts.shape, 2)),
             2.0 * information,  # of each of the two displacements, which are equal and opposite
             exposure_time,
             average_times,
@@ -70,68 +71,66 @@ class Measurements:
         )
 
     @cached_property
-    def _mean_weights(self) -> Tensor:
+    def _mean_weights(self) -> Array:
         """(B, N, G) weights of the mean over the frames that contain a row."""
-        return self.visible / self.visible.sum(2, keepdim=True).clamp(min=1.0)
+        return self.visible / np.maximum(self.visible.sum(2, keepdims=True), 1.0)
 
     @cached_property
-    def span(self) -> Tensor:
+    def span(self) -> Array:
         """(B,) seconds from the first to the last exposure start of the record."""
-        return self.exposure_starts.amax((1, 2)) - self.exposure_starts.amin((1, 2))
+        return self.exposure_starts.max((1, 2)) - self.exposure_starts.min((1, 2))
 
     @cached_property
-    def centre(self) -> Tensor:
+    def centre(self) -> Array:
         """(B,) mid-time of the record in seconds: phases are fitted there, where they depend least on frequency."""
-        return 0.5 * (self.exposure_starts.amin((1, 2)) + self.exposure_starts.amax((1, 2)) + self.exposure_time)
+        return 0.5 * (self.exposure_starts.min((1, 2)) + self.exposure_starts.max((1, 2)) + self.exposure_time)
 
     @cached_property
-    def middles(self) -> Tensor:
+    def middles(self) -> Array:
         """(B, N, G, 1, 1) mid-exposures in seconds from the centre of the record."""
         return (self.exposure_starts + (0.5 * self.exposure_time - self.centre)[:, None, None])[..., None, None]
 
     @cached_property
-    def smearing_times(self) -> Tensor:
+    def smearing_times(self) -> Array:
         """(2, 1, A, 1) seconds over which displacements are averages: the exposure, the rows of a band."""
         axes = self.displacements.shape[-1]
         along, across = self.average_times
         times = [[self.exposure_time] * axes, [along, across, along, along][:axes]]
-        return torch.tensor(times, dtype=self.exposure_starts.dtype, device=self.exposure_starts.device)[
-            :, None, :, None
-        ]
+        return np.array(times)[:, None, :, None]
 
     @cached_property
-    def drifts(self) -> Tensor:
+    def drifts(self) -> Array:
         """(B, N, G, 2) relative displacements by unit drifts t and t^2 / 2 from the centre, averaged over exposures."""
         time = self.middles[..., 0, 0]
-        return self.relative(torch.stack([time, 0.5 * time.square() + self.exposure_time**2 / 24.0], -1))
+        return self.relative(np.stack([time, 0.5 * np.square(time) + self.exposure_time**2 / 24.0], -1))
 
     @property
-    def duration(self) -> Tensor:
+    def duration(self) -> Array:
         """(B,) seconds from the first to the last row of the record, in any frame but the last of a group."""
-        first = self.exposure_starts.amin(-1)
-        return first.amax(1) - first.amin(1)
+        first = self.exposure_starts.min(-1)
+        return first.max(1) - first.min(1)
 
     @property
-    def weights(self) -> Tensor:
+    def weights(self) -> Array:
         """(B, N, 2) information of each axis alone."""
-        return self.information.diagonal(dim1=-2, dim2=-1)
+        return self.information.diagonal(axis1=-2, axis2=-1)
 
     @cached_property
-    def root(self) -> Tensor:
+    def root(self) -> Array:
         """(B, N, 2, 2) upper triangular R with ``W = R^T R``, W the information."""
         return cholesky_root(self.information)
 
     @cached_property
-    def inverse_variances(self) -> Tensor:
+    def inverse_variances(self) -> Array:
         """(B, N, 2) inverse variance ``1 / (W^-1)_aa`` of the displacement of each axis, W the information."""
         axes = self.information.shape[-1]
         # the last pivot of a Cholesky factor belongs to an axis that is conditioned on none
         orders = [[*(other for other in range(axes) if other != axis), axis] for axis in range(axes)]
-        reordered = torch.stack([self.information[..., order, :][..., order] for order in orders], 2)
-        return cholesky_root(reordered)[..., -1, -1].square()
+        reordered = np.stack([self.information[..., order, :][..., order] for order in orders], 2)
+        return np.square(cholesky_root(reordered)[..., -1, -1])
 
     @property
-    def _expected(self) -> Tensor:
+    def _expected(self) -> Array:
         """(B, N, A) inverse variances that residuals of each axis are compared with.
 
         x and y of a row are nearly independent. With roll and zoom, x and roll are not: the displacement along x
@@ -140,21 +139,21 @@ class Measurements:
         return self.weights if self.information.shape[-1] == 2 else self.inverse_variances
 
     @property
-    def num_differences(self) -> Tensor:
+    def num_differences(self) -> Array:
         """(B, N) independent differences within each group: one less than the frames that contain the row."""
-        return (self.visible.sum(-1) - 1).clamp(min=0.0)
+        return np.maximum(self.visible.sum(-1) - 1, 0.0)
 
     @property
-    def num_measurements(self) -> Tensor:
+    def num_measurements(self) -> Array:
         """(B, 2) number of independent measurements of each axis."""
         count = ((self.weights > 0) * self.num_differences[..., None]).sum(1)
-        return count * torch.as_tensor(self.independent, dtype=count.dtype, device=count.device)[..., None]
+        return count * np.asarray(self.independent)[..., None]
 
     def repeated(self, count: int) -> "Measurements":
         """Every stack ``count`` times in a row."""
-        return self.mapped(lambda values: values.repeat_interleave(count, dim=0))
+        return self.mapped(lambda values: np.repeat(values, count, 0))
 
-    def mapped(self, function: Callable[[Tensor], Tensor]) -> "Measurements":
+    def mapped(self, function: Callable[[Array], Array]) -> "Measurements":
         """The measurements with a function of the stacks, their first axis, applied to all tensors."""
         return replace(
             self,
@@ -162,7 +161,7 @@ class Measurements:
             displacements=function(self.displacements),
             visible=function(self.visible),
             information=function(self.information),
-            independent=function(self.independent) if isinstance(self.independent, Tensor) else self.independent,
+            independent=function(self.independent) if isinstance(self.independent, np.ndarray) else self.independent,
         )
 
     def thinned(self, every: int) -> "Measurements":
@@ -170,16 +169,16 @@ class Measurements:
         names = ("exposure_starts", "displacements", "visible", "information")
         return replace(self, **{name: getattr(self, name)[:, ::every] for name in names})
 
-    def only(self, counts: Tensor) -> "Measurements":
+    def only(self, counts: Array) -> "Measurements":
         """The measurements with information 0 in the rows where ``counts`` (B, N) is False."""
         return self._with_information(self.information * counts[..., None, None])
 
-    def scaled(self, factor: Tensor) -> "Measurements":
+    def scaled(self, factor: Array) -> "Measurements":
         """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
-        root = factor.sqrt()
+        root = np.sqrt(factor)
         return self._with_information(self.information * root[..., :, None] * root[..., None, :])
 
-    def _with_information(self, information: Tensor) -> "Measurements":
+    def _with_information(self, information: Array) -> "Measurements":
         """The same displacements with other information; cached values are kept if they depend on times only."""
         result = copy(self)
         object.__setattr__(result, "information", information)
@@ -187,40 +186,40 @@ class Measurements:
             result.__dict__.pop(name, None)
         return result
 
-    def relative(self, values: Tensor) -> Tensor:
+    def relative(self, values: Array) -> Array:
         """Values (B, N, G, ...) less their mean over the frames that contain the row; 0 in the other frames."""
         ones = (1,) * (values.ndim - 3)
         visible = self.visible.reshape(*self.visible.shape, *ones)
-        mean = (self._mean_weights.reshape(visible.shape) * values).sum(2, keepdim=True)
+        mean = (self._mean_weights.reshape(visible.shape) * values).sum(2, keepdims=True)
         return visible * (values - mean)
 
     # Residuals of a fit, (B, N, G, 2) px
 
-    def square(self, residual: Tensor) -> Tensor:
+    def square(self, residual: Array) -> Array:
         """(B, 2) sum of the squared residuals of each axis over their variance.
 
         The residuals of one axis do not affect the sum of the other.
         """
-        return torch.einsum("bnga,bna->ba", residual.square(), self.inverse_variances)
+        return np.einsum("bnga,bna->ba", np.square(residual), self.inverse_variances)
 
-    def sizes(self, residual: Tensor) -> Tensor:
+    def sizes(self, residual: Array) -> Array:
         """(B, N, 2) rms residual of each row in standard deviations; NaN where nothing was measured."""
-        return self.distances(residual) * self._expected.sqrt()
+        return self.distances(residual) * np.sqrt(self._expected)
 
-    def distances(self, residual: Tensor) -> Tensor:
+    def distances(self, residual: Array) -> Array:
         """(B, N, 2) rms residual of each row in px; NaN where nothing was measured."""
         measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
-        square = residual.square().sum(2) / self.num_differences[..., None].clamp(min=1.0)
-        return torch.where(measured, square.sqrt(), torch.nan)
+        square = np.square(residual).sum(2) / np.maximum(self.num_differences[..., None], 1.0)
+        return np.where(measured, np.sqrt(square), np.nan)
 
-    def unexplained(self, residual: Tensor) -> Tensor:
+    def unexplained(self, residual: Array) -> Array:
         """(B, 2) px, rms residual without the part that is explained by noise."""
         measured = (self.weights > 0) & (self.num_differences[..., None] > 0)
-        square = residual.square().sum(2) / self.num_differences[..., None].clamp(min=1.0)
-        excess = square - 1 / self._expected.clamp(min=1e-300)
-        return trimmed_mean(torch.where(measured, excess, torch.nan)).clamp(min=0.0).sqrt()
+        square = np.square(residual).sum(2) / np.maximum(self.num_differences[..., None], 1.0)
+        excess = square - 1 / np.maximum(self._expected, 1e-300)
+        return np.sqrt(np.maximum(trimmed_mean(np.where(measured, excess, np.nan)), 0.0))
 
-    def correlated(self, residual: Tensor, *, significance: float = 1.645) -> Tensor:
+    def correlated(self, residual: Array, *, significance: float = 1.645) -> Array:
         """(B, 2) px, root of the weighted mean product of the residuals of neighbouring rows.
 
         Noise is independent from row to row and does not contribute; an unmodelled motion, and a wrong timing, displace
@@ -228,24 +227,24 @@ class Measurements:
         standard deviations (1.645: 95 %).
         """
         weight = self.weights[:, 1:] * self.weights[:, :-1]
-        product = (residual[:, 1:] * residual[:, :-1]).sum(2) / self.num_differences[:, 1:, None].clamp(min=1.0)
-        total, deviation = (weight * product).sum(1), (weight * product).square().sum(1).sqrt()
-        return torch.where(total > significance * deviation, total / weight.sum(1).clamp(min=1e-300), 0.0).sqrt()
+        product = (residual[:, 1:] * residual[:, :-1]).sum(2) / np.maximum(self.num_differences[:, 1:, None], 1.0)
+        total, deviation = (weight * product).sum(1), np.sqrt(np.square(weight * product).sum(1))
+        return np.sqrt(np.where(total > significance * deviation, total / np.maximum(weight.sum(1), 1e-300), 0.0))
 
-    def independent_fraction(self, residual: Tensor, *, lags: int = 4) -> Tensor:
+    def independent_fraction(self, residual: Array, *, lags: int = 4) -> Array:
         """(B,) fraction of the rows that are independent, from the correlation rho(k) of residuals k rows apart.
 
         Errors of the model correlate the residuals of neighbouring rows, and the variance of a mean is larger by
         ``1 + 2 sum rho(k)``, k = 1 ... ``lags``.
         """
-        scaled = residual * self._expected.sqrt()[:, :, None]
-        energy = scaled.square().sum((1, 2, 3)).clamp(min=1e-300)
+        scaled = residual * np.sqrt(self._expected)[:, :, None]
+        energy = np.maximum(np.square(scaled).sum((1, 2, 3)), 1e-300)
         products = [(scaled[:, lag:] * scaled[:, :-lag]).sum((1, 2, 3)) for lag in range(1, lags + 1)]
-        return 1.0 / (1.0 + 2.0 * torch.stack(products).sum(0) / energy).clamp(min=1.0)
+        return 1.0 / np.maximum(1.0 + 2.0 * np.stack(products).sum(0) / energy, 1.0)
 
     # Robust weights
 
-    def _sizes_for_weights(self, residual: Tensor) -> Tensor:
+    def _sizes_for_weights(self, residual: Array) -> Array:
         """``sizes``; with roll and zoom one of all axes of a row together.
 
         Unequal weights of correlated components would mix them: a smaller weight of x alone turns the precise
@@ -254,41 +253,41 @@ class Measurements:
         axes = self.information.shape[-1]
         if axes == 2:
             return self.sizes(residual)
-        square = torch.einsum("bnga,bnac,bngc->bn", residual, self.information, residual)
-        size = (square / (axes * self.num_differences).clamp(min=1.0)).clamp(min=0.0).sqrt()[..., None]
-        return torch.where(self.distances(residual).isnan(), torch.nan, size)
+        square = np.einsum("bnga,bnac,bngc->bn", residual, self.information, residual)
+        size = np.sqrt(np.maximum(square / np.maximum(axes * self.num_differences, 1.0), 0.0))[..., None]
+        return np.where(np.isnan(self.distances(residual)), np.nan, size)
 
-    def for_least_absolute(self, residual: Tensor) -> "Measurements":
+    def for_least_absolute(self, residual: Array) -> "Measurements":
         """Weights that make a least-squares fit minimise the sum of absolute residuals, which limits outliers."""
         size = self._sizes_for_weights(residual)
-        floor = 0.1 * size.nanmedian(dim=1, keepdim=True).values.nan_to_num(1.0) + 1e-12  # no weight is unbounded
-        return self.scaled(1 / torch.maximum(size.nan_to_num(0.0), floor))
+        floor = 0.1 * without_nan(median(size, 1, keepdims=True), 1.0) + 1e-12  # no weight is unbounded
+        return self.scaled(1 / np.maximum(without_nan(size, 0.0), floor))
 
-    def reweighted(self, residual: Tensor) -> "Measurements":
+    def reweighted(self, residual: Array) -> "Measurements":
         """The measurements with Tukey's biweight of their residual on each axis: outliers have weight 0."""
-        return self.scaled((1 - self._biweight_argument(residual).square()).square())
+        return self.scaled(np.square(1 - np.square(self._biweight_argument(residual))))
 
-    def share_counted(self, residual: Tensor) -> Tensor:
+    def share_counted(self, residual: Array) -> Array:
         """(B,) correction (0 to 1) of the number of measurements after ``reweighted``, for the covariance of the fit.
 
         Weights that depend on the residuals make these look smaller than the errors are: the variance of an M-estimator
         is ``E psi^2 / (E psi')^2`` with ``psi = w z``, not ``E w z^2 / E w`` (Huber 1981, ch. 6).
         """
         z = self._biweight_argument(residual)
-        weight = (1 - z.square()).square()
-        slope = (1 - z.square()) * (1 - 5 * z.square())
-        apparent = (weight * z.square()).sum((1, 2)) / (weight.sum((1, 2)) * (z < 1).sum((1, 2))).clamp(min=1e-300)
-        actual = (weight * z).square().sum((1, 2)) / slope.sum((1, 2)).square().clamp(min=1e-300)
-        return (apparent / actual.clamp(min=1e-300)).clamp(max=1.0)
+        weight = np.square(1 - np.square(z))
+        slope = (1 - np.square(z)) * (1 - 5 * np.square(z))
+        apparent = (weight * np.square(z)).sum((1, 2)) / np.maximum(weight.sum((1, 2)) * (z < 1).sum((1, 2)), 1e-300)
+        actual = np.square(weight * z).sum((1, 2)) / np.maximum(np.square(slope.sum((1, 2))), 1e-300)
+        return np.minimum(apparent / np.maximum(actual, 1e-300), 1.0)
 
-    def _biweight_argument(self, residual: Tensor) -> Tensor:
+    def _biweight_argument(self, residual: Array) -> Array:
         """(B, N, 2) rms residual over 6 robust standard deviations, at most 1; 1 where nothing was measured.
 
         With this limit the biweight is 98 % efficient for Gaussian errors.
         """
         size = self._sizes_for_weights(residual)
-        spread = 1.4826 * size.nanmedian(dim=1, keepdim=True).values
-        return (size / (6.0 * spread.nan_to_num(1.0).clamp(min=1e-9))).nan_to_num(1.0).clamp(max=1.0)
+        spread = 1.4826 * median(size, 1, keepdims=True)
+        return np.minimum(without_nan(size / (6.0 * np.maximum(without_nan(spread, 1.0), 1e-9)), 1.0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,45 +304,46 @@ class OtherMotion:
             deviation, and the size of the expected difference relative to the detail of the scene.
     """
 
-    size: Tensor
-    unexplained: Tensor
-    correlated: Tensor
-    differential: Tensor
-    measured: Tensor
-    blur: Tensor
+    size: Array
+    unexplained: Array
+    correlated: Array
+    differential: Array
+    measured: Array
+    blur: Array
 
     @classmethod
-    def of(cls, measurements: Measurements, by_tones: Tensor, residual: Tensor, differential: Tensor) -> "OtherMotion":
+    def of(cls, measurements: Measurements, by_tones: Array, residual: Array, differential: Array) -> "OtherMotion":
         """From displacements (B, N, G, 2) of rows by the tones, and those left; the blur counts as expected."""
         visible = measurements.num_differences > 0
         measured = visible & (measurements.weights > 0).any(-1)
         return cls(
             # sqrt(2): from the rms displacement about the mean of the frames to the offset of two of them
-            size=math.sqrt(2) * measurements.distances(by_tones).square().nanmean(1).sqrt(),
+            size=math.sqrt(2) * np.sqrt(valid_mean(np.square(measurements.distances(by_tones)), 1)),
             unexplained=measurements.unexplained(residual),
             correlated=measurements.correlated(residual),
             differential=differential,
-            measured=measured.double().sum(1) / visible.double().sum(1).clamp(min=1.0),
-            blur=residual.new_tensor([1.0, 0.0, 0.0]).expand(len(residual), 3),
+            measured=measured.astype(np.float64).sum(1) / np.maximum(visible.astype(np.float64).sum(1), 1.0),
+            blur=np.broadcast_to(np.array([1.0, 0.0, 0.0]), (len(residual), 3)),
         )
 
     @property
-    def permitted(self) -> Tensor:
+    def permitted(self) -> Array:
         """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur."""
-        return (0.006 * self.size).clamp(min=0.05)
+        return np.maximum(0.006 * self.size, 0.05)
 
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""
         return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-def cholesky_root(information: Tensor) -> Tensor:
+def cholesky_root(information: Array) -> Array:
     """Upper triangular R (..., A, A) with ``W = R^T R`` of information matrices W, rows of 0 where W is singular."""
     axes = information.shape[-1]
-    root, rest = torch.zeros_like(information), information
+    root, rest = np.zeros_like(information), information
     for axis in range(axes):
         square = rest[..., :1, :1]
-        row = torch.where(square > 0, rest[..., :1, :] * square.rsqrt(), 0.0)  # (..., 1, A - axis)
+        scale = (square > 0) / np.sqrt(np.where(square > 0, square, 1.0))
+        row = rest[..., :1, :] * scale  # (..., 1, A - axis)
         root[..., axis, axis:] = row[..., 0, :]
         if axis + 1 < axes:
             later = row[..., 1:]
@@ -351,9 +351,9 @@ def cholesky_root(information: Tensor) -> Tensor:
     return root
 
 
-def trimmed_mean(values: Tensor, *, fraction: float = 0.7) -> Tensor:
+def trimmed_mean(values: Array, *, fraction: float = 0.7) -> Array:
     """Mean (B, A) of the smallest ``fraction`` of values (B, N, A) without NaN; clouds may cover the other rows."""
-    ordered = values.sort(dim=1).values  # NaN come last
-    count = ((~torch.isnan(values)).sum(1, keepdim=True).to(torch.float32) * fraction).ceil()
-    counted = torch.arange(values.shape[1], device=values.device)[None, :, None] < count
-    return torch.where(counted, ordered, 0.0).sum(1) / count[:, 0].clamp(min=1)
+    ordered = np.sort(values, 1)  # NaN come last
+    count = np.ceil((~np.isnan(values)).sum(1, keepdims=True).astype(np.float32) * fraction)
+    counted = np.arange(values.shape[1])[None, :, None] < count
+    return np.where(counted, ordered, 0.0).sum(1) / np.maximum(count[:, 0], 1)

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from rsvib_torch.core.option_types import DetectionMethod
+from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine
@@ -26,8 +27,10 @@ from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
     displacement_std,
+    motion_of_fit,
     residual_of,
-    shrunk_motion,
+    shrunk,
+    tone_displacements,
     vibration_of_fit,
     with_unknown_errors,
 )
@@ -86,7 +89,7 @@ class Hypothesis:
     has_pattern: bool | None = None
     translation: ToneFit | None = None
     bands: OffsetCurve | None = None
-    frequencies: Tensor | None = None
+    frequencies: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,7 @@ class Fitted:
     fit: ToneFit
     measurements: Measurements
     offsets: OffsetCurve
-    predicted: Tensor
+    predicted: Array
     refined: FittedRows | None = None
 
 
@@ -165,7 +168,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
     if hypothesis.frequencies is not None:
-        active = torch.ones_like(hypothesis.frequencies, dtype=torch.bool)
+        active = np.ones_like(hypothesis.frequencies, dtype=bool)
         known, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.model)
         start = replace(start, fit=known)
 
@@ -175,7 +178,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
     # for any errors; aliasing biases the displacements; the record may contain a further tone. The displacement is that
     # of every eighth row of all frames.
-    row_starts = timing.row_starts(num_frames, height, frames.device)[:, ::8].flatten()
+    row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     if fitted.refined is None:
         fit = with_unknown_errors(fitted.measurements, fitted.fit)
     else:
@@ -183,19 +186,18 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     fit, total_std = with_further_tones(fitted.measurements, fit, row_starts, number_is_known=options.tones is not None)
     vibration, std = vibration_of_fit(fit)
-    std = replace(std, displacement=total_std)
+    std = replace(std, displacement=torch.from_numpy(total_std))
 
     # 4. Verdict: for each axis, the reasons against it, from the rows or the bands that the vibration was fitted to.
-    intervals = compared_intervals(timing, num_frames, method.max_group_frames, frames.device)
-    tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
-    moved = tones.mean_displacement(row_starts.expand(len(fit.centre), -1), timing.exposure_time)
+    intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
+    moved = tone_displacements(fit, row_starts, timing.exposure_time)
     refined = fitted.refined
     findings = judged(
         vibration,
         std,
         _band_offsets(start, fit, options, height) if refined is None else refined.other_motion,
         intervals=intervals,
-        displacement=moved.std(1, correction=0),
+        displacement=moved.std(1),
         known_std=known_std,
         timing=timing,
         max_tones=options.max_tones,
@@ -221,9 +223,8 @@ def _statuses(fitted: Fitted) -> tuple[Status, ...]:
     statuses: list[Status] = ["converged"] * len(fitted.fit.centre)
     if refined is None:
         return tuple(statuses)
-    for index, (converged, measured, abandoned) in enumerate(
-        torch.stack([refined.converged, refined.other_motion.measured > 0, refined.abandoned], -1).tolist()
-    ):
+    of_stacks = zip(refined.converged, refined.other_motion.measured > 0, refined.abandoned, strict=True)
+    for index, (converged, measured, abandoned) in enumerate(of_stacks):
         if abandoned:
             statuses[index] = "abandoned"
         elif not measured:
@@ -236,10 +237,14 @@ def _statuses(fitted: Fitted) -> tuple[Status, ...]:
 def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:
     """The offsets of the row bands with those that a fit predicts."""
     curve, predicted = start.curve, start.predicted(fit)
+    offsets, rows = tables(curve.offsets, curve.rows)
     # an image motion may carry bands out of the later frame
-    later, half = curve.rows + predicted[..., 1], 0.5 * options.bands.band_rows
+    later, half = rows + predicted[..., 1], 0.5 * options.bands.band_rows
     visible = (later >= half) & (later <= height - 1 - half)
-    return BandOffsets(*(values.flatten(1, 2) for values in (curve.offsets, predicted, visible)))
+    stacks, axes = len(offsets), offsets.shape[-1]
+    return BandOffsets(
+        offsets.reshape(stacks, -1, axes), predicted.reshape(stacks, -1, axes), visible.reshape(stacks, -1)
+    )
 
 
 # Methods of detection
@@ -279,8 +284,9 @@ def fit_directly(
     """The fit to bands, refined on the images row by row."""
     # The gradients of rows reach a few tenths of a pixel, so that a start with an error of 0.15 px converges.
     fit = _tones_of_bands(start, timing, options, accuracy=0.15)
-    intervals = compared_intervals(timing, stacks.images.shape[1], MAX_GROUP_FRAMES, stacks.images.device)
-    motion, scale, doubtful = shrunk_motion(fit, intervals), hypothesis.scale, hypothesis.is_doubtful
+    intervals = table(compared_intervals(timing, stacks.images.shape[1], MAX_GROUP_FRAMES))
+    motion = motion_of_fit(shrunk(fit, intervals), stacks.images.device)
+    scale, doubtful = hypothesis.scale, hypothesis.is_doubtful
     if scale.same_for_all_columns:
         frames = grouped_frames(stacks.images, stacks.valid, timing, motion)
     else:  # equal blur takes several times as long, and is not needed to find that there is no roll
@@ -289,20 +295,21 @@ def fit_directly(
     refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
     # Roll and zoom that were confirmed are fitted again with equal blur, if the exposures blur the frames differently.
     if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
-        motion = shrunk_motion(refined.fit, intervals)
+        motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
         if frames.differently_blurred(motion):
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
             again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)
     group_frames = [group.starts.shape[1] for group in refined.frames.groups]
-    offsets, predicted = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames)
+    device = stacks.images.device
+    offsets, predicted = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames, device)
     return Fitted(refined.fit, refined.measurements, offsets, predicted, refined)
 
 
 def _tones_of_bands(start: BandStart, timing: RowTiming, options: DetectionOptions, accuracy: float = 0.0) -> ToneFit:
     """Tones and image motion of the offsets of row bands; further tones until residuals are below ``accuracy`` px."""
     interval = options.bands.band_step * timing.row_time
-    blind = blind_frequencies(timing, 0.5 / interval).to(start.measurements.centre.device)
+    blind = table(blind_frequencies(timing, 0.5 / interval))
     return find_tones(
         start.measurements, interval, options.tones, options.model, start=start.fit, blind=blind, accuracy=accuracy
     )

@@ -16,10 +16,10 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from torch import Tensor
-from torch.nn import functional
 
+from rsvib_torch.core.tables import Array, median, table, valid_mean, without_nan
 from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -29,9 +29,10 @@ from rsvib_torch.detection.tones.fit import (
     fit_tones,
     is_bounded,
     model_displacements,
+    motion_of_fit,
     residual_of,
     select_stacks,
-    shrunk_motion,
+    shrunk,
     strongest_only,
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, significant_only, typical_size
@@ -54,7 +55,7 @@ class FittedRows:
         uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
         frames: The frames; without a pattern of columns if there was one.
         has_pattern: Whether a pattern of columns was subtracted.
-        unknown: (B, A P, A P) part of the covariance of the fit, what the last rounds changed; 0 for stacks that
+        unknown: (B, A, P, R) changes of the parameters by the last R rounds, which count as errors; 0 for stacks that
             converged.
         converged: (B,) bool, stacks whose next round would change little.
         abandoned: (B,) bool, stacks whose large residual ended the rounds early.
@@ -63,19 +64,19 @@ class FittedRows:
     measurements: Measurements
     fit: ToneFit
     other_motion: OtherMotion
-    robust_weights: Tensor
-    aliasing: Tensor
-    uneven: Tensor
+    robust_weights: Array
+    aliasing: Array
+    uneven: Array
     frames: GroupedFrames
     has_pattern: bool
-    unknown: Tensor
-    converged: Tensor
-    abandoned: Tensor
+    unknown: Array
+    converged: Array
+    abandoned: Array
 
 
 def refine(
     frames: GroupedFrames,
-    intervals: Tensor,
+    intervals: Array,
     start: ToneFit,
     tones: int | None,
     *,
@@ -98,8 +99,9 @@ def refine(
     # Rounds of measuring and fitting from the given start.
     refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
     # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well.
-    if frames.differently_blurred(shrunk_motion(start, intervals)):
-        tried = torch.zeros_like(start.active[..., 0])
+    device = frames.groups[0].starts.device
+    if frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device)):
+        tried = np.zeros_like(start.active[..., 0])
         for _ in range(2):  # one axis after the other
             frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
             if not bool(mirrored.any()):
@@ -114,15 +116,16 @@ def refine(
     if tones is None:
         fit = significant_only(refined.measurements, refined.fit, intervals)
         if fit is not refined.fit:  # it was fitted again, without what the last rounds changed
-            refined = replace(refined, fit=replace(fit, covariance=fit.covariance + refined.unknown))
+            covariance = fit.covariance + covariance_of_changes(refined.unknown)
+            refined = replace(refined, fit=replace(fit, covariance=covariance))
     # The difference of the blur of the frames, by the final motion, contradicts a wrong exposure time.
-    blur = refined.frames.blur_ratio(shrunk_motion(refined.fit, intervals))
+    blur = table(refined.frames.blur_ratio(motion_of_fit(shrunk(refined.fit, intervals), device)))
     return replace(refined, other_motion=replace(refined.other_motion, blur=blur))
 
 
 def _rounds(
     frames: GroupedFrames,
-    intervals: Tensor,
+    intervals: Array,
     start: ToneFit,
     tones: int | None,
     may_abandon: bool,
@@ -147,10 +150,10 @@ class ColumnPatterns:
 
     remaining: int
     subtracted: bool = False
-    refused: Tensor | None = None
+    refused: Array | None = None
 
     def without(
-        self, frames: GroupedFrames, motion: Vibration, gradients: list[RowGradients], refused: Tensor | None = None
+        self, frames: GroupedFrames, motion: Vibration, gradients: list[RowGradients], refused: Array | None = None
     ) -> GroupedFrames | None:
         """The rows without their pattern; None if there is none, or if axes are refused again after the last one."""
         if self.remaining == 0 or (refused is not None and self.refused is not None):
@@ -160,7 +163,7 @@ class ColumnPatterns:
             self.remaining, self.subtracted, self.refused = self.remaining - 1, True, refused
         return cleared
 
-    def were_not_the_cause(self, size: Tensor) -> bool:
+    def were_not_the_cause(self, size: Array) -> bool:
         """Whether refused axes have residuals (B, A) of more than half the size without the pattern."""
         return self.refused is not None and bool((size > 0.5 * self.refused).all())
 
@@ -182,8 +185,8 @@ class Refinement:
     Attributes:
         frames: The frames, without a pattern of columns that was subtracted.
         fit: The fit of the last round.
-        motion: The motion of the fit, around which the next round measures.
-        warped_by: The motion around which the last round measured.
+        around: The fit around whose motion the next round measures.
+        warped_by: The fit around whose motion the last round measured.
         round: Number of the next round, from 0, and of the rounds that have been made.
         search_round: Round in which further tones are searched for. The first round removes the error of the band
             offsets; weak tones are significant after it.
@@ -195,7 +198,7 @@ class Refinement:
     def __init__(
         self,
         frames: GroupedFrames,
-        intervals: Tensor,
+        intervals: Array,
         start: ToneFit,
         tones: int | None,
         *,
@@ -204,22 +207,27 @@ class Refinement:
         has_pattern: bool | None = None,
     ) -> None:
         self.frames, self.fit = frames, start
-        self.motion = self.warped_by = shrunk_motion(start, intervals)
+        self.around = self.warped_by = shrunk(start, intervals)
         self.round, self.search_round, self.is_finished = 0, 1, False
-        self.converged = self.abandoned = torch.zeros_like(start.centre, dtype=torch.bool)
+        self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
         self._intervals, self._tones, self._max_rounds = intervals, tones, max_rounds
         self._may_abandon, self._has_pattern = may_abandon, has_pattern
         # exposures average out faster tones
         self._sample_interval = max(BLOCK_ROWS * frames.timing.row_time, 0.5 * frames.timing.exposure_time)
-        self._blind = blind_frequencies(frames.timing, 0.5 / self._sample_interval).to(start.centre.device)
+        self._blind = table(blind_frequencies(frames.timing, 0.5 / self._sample_interval))
         self._measured: MeasuredRows  # of the last round
         self._gradients: list[RowGradients] | None = None  # of the scene; None: compute them from the warped frames
         self._acceleration = Acceleration()
         # a strong pattern biases its first estimate, so that it is subtracted twice
         self._patterns = ColumnPatterns(remaining=0 if has_pattern is False else 2)
         # of the rounds since the search: (B, A) typical residuals in standard deviations, and fits of the same tones
-        self._sizes: list[Tensor] = []
+        self._sizes: list[Array] = []
         self._fits: list[ToneFit] = []
+
+    @property
+    def motion(self) -> Vibration:
+        """The motion around which the next round measures, on the device of the frames."""
+        return motion_of_fit(self.around, self.frames.groups[0].starts.device)
 
     def step(self) -> None:
         """One round: measure the rows around the motion, fit the motion to them, decide how to continue."""
@@ -230,7 +238,7 @@ class Refinement:
         measured = self._measured = self.frames.measure(self.motion, self._gradients)
         measurements = measured.measurements
         residual = residual_of(measurements, previous)
-        size = measurements.sizes(residual).nanmedian(1).values
+        size = median(measurements.sizes(residual), 1)
         self._sizes = [] if number == self.search_round else [*self._sizes, size]  # fewer tones before the search
 
         # 2. Fit the motion to them, and keep the last fit of a stack whose fit diverges.
@@ -238,9 +246,9 @@ class Refinement:
         if fit is None:
             fit = robust_fit(measurements, previous.frequencies, previous.active, previous.model, residual, steps=1)[0]
         fit = self.fit = self._bounded(fit, previous)
-        same_tones = torch.equal(previous.active, fit.active)
+        same_tones = np.array_equal(previous.active, fit.active)
         self._fits = [*self._fits, fit] if same_tones and number > self.search_round else [fit]
-        self.warped_by, self.motion = self.motion, shrunk_motion(fit, self._intervals)
+        self.warped_by, self.around = self.around, shrunk(fit, self._intervals)
         self._gradients = measured.gradients
 
         # 3. Begin again without a pattern of columns that is known, as soon as the motion is known roughly.
@@ -254,11 +262,11 @@ class Refinement:
 
         # 5. Stop if the next round would change the motion by much less than its standard deviation, or if the residual
         # of an axis that is refused hardly decreases: unless a pattern of columns is the cause.
-        step = Step.between(measurements, self.warped_by, self.motion)
+        step = Step.between(measurements, self.warped_by, self.around)
         converged = is_converged(previous, fit, self._acceleration.ratio(step) if same_tones else None)
         converged = converged & (number >= self.search_round)
         stalled = self._stalled(measured)
-        self.converged = converged.all(-1)
+        self.converged = np.all(converged, -1)
         if bool((converged | stalled | self.abandoned[:, None]).all()):
             self.is_finished = not self._subtract_pattern(size if bool(stalled.all()) else None)
             return
@@ -269,12 +277,12 @@ class Refinement:
         faster = self._acceleration.applied(measurements, fit)
         if faster is not None:
             self.fit = self._bounded(faster, fit)
-            self.motion = shrunk_motion(self.fit, self._intervals)
-            step = Step.between(measurements, self.warped_by, self.motion)
-        if float(step.change.abs().amax()) > _SAME_GRADIENTS:
+            self.around = shrunk(self.fit, self._intervals)
+            step = Step.between(measurements, self.warped_by, self.around)
+        if float(np.abs(step.change).max()) > _SAME_GRADIENTS:
             self._gradients = None
 
-    def _must_stop(self, measured: MeasuredRows, size: Tensor) -> bool:
+    def _must_stop(self, measured: MeasuredRows, size: Array) -> bool:
         """Whether no further round is permitted, or none would help; stacks with a large residual are abandoned.
 
         Args:
@@ -293,17 +301,17 @@ class Refinement:
         fitted = conclude(self.frames, self._measured, self.fit)
         converged = self.converged | self.abandoned
         if not bool(converged.all()):
-            fitted = with_unknown_changes(fitted, self.warped_by, self.motion, self._fits, ~converged)
+            fitted = with_unknown_changes(fitted, self.warped_by, self.around, self._fits, ~converged)
         has_pattern = self._patterns.subtracted
         return replace(fitted, has_pattern=has_pattern, converged=self.converged, abandoned=self.abandoned)
 
-    def _searched(self, measurements: Measurements, residual: Tensor) -> ToneFit:
+    def _searched(self, measurements: Measurements, residual: Array) -> ToneFit:
         """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
         independent = replace(measurements, independent=measurements.independent_fraction(residual))
         start = strongest_only(self.fit)
         return find_tones(independent, self._sample_interval, self._tones, start.model, 0.02, start, self._blind)
 
-    def _subtract_pattern(self, refused: Tensor | None = None) -> bool:
+    def _subtract_pattern(self, refused: Array | None = None) -> bool:
         """Subtract a pattern of columns, and begin again; False if there is none.
 
         Args:
@@ -314,7 +322,7 @@ class Refinement:
         if cleared is None:
             return False
         self.frames, self._gradients = cleared, None
-        self.converged = torch.zeros_like(self.converged)
+        self.converged = np.zeros_like(self.converged)
         if self.round > 1:  # after the first round, the search is still to come
             self.search_round = self.round
             self._sizes = []
@@ -330,13 +338,13 @@ class Refinement:
             return previous
         return select_stacks(bounded, fit, previous)
 
-    def _stalled(self, measured: MeasuredRows) -> Tensor:
+    def _stalled(self, measured: MeasuredRows) -> Array:
         """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
 
         A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
         """
         sizes = self._sizes
-        nothing = torch.zeros_like(self.fit.active[..., 0])
+        nothing = np.zeros_like(self.fit.active[..., 0])
         if len(sizes) < 3:
             return nothing
         stalled = sizes[-1] > 0.75 * sizes[-3]
@@ -351,10 +359,10 @@ _TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
 _SAME_GRADIENTS = 0.05  # px; over smaller distances the gradients of the scene are the same
 
 
-def _large_residual(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Tensor:
+def _large_residual(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Array:
     """(B,) bool, whether the fit leaves a residual that no further round would reduce enough."""
     other = conclude(frames, measured, fit).other_motion
-    return (other.unexplained > _MAX_TRIED * other.permitted).any(-1)
+    return np.any(other.unexplained > _MAX_TRIED * other.permitted, -1)
 
 
 # Conclusion
@@ -369,25 +377,25 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
     weighted = replace(weighted, independent=share)
     exact = fit_tones(weighted, fit, fit.active, fit.model)
     fit = select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)  # the exact fit may diverge
-    tones = measurements.relative(model_displacements(measurements, replace(fit, drift=torch.zeros_like(fit.drift))))
+    tones = measurements.relative(model_displacements(measurements, replace(fit, drift=np.zeros_like(fit.drift))))
     other = OtherMotion.of(measurements, tones, residual, measured.differential())
     return FittedRows(
         weighted,
         fit,
         other,
-        robust_weights=weighted.weights / measurements.weights.clamp(min=1e-300),
-        aliasing=torch.stack([gradients.aliasing for gradients in measured.gradients]).mean(0),
+        robust_weights=weighted.weights / np.maximum(measurements.weights, 1e-300),
+        aliasing=table(torch.stack([gradients.aliasing for gradients in measured.gradients]).mean(0)),
         uneven=measured.uneven(),
         frames=frames,
         has_pattern=False,
-        unknown=torch.zeros_like(fit.covariance),
-        converged=torch.zeros_like(fit.centre, dtype=torch.bool),
-        abandoned=torch.zeros_like(fit.centre, dtype=torch.bool),
+        unknown=np.zeros((*fit.parameters.shape, 1)),
+        converged=np.zeros_like(fit.centre, dtype=bool),
+        abandoned=np.zeros_like(fit.centre, dtype=bool),
     )
 
 
 def with_unknown_changes(
-    fitted: FittedRows, warped_by: Vibration, motion: Vibration, fits: Sequence[ToneFit], where: Tensor
+    fitted: FittedRows, warped_by: ToneFit, around: ToneFit, fits: Sequence[ToneFit], where: Array
 ) -> FittedRows:
     """The fit of stacks whose rounds did not converge: what the last rounds changed is not known.
 
@@ -400,29 +408,32 @@ def with_unknown_changes(
 
     Args:
         fitted: The fit of the last round.
-        warped_by: Motion that the frames were warped by.
-        motion: Motion that was fitted.
+        warped_by: Fit that the frames were warped by.
+        around: Fit that a further round would measure around.
         fits: Fits of the last rounds with the same tones.
         where: (B,) bool, stacks that did not converge.
     """
     measurements, fit, other = fitted.measurements, fitted.fit, fitted.other_motion
-    change = Step.between(measurements, warped_by, motion).change
-    distance = measurements.distances(change).square().nanmean(1).nan_to_num(0.0).sqrt() * where[:, None]
-    least = (distance / other.permitted).amax(-1, keepdim=True) * other.permitted
-    other = replace(other, unexplained=torch.maximum(other.unexplained, least))
-    changes = torch.stack([one.about(fit.centre).parameters - fit.parameters for one in fits], -1).flatten(1, 2)
-    changes = changes * where[:, None, None]
-    unknown = changes @ changes.mT
-    fit = replace(fit, covariance=fit.covariance + unknown)
+    change = Step.between(measurements, warped_by, around).change
+    distance = np.sqrt(without_nan(valid_mean(np.square(measurements.distances(change)), 1), 0.0)) * where[:, None]
+    least = (distance / other.permitted).max(-1, keepdims=True) * other.permitted
+    other = replace(other, unexplained=np.maximum(other.unexplained, least))
+    changes = np.stack([one.about(fit.centre).parameters - fit.parameters for one in fits], -1)
+    unknown = changes * where[:, None, None, None]
+    fit = replace(fit, covariance=fit.covariance + covariance_of_changes(unknown))
     return replace(fitted, other_motion=other, fit=fit, unknown=unknown)
+
+
+def covariance_of_changes(changes: Array) -> Array:
+    """Covariance (B, A P, A P) of parameters whose errors are the sum of changes (B, A, P, R) of unknown sign."""
+    columns = changes.reshape(len(changes), -1, changes.shape[-1])
+    return columns @ columns.mT
 
 
 # Mirrored frequencies
 
 
-def mirrored_frequencies(
-    measurements: Measurements, fit: ToneFit, start: ToneFit, tried: Tensor
-) -> tuple[Tensor, Tensor]:
+def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFit, tried: Array) -> tuple[Array, Array]:
     """Frequencies of the strongest tones, that of the less explained axis mirrored at the nearest blind frequency.
 
     With two frames, tones equally far above and below a blind frequency ``j / (m T_row)`` have the same gain and differ
@@ -439,17 +450,17 @@ def mirrored_frequencies(
         residual of three standard deviations in the typical row, and frequencies that a frame does not resolve.
     """
     strongest = strongest_only(fit)
-    residual = measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.nan_to_num(0.0)  # (B, A)
+    residual = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
     exposure_starts = measurements.exposure_starts
-    duration = (exposure_starts.amax(1) - exposure_starts.amin(1)).amax(-1)[:, None]
+    duration = (exposure_starts.max(1) - exposure_starts.min(1)).max(-1)[:, None]
     interval = (exposure_starts[:, :, 1] - exposure_starts[:, :, 0]).mean(1)[:, None]
     frequency = strongest_only(start).frequencies[..., 0]
     mirrored = 2 * (frequency * interval).round() / interval - frequency
-    unresolved = ((mirrored - frequency).abs() * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]
-    where = unresolved & ~tried & (residual > 3.0) & (residual == residual.amax(-1, keepdim=True))
+    unresolved = (np.abs(mirrored - frequency) * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]
+    where = unresolved & ~tried & (residual > 3.0) & (residual == residual.max(-1, keepdims=True))
     if fit.model.harmonics > 1 or exposure_starts.shape[2] > 2:
-        where = torch.zeros_like(where)
-    return torch.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
+        where = np.zeros_like(where)
+    return np.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
 
 
 def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
@@ -463,35 +474,32 @@ def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
     # Tones of both fits side by side, where one has more than the other, are fitted to the chosen measurements.
     count = max(first.fit.active.shape[-1], second.fit.active.shape[-1])
 
-    def tones(one: Tensor, other: Tensor) -> Tensor:
-        one, other = (functional.pad(values, (0, count - values.shape[-1])) for values in (one, other))
-        return torch.where(better[:, None, None], one, other)
+    def tones(one: Array, other: Array) -> Array:
+        one, other = (np.pad(values, ((0, 0), (0, 0), (0, count - values.shape[-1]))) for values in (one, other))
+        return np.where(better[:, None, None], one, other)
 
     measurements = select_stacks(better, second.measurements, first.measurements)
     frequencies = tones(second.fit.frequencies, first.fit.frequencies)
     active = tones(second.fit.active, first.fit.active)
     fit = fit_tones(measurements, frequencies, active, first.fit.model)
-    unknown = torch.where(better[:, None, None], _with_tones(second, count), _with_tones(first, count))
+    chosen = better[:, None, None, None]
+    unknown = np.concatenate([_with_tones(second, count) * chosen, _with_tones(first, count) * ~chosen], -1)
     return replace(
         first,
         measurements=measurements,
-        fit=replace(fit, covariance=fit.covariance + unknown),
+        fit=replace(fit, covariance=fit.covariance + covariance_of_changes(unknown)),
         unknown=unknown,
         other_motion=select_stacks(better, second.other_motion, first.other_motion),
-        robust_weights=torch.where(better[:, None, None], second.robust_weights, first.robust_weights),
-        aliasing=torch.where(better, second.aliasing, first.aliasing),
-        converged=torch.where(better, second.converged, first.converged),
-        uneven=torch.where(better[:, None], second.uneven, first.uneven),
+        robust_weights=np.where(better[:, None, None], second.robust_weights, first.robust_weights),
+        aliasing=np.where(better, second.aliasing, first.aliasing),
+        converged=np.where(better, second.converged, first.converged),
+        uneven=np.where(better[:, None], second.uneven, first.uneven),
     )
 
 
-def _with_tones(fitted: FittedRows, count: int) -> Tensor:
-    """``FittedRows.unknown`` of a fit with ``count`` tones on each axis; the further ones are known."""
-    axes, tones = fitted.fit.active.shape[1:]
-    added = functional.pad(fitted.unknown.unflatten(2, (axes, -1)).unflatten(1, (axes, -1)), (0, 3 * (count - tones)))
-    # the drift follows the tones
-    order = fitted.fit.drift.shape[-1]
-    place = torch.cat([torch.arange(3 * tones), torch.arange(3 * tones + order, 3 * count + order)])
-    place = torch.cat([place, torch.arange(3 * tones, 3 * tones + order)]).to(added.device)
-    added = functional.pad(added[..., place], (0, 0, 0, 0, 0, 3 * (count - tones)))
-    return added[:, :, place].flatten(3, 4).flatten(1, 2)
+def _with_tones(fitted: FittedRows, count: int) -> Array:
+    """``FittedRows.unknown`` of a fit with ``count`` tones on each axis; the further ones did not change."""
+    tones = fitted.fit.active.shape[-1]
+    further = np.zeros((*fitted.unknown.shape[:2], 3 * (count - tones), fitted.unknown.shape[-1]))
+    of_tones, of_drift = np.split(fitted.unknown, [3 * tones], 2)
+    return np.concatenate([of_tones, further, of_drift], 2)

@@ -3,16 +3,16 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import math
 from dataclasses import replace
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.tables import pseudo_inverse, split_axis, table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
-from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, motion_of_fit
+from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displacements
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 
@@ -36,41 +36,39 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     Returns:
         Sensitivities (B, 2, K), the tones in the order of ``vibration_of_fit``.
     """
-    batch, device = len(fit.centre), fit.centre.device
+    batch, axes, tones = fit.coefficients.shape
 
-    def starts(stated: RowTiming) -> Tensor:
-        rows = stated.row_starts(num_frames, num_rows, device)[:, :: max(1, num_rows // 128)]
-        return rows.T.expand(batch, -1, -1)  # (B, N, T)
+    # 1. A record of all rows of all frames, and the fit at its middle.
+    def record(stated: RowTiming) -> Measurements:
+        rows = table(stated.row_starts(num_frames, num_rows)[:, :: max(1, num_rows // 128)].T)
+        times = np.repeat(rows[None], batch, 0)  # (B, N, T)
+        information = np.broadcast_to(np.eye(axes), (*times.shape[:2], axes, axes))
+        nothing = np.zeros((*times.shape, axes))
+        return Measurements(times, nothing, np.ones_like(times), information, stated.exposure_time)
 
-    times = starts(timing)
-    axes = fit.coefficients.shape[1]
-    eye = torch.eye(axes, dtype=times.dtype, device=device).expand(*times.shape[:2], axes, axes)
-    displacements = times.new_zeros(*times.shape, axes)
-    record = Measurements(times, displacements, torch.ones_like(times), eye, timing.exposure_time)
-    # parameters of the fit at the middle of this record
-    turn = 2 * math.pi * fit.frequencies * (record.centre - fit.centre)[:, None, None]
-    fit = replace(fit, coefficients=fit.coefficients * torch.polar(torch.ones_like(turn), turn), centre=record.centre)
-    motion, inverses = motion_of_fit(fit), []
+    whole = record(timing)
+    fit = fit.about(whole.centre)
+
+    # 2. The pseudo-inverse of the derivatives of the displacements of each axis by its parameters.
+    inverses = []
     for axis in range(axes):
-        jacobian, to_all = axis_jacobian(record, fit, axis)
-        inverses.append(to_all @ torch.linalg.pinv(jacobian.flatten(1, 2)))
+        jacobian, to_all = axis_jacobian(whole, fit, axis)
+        inverses.append(to_all @ pseudo_inverse(jacobian.reshape(batch, -1, jacobian.shape[-1])))
 
-    def predicted(stated: RowTiming) -> Tensor:
-        return record.relative(motion.mean_displacement(starts(stated), stated.exposure_time))
-
+    # 3. The change of the tones by a change of each time, the tones in the order of a ``Vibration``.
     values = {}
-    largest_first = fit.amplitude.argsort(dim=-1, descending=True, stable=True)
-    size = torch.where(fit.amplitude > 0, fit.amplitude, 1.0)
+    largest_first = (-fit.amplitude).argsort(-1, stable=True)
+    size = np.where(fit.amplitude > 0, fit.amplitude, 1.0)
     for name in ("row_time", "frame_rows", "exposure_rows"):
-        lower, higher = (_scaled(timing, name, 1 + sign * _STEP) for sign in (-1, 1))
-        change = (predicted(higher) - predicted(lower)) / (2 * _STEP)
-        moved = torch.stack([-inverses[axis] @ change[..., axis].flatten(1)[..., None] for axis in range(axes)], 1)
-        tones = moved[:, :, : 3 * size.shape[-1], 0].unflatten(-1, (-1, 3))  # (B, 2, K, 3)
-        along = fit.coefficients.conj() * torch.complex(tones[..., 0], tones[..., 1])
-        amplitude = torch.where(fit.active, along.real / size.square(), 0.0)
-        frequency = torch.where(fit.active, tones[..., 2] / fit.frequencies.clamp(min=1e-300), 0.0)
-        values[f"amplitude_by_{name}"] = amplitude.take_along_dim(largest_first, -1)
-        values[f"frequency_by_{name}"] = frequency.take_along_dim(largest_first, -1)
+        lower, higher = (model_displacements(record(_scaled(timing, name, 1 + sign * _STEP)), fit) for sign in (-1, 1))
+        change = (higher - lower) / (2 * _STEP)
+        moved = [-inverses[axis] @ change[..., axis].reshape(batch, -1, 1) for axis in range(axes)]
+        by_tones = split_axis(np.stack(moved, 1)[:, :, : 3 * tones, 0], -1, tones, 3)
+        along = fit.coefficients.conj() * (by_tones[..., 0] + 1j * by_tones[..., 1])
+        amplitude = np.where(fit.active, along.real / np.square(size), 0.0)
+        frequency = np.where(fit.active, by_tones[..., 2] / np.maximum(fit.frequencies, 1e-300), 0.0)
+        for of, change in (("amplitude", amplitude), ("frequency", frequency)):
+            values[f"{of}_by_{name}"] = torch.from_numpy(np.take_along_axis(change, largest_first, -1))
     return TimingSensitivity(**values)
 
 

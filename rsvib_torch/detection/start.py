@@ -5,10 +5,12 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.tables import Array, split_axis, table, tables
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
@@ -80,11 +82,10 @@ class BandStart:
     measurements: Measurements
     fit: ToneFit | None = None
 
-    def predicted(self, fit: ToneFit) -> Tensor:
+    def predicted(self, fit: ToneFit) -> Array:
         """Offsets (B, P, N, A) in px of the row bands that a fit predicts."""
         displacements = model_displacements(self.measurements, fit)
-        offsets: Tensor = (displacements[:, :, 1] - displacements[:, :, 0]).unflatten(1, self.curve.quality.shape[1:])
-        return offsets
+        return split_axis(displacements[:, :, 1] - displacements[:, :, 0], 1, *self.curve.quality.shape[1:])
 
 
 def band_start(
@@ -145,15 +146,16 @@ def field_start(
     rows = (each.rows - 0.5 * (scale.height - 1)).repeat(len(each.pairs))
     factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
     of_parts = measurements_of_curve(each, timing, options.band_step)
-    measurements = combined_strips(of_parts, factors.expand(len(frames), *factors.shape))
+    measurements = combined_strips(of_parts, np.repeat(table(factors)[None], len(frames), 0))
     shape = each.quality.shape[1:]
-    good = (measurements.weights > 0).all(-1)
+    good = np.all(measurements.weights > 0, -1)
     offsets = measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0]
+    offsets = np.where(good[..., None], offsets, np.nan)
     quality = each.quality.unflatten(0, (-1, count)).amin(1)
     curve = replace(
         each,
-        offsets=torch.where(good[..., None], offsets, torch.nan).unflatten(1, shape),
-        quality=torch.where(good.unflatten(1, shape), quality, 0.0),
+        offsets=torch.from_numpy(split_axis(offsets, 1, *shape)).to(frames.device),
+        quality=quality * torch.from_numpy(split_axis(good, 1, *shape)).to(frames.device),
     )
     return BandStart(curve, measurements, None if translation is None else with_axes(translation, scale.axes))
 
@@ -164,20 +166,20 @@ def measurements_of_curve(curve: OffsetCurve, timing: RowTiming, band_step: int)
     A correlation q of two noisy bands means a ratio of noise to signal of (1 - q) / q. Weights are its inverse, bounded
     so that no band dominates.
     """
-    offsets = curve.offsets.flatten(1, 2)
-    good = torch.isfinite(offsets).all(-1)
-    noise = 1.0 - curve.quality.flatten(1, 2).clamp(max=1.0)
-    weight = torch.where(good, 1.0 / (noise + 0.05), 0.0)
-    typical = weight.sum(1, keepdim=True) / good.sum(1, keepdim=True).clamp(min=1)
-    weight = weight / typical.clamp(min=1e-300)
-    offsets = torch.where(good[..., None], offsets, 0.0)
-    # content that moves by y along the scan axis is exposed y row times later in the later frame
-    later = curve.later_times.flatten() + offsets[..., 1] * timing.row_time
+    # 1. The offsets and the weights of the bands of all frame pairs.
+    offsets, quality, times, later_times = tables(curve.offsets, curve.quality, curve.times, curve.later_times)
+    offsets = offsets.reshape(len(offsets), -1, offsets.shape[-1])
+    good = np.all(np.isfinite(offsets), -1)
+    noise = 1.0 - np.minimum(quality.reshape(good.shape), 1.0)
+    weight = np.where(good, 1.0 / (noise + 0.05), 0.0)
+    weight = weight / np.maximum(weight.sum(1, keepdims=True) / np.maximum(good.sum(1, keepdims=True), 1), 1e-300)
+    offsets = np.where(good[..., None], offsets, 0.0)
+    # 2. Their times: content that moves by y along the scan axis is exposed y row times later in the later frame.
     return Measurements.of_pairs(
-        starts=curve.times.flatten().expand(len(offsets), -1),
-        later_starts=later,
+        starts=np.broadcast_to(times.ravel(), good.shape),
+        later_starts=later_times.ravel() + offsets[..., 1] * timing.row_time,
         offsets=offsets,
-        information=torch.diag_embed(weight[..., None].expand(-1, -1, 2)),
+        information=weight[..., None, None] * np.eye(2),
         exposure_time=timing.exposure_time,
         average_times=(curve.heights[0] * timing.row_time, curve.heights[1] * timing.row_time),
         independent=min(1.0, band_step / max(curve.heights)),

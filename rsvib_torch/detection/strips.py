@@ -14,9 +14,11 @@ multiplied by a length, the rms distance of the pixels from the centre, so that 
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.tables import Array, split_axis
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_factors
@@ -105,7 +107,7 @@ def camera_in_row_order(
     return Vibration.still(axes=2).with_camera(camera).to_row_order(timing).camera
 
 
-def combined_strips(measured: Measurements, factors: Tensor) -> Measurements:
+def combined_strips(measured: Measurements, factors: Array) -> Measurements:
     """Components of the motion of every row from the displacements of strips.
 
     Args:
@@ -117,30 +119,31 @@ def combined_strips(measured: Measurements, factors: Tensor) -> Measurements:
     """
     strips = factors.shape[1]
 
-    def of_strips(values: Tensor) -> Tensor:
-        each: Tensor = values.unflatten(0, (-1, strips))
-        return each
+    def of_strips(values: Array) -> Array:
+        return split_axis(values, 0, -1, strips)
 
-    visible = of_strips(measured.visible).amin(1)
-    everywhere = replace(measured, visible=visible.repeat_interleave(strips, 0))
+    # 1. Displacements relative to the frames in which all strips of a row are visible.
+    visible = of_strips(measured.visible).min(1)
+    everywhere = replace(measured, visible=np.repeat(visible, strips, 0))
     displacements = of_strips(everywhere.relative(measured.displacements))  # (B, S, N, G, 2)
-    W = of_strips(measured.information)  # (B, S, N, 2, 2)
-    weighted = W @ factors
+    # 2. The normal equations of the components of every row, in units of their sizes.
+    weighted = of_strips(measured.information) @ factors
     information = (factors.mT @ weighted).sum(1)  # (B, N, A, A)
-    right = torch.einsum("bsnia,bsngi->bnga", weighted, displacements)
-    size = information.diagonal(dim1=-2, dim2=-1)
-    unit = size.clamp(min=1e-300).rsqrt()
+    right = np.einsum("bsnia,bsngi->bnga", weighted, displacements)
+    size = information.diagonal(axis1=-2, axis2=-1)
+    unit = 1 / np.sqrt(np.maximum(size, 1e-300))
     normal = information * unit[..., :, None] * unit[..., None, :]
-    values, vectors = torch.linalg.eigh(torch.where((size > 0).all(-1)[..., None, None], normal, 0.0))
-    regular = values[..., 0] > 1e-6  # fewer than two strips with detail do not determine roll
-    solvable = torch.where(regular[..., None], values, 1.0)
-    solved = torch.einsum("bnij,bnj,bnkj,bngk->bngi", vectors, 1 / solvable, vectors, right * unit[:, :, None])
-    components = torch.where(regular[:, :, None, None], solved * unit[:, :, None], 0.0)
+    # 3. Their solution; fewer than two strips with detail do not determine roll.
+    values, vectors = np.linalg.eigh(np.where((size > 0).all(-1)[..., None, None], normal, 0.0))
+    regular = values[..., 0] > 1e-6
+    solvable = np.where(regular[..., None], values, 1.0)
+    inverse = (vectors / solvable[..., None, :]) @ vectors.mT  # (B, N, A, A)
+    components = np.where(regular[:, :, None, None], ((right * unit[:, :, None]) @ inverse) * unit[:, :, None], 0.0)
     return Measurements(
         of_strips(measured.exposure_starts).mean(1),
         components,
         visible,
-        torch.where(regular[..., None, None], information, 0.0),
+        np.where(regular[..., None, None], information, 0.0),
         measured.exposure_time,
         measured.average_times,
         measured.independent,

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
@@ -51,9 +51,9 @@ class BandOffsets:
         visible: (B, M) bool, bands that both frames contain.
     """
 
-    offsets: Tensor
-    fitted: Tensor
-    visible: Tensor
+    offsets: Array
+    fitted: Array
+    visible: Array
 
 
 def judged(
@@ -61,9 +61,9 @@ def judged(
     std: VibrationStd,
     measured: OtherMotion | BandOffsets,
     *,
-    intervals: Tensor,
-    displacement: Tensor,
-    known_std: Tensor,
+    intervals: Array,
+    displacement: Array,
+    known_std: Array,
     timing: RowTiming,
     max_tones: float = math.inf,
     radius: float = 0.0,
@@ -82,27 +82,30 @@ def judged(
         max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
         radius: Distance from the centre, in px, at which roll and zoom are displacements in px.
     """
-    # 1. The compared quantities of all stacks and axes, on the device.
+    # 1. The compared quantities of all stacks and axes.
+    frequency = table(vibration.frequency)
     quantities = {
-        "amplitude": vibration.amplitude,
-        "amplitude_std": std.amplitude,
-        "frequency": vibration.frequency,
-        "frequency_std": std.frequency,
-        "gain": offset_gain(vibration.frequency, intervals),
+        "amplitude": table(vibration.amplitude),
+        "amplitude_std": table(std.amplitude),
+        "frequency": frequency,
+        "frequency_std": table(std.frequency),
+        "gain": offset_gain(frequency, intervals),
         "displacement": displacement,
         "known_std": known_std,
-        "std": known_std if std.displacement is None else std.displacement,
+        "std": known_std if std.displacement is None else table(std.displacement),
     }
     if isinstance(measured, OtherMotion):
         quantities |= {**vars(measured), "permitted": measured.permitted}
     else:
         # Condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed.
         tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
-        quantities |= {**_compared_bands(measured), "within_row_time": tones.displacement_within(timing.row_time)}
+        within = tones.displacement_within(timing.row_time)
+        quantities |= {**_compared_bands(measured), "within_row_time": table(within)}
 
-    # 2. One transfer to the CPU, and the comparisons with the limits.
+    # 2. The comparisons with the limits.
     findings = []
-    for stack in _numbers_of_stacks(quantities):
+    for numbers in zip(*(values.tolist() for values in quantities.values()), strict=True):
+        stack = dict(zip(quantities, numbers, strict=True))
         against = _reasons_against_stack(stack, timing, max_tones)
         # A displacement by roll or zoom depends on the distance from the centre.
         for axis, reasons in enumerate(against):
@@ -115,28 +118,20 @@ def judged(
     return tuple(findings)
 
 
-def _numbers_of_stacks(quantities: dict[str, Tensor]) -> list[dict[str, Any]]:
-    """For each stack, quantities (B, ...) as numbers and nested lists of numbers, by one transfer to the CPU."""
-    parts = [values.to(torch.float64).reshape(len(values), -1) for values in quantities.values()]
-    split = torch.cat(parts, 1).cpu().split([part.shape[1] for part in parts], 1)
-    numbers = [part.reshape(of.shape).tolist() for part, of in zip(split, quantities.values(), strict=True)]
-    return [dict(zip(quantities, stack, strict=True)) for stack in zip(*numbers, strict=True)]
-
-
-def _compared_bands(bands: BandOffsets) -> dict[str, Tensor]:
+def _compared_bands(bands: BandOffsets) -> dict[str, Array]:
     """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them."""
-    good = torch.isfinite(bands.offsets).all(-1) & bands.visible
-    number, good = good.sum(1, keepdim=True), good[..., None]
-    offsets = bands.offsets.where(good, torch.nan)
+    good = np.isfinite(bands.offsets).all(-1) & bands.visible
+    number = good.sum(1, keepdims=True)
+    offsets = np.where(good[..., None], bands.offsets, np.nan)
     # Clouds may cover the other quarter.
-    residuals = (offsets - bands.fitted).abs().nan_to_num(nan=math.inf).sort(dim=1).values
-    counted = (0.75 * number.to(residuals.dtype)).ceil()
-    best = torch.arange(residuals.shape[1], device=residuals.device)[:, None] < counted[:, None]
+    residuals = np.sort(without_nan(np.abs(offsets - bands.fitted), math.inf), 1)
+    counted = np.ceil(0.75 * number)
+    best = np.arange(residuals.shape[1])[:, None] < counted[:, None]
     return {
-        "measured": number[:, 0] / bands.visible.sum(1).clamp(min=1),
+        "measured": number[:, 0] / np.maximum(bands.visible.sum(1), 1),
         "bands": bands.visible.sum(1),
-        "residual": residuals.where(best, 0.0).sum(1) / counted,
-        "size": (offsets - offsets.nanmean(1, keepdim=True)).abs().nanmean(1),
+        "residual": np.where(best, residuals, 0.0).sum(1) / counted,
+        "size": valid_mean(np.abs(offsets - valid_mean(offsets, 1)[:, None]), 1),
     }
 
 
@@ -253,15 +248,14 @@ def contradicted_axes(findings: Findings) -> tuple[bool, bool]:
 # Roll and zoom
 
 
-def _max_apart(size: Any) -> Any:
+def _max_apart(size: Array | float) -> Array:
     """Largest permitted difference in px of the displacements along a row, for an axis with offsets of size px rms."""
-    return (0.009 * size).clamp(min=0.035) if isinstance(size, Tensor) else max(0.035, 0.009 * size)
+    return np.maximum(0.009 * size, 0.035)
 
 
-def halves_move_apart(other: OtherMotion) -> Tensor:
+def halves_move_apart(other: OtherMotion) -> Array:
     """(B,) whether the halves of the rows move apart, as roll and zoom cause it."""
-    apart: Tensor = (other.differential.flip(-1) > _max_apart(other.size)).any(-1)
-    return apart
+    return np.any(other.differential[..., ::-1] > _max_apart(other.size), -1)
 
 
 # Limits of roll and zoom as the cause. Of 15 recordings with either, 0.057 px of the differences along a row were not
@@ -270,7 +264,7 @@ def halves_move_apart(other: OtherMotion) -> Tensor:
 _MAX_UNEVEN, _MAX_MOVED = 3.0, 8.0  # of the permitted difference of the halves, of the difference of the halves
 
 
-def rotation_possible(other: OtherMotion, uneven: Tensor, aspect: float) -> Tensor:
+def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array:
     """(B,) whether roll or zoom may be all that the fit of a stack does not explain.
 
     Args:
@@ -278,11 +272,10 @@ def rotation_possible(other: OtherMotion, uneven: Tensor, aspect: float) -> Tens
         uneven: (B, 2) px, differences of the displacements along a row that are not linear in the column.
         aspect: Rows of a frame over its columns.
     """
-    apart = other.differential.flip(-1)
-    is_uneven = (uneven.flip(-1) > _MAX_UNEVEN * _max_apart(other.size)).any(-1)
-    moved = torch.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * apart)
-    possible: Tensor = halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
-    return possible
+    apart = other.differential[..., ::-1]
+    is_uneven = (uneven[..., ::-1] > _MAX_UNEVEN * _max_apart(other.size)).any(-1)
+    moved = np.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * apart)
+    return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
 
 
 def rotation_reasons(
@@ -300,7 +293,7 @@ def rotation_reasons(
         size: px, rms offset along the axis.
         remedy: Value of ``roll`` and ``zoom`` with which they are measured.
     """
-    apart, allowed = max(differential) if axes > 2 else differential[1 - axis], _max_apart(size)
+    apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
     if apart <= allowed:
         return []
     if axes > 2:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.tables import tensor
 from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.plots import plain_axes, save_figure
@@ -56,13 +57,15 @@ class Spectrogram:
             self._start = tracked.time
         elif tracked.time - self._start >= self._duration:
             self._finish(tracked.time)
-        middles = record.exposure_starts[0].cpu() + (0.5 * record.exposure_time + tracked.time - self._start)  # (N, 2)
-        offsets = (record.displacements[0, :, 1] - record.displacements[0, :, 0]).cpu()  # (N, 2)
+        middles = tensor(record.exposure_starts[0]) + (
+            0.5 * record.exposure_time + tracked.time - self._start
+        )  # (N, 2)
+        offsets = tensor(record.displacements[0, :, 1] - record.displacements[0, :, 0])  # (N, 2)
         # Hann window: less leakage of strong tones into other frequencies
         window = (
             math.sin(math.pi * (tracked.time - self._start + 0.5 * self._timing.frame_period) / self._duration) ** 2
         )
-        weights = window * record.weights[0].cpu() * (record.num_differences[0].cpu() > 0)[:, None]
+        weights = window * tensor(record.weights[0] * (record.num_differences[0] > 0)[:, None])
         # the mean is image motion
         mean = (weights * offsets).sum(0) / weights.sum(0).clamp(min=1e-300)
         angle = 2 * math.pi * self.frequencies[:, None] * middles[:, 0]

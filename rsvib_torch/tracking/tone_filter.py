@@ -14,9 +14,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Self
 
-import torch
-from torch import Tensor
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import softmax
 
+from rsvib_torch.core.tables import Array, median, split_axis, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 
@@ -42,14 +44,14 @@ class ToneFilter:
     """
 
     time: float
-    values: Tensor
-    covariance: Tensor
-    probability: Tensor
+    values: Array
+    covariance: Array
+    probability: Array
     exposure_time: float
 
     @classmethod
     def started(
-        cls, time: float, coefficients: Tensor, frequencies: Tensor, drift: Tensor, std: Tensor, exposure_time: float
+        cls, time: float, coefficients: Array, frequencies: Array, drift: Array, std: Array, exposure_time: float
     ) -> Self:
         """Filter from tones at a time.
 
@@ -62,25 +64,25 @@ class ToneFilter:
             exposure_time: T_e in s.
         """
         models = len(PROCESS_NOISE)
-        probability = torch.full((len(std), models), (1 - _STAY) / (models - 1), dtype=std.dtype, device=std.device)
+        probability = np.full((len(std), models), (1 - _STAY) / (models - 1))
         probability[:, 0] = _STAY
-        rates = torch.complex(torch.zeros_like(frequencies), 2 * math.pi * frequencies)
-        values = _packed(coefficients, rates, drift)[:, None].repeat(1, models, 1)
-        covariance = torch.diag_embed(std.square())[:, None].repeat(1, models, 1, 1)
+        rates = np.zeros_like(frequencies) + 1j * 2 * math.pi * frequencies
+        values = np.repeat(_packed(coefficients, rates, drift)[:, None], models, 1)
+        covariance = np.repeat((np.square(std)[..., None] * np.eye(std.shape[-1]))[:, None], models, 1)
         return cls(time, values, covariance, probability, exposure_time)
 
     @property
-    def coefficients(self) -> Tensor:
+    def coefficients(self) -> Array:
         """(A, M, K) complex128 C in px at the reference time."""
-        return torch.complex(self.values[..., :-2:4], self.values[..., 1:-2:4])
+        return self.values[..., :-2:4] + 1j * self.values[..., 1:-2:4]
 
     @property
-    def rates(self) -> Tensor:
+    def rates(self) -> Array:
         """(A, M, K) complex128 ``g + 2 pi i f`` in 1/s."""
-        return torch.complex(self.values[..., 2:-2:4], self.values[..., 3:-2:4])
+        return self.values[..., 2:-2:4] + 1j * self.values[..., 3:-2:4]
 
     @property
-    def drift(self) -> Tensor:
+    def drift(self) -> Array:
         """(A, M, 2) float64 v and a."""
         return self.values[..., -2:]
 
@@ -94,54 +96,55 @@ class ToneFilter:
             mixed: Whether the process noise may change in between.
         """
         before, step = self._mixed() if mixed else self, time - self.time
-        factor = (before.rates * step).exp()
+        factor = np.exp(before.rates * step)
         moved = before.coefficients * factor
-        eye = torch.eye(self.values.shape[-1], dtype=torch.float64, device=moved.device)
-        transition = eye.expand_as(before.covariance).clone()
-        noise = torch.zeros_like(transition)
-        walk, jerk = eye.new_tensor(PROCESS_NOISE).square()[..., None, None].unbind(1)  # (M, 1, 1)
+        eye = np.eye(self.values.shape[-1])
+        transition = np.broadcast_to(eye, before.covariance.shape).copy()
+        noise = np.zeros_like(transition)
+        walk, jerk = np.moveaxis(np.square(np.array(PROCESS_NOISE))[..., None, None], 1, 0)  # (M, 1, 1)
         # Tones: C turns and grows by g and 2 pi f, whose random walk is integrated once.
         for tone in range(moved.shape[-1]):
             size, rate = slice(4 * tone, 4 * tone + 2), slice(4 * tone + 2, 4 * tone + 4)
             by_rate = _as_matrix(moved[..., tone])  # derivative of C by the rate, per second
             transition[..., size, size] = _as_matrix(factor[..., tone])
             transition[..., size, rate] = step * by_rate
-            exists = (moved[..., tone].abs() > 0)[..., None, None] * walk
+            exists = (np.abs(moved[..., tone]) > 0)[..., None, None] * walk
             noise[..., size, size] = exists * (step**3 / 3) * (by_rate @ by_rate.mT)
             noise[..., size, rate] = exists * (step**2 / 2) * by_rate
             noise[..., rate, size] = noise[..., size, rate].mT
             noise[..., rate, rate] = exists * step * eye[:2, :2]
         # Image motion: v grows by a, whose random walk is integrated once.
         transition[..., -2, -1] = step
-        noise[..., -2:, -2:] = jerk * eye.new_tensor([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
-        velocity, acceleration = before.drift.unbind(-1)
-        drift = torch.stack([velocity + step * acceleration, acceleration], -1)
+        noise[..., -2:, -2:] = jerk * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+        velocity, acceleration = np.moveaxis(before.drift, -1, 0)
+        drift = np.stack([velocity + step * acceleration, acceleration], -1)
         covariance = transition @ before.covariance @ transition.mT + noise
         return replace(before, time=time, values=_packed(moved, before.rates, drift), covariance=covariance)
 
     def _mixed(self) -> Self:
         """Every filter starts from the mean of all, weighted by how probable a change to its process noise is."""
         models = self.probability.shape[-1]
-        change = torch.full((models, models), (1 - _STAY) / (models - 1), dtype=torch.float64, device="cpu")
-        change = change.fill_diagonal_(_STAY).to(self.probability)
+        change = np.full((models, models), (1 - _STAY) / (models - 1))
+        np.fill_diagonal(change, _STAY)
         joint = self.probability[..., None] * change  # (A, from, to)
         probability = joint.sum(1)
         values, covariance = self._moments(joint / probability[:, None])
         return replace(self, values=values, covariance=covariance, probability=probability)
 
-    def _moments(self, weight: Tensor) -> tuple[Tensor, Tensor]:
+    def _moments(self, weight: Array) -> tuple[Array, Array]:
         """Means (A, N, P) and covariances (A, N, P, P) of mixtures with weights (A, M, N) of the filters."""
         # as products of matrices: einsum takes five times as many operations
         share = weight.mT
         mean = share @ self.values
         apart = self.values[:, None] - mean[:, :, None]  # (A, N, M, P)
         spread = (apart * share[..., None]).mT @ apart
-        covariance = (share @ self.covariance.flatten(-2)).unflatten(-1, self.covariance.shape[-2:])
+        size = self.covariance.shape[-1]
+        covariance = split_axis(share @ self.covariance.reshape(*self.covariance.shape[:2], -1), -1, size, size)
         return mean, covariance + spread
 
     # Update
 
-    def updated(self, measurements: Measurements, origin: float, noise_factor: Tensor) -> Self:
+    def updated(self, measurements: Measurements, origin: float, noise_factor: Array) -> Self:
         """The filter after the offsets between two frames, measured around the prediction.
 
         Args:
@@ -157,88 +160,91 @@ class ToneFilter:
         normal, right = weighted.mT @ jacobian, (weighted.mT @ residual[..., None])[..., 0]
         # 2. Posterior (P^-1 + N)^-1 = (I + P N)^-1 P of the covariance P and the normal matrix N, in units of the
         # standard deviations: their sizes differ by many orders of magnitude, and fixed parameters have none.
-        scale = self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
-        inverse_scale = torch.where(scale > 0, 1 / scale.clamp(min=1e-300), 0.0)
+        scale = np.sqrt(np.maximum(self.covariance.diagonal(axis1=-2, axis2=-1), 0.0))
+        inverse_scale = np.where(scale > 0, 1 / np.maximum(scale, 1e-300), 0.0)
         correlation = self.covariance * inverse_scale[..., None] * inverse_scale[..., None, :]
-        eye = torch.eye(scale.shape[-1], dtype=torch.float64, device=scale.device)
+        eye = np.eye(scale.shape[-1])
         system = eye + correlation @ (normal * scale[..., None] * scale[..., None, :])
-        posterior = torch.linalg.solve(system, correlation)
+        posterior = np.linalg.solve(system, correlation)
         posterior = 0.5 * (posterior + posterior.mT) * scale[..., None] * scale[..., None, :]
         step = (posterior @ right[..., None])[..., 0]
         values = self.values + step
-        values[..., 3:-2:4] = values[..., 3:-2:4].abs()  # frequencies stay positive
+        values[..., 3:-2:4] = np.abs(values[..., 3:-2:4])  # frequencies stay positive
         # 3. Probabilities of the process noise, from how well each filter predicted the offsets.
-        fit = (weights[:, None] * residual.square()).sum(-1) - (step * right).sum(-1)
-        score = self.probability.log() - 0.5 * (fit + torch.linalg.slogdet(system).logabsdet)
-        probability = score.softmax(-1).clamp(min=1e-6)  # a filter that failed must be able to return
-        probability = probability / probability.sum(-1, keepdim=True)
+        fit = (weights[:, None] * np.square(residual)).sum(-1) - (step * right).sum(-1)
+        score = np.log(self.probability) - 0.5 * (fit + np.linalg.slogdet(system)[1])
+        probability = np.maximum(softmax(score, -1), 1e-6)  # a filter that failed must be able to return
+        probability = probability / probability.sum(-1, keepdims=True)
         return replace(self, values=values, covariance=posterior, probability=probability)
 
-    def explained(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+    def explained(self, measurements: Measurements, origin: float) -> tuple[Array, Array]:
         """Displacements (1, N, 2, A) in px of rows in two frames relative to their mean, by the tones and by the drift.
 
         They are the means of all filters.
         """
         middles, _ = self._offsets(measurements, origin)
-        parts = torch.stack(self._expected(self._waves(middles), middles))  # (2, A, M, N)
+        parts = np.stack(self._expected(self._waves(middles), middles))  # (2, A, M, N)
         mean = (self.probability[..., None, :] @ parts)[..., 0, :].mT  # (2, N, A)
-        tones, drift = measurements.relative(torch.stack([-0.5 * mean, 0.5 * mean], 2)).split(1)
-        return tones, drift
+        relative = measurements.relative(np.stack([-0.5 * mean, 0.5 * mean], 2))
+        return relative[:1], relative[1:]
 
-    def _linearised(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+    def _linearised(self, measurements: Measurements, origin: float) -> tuple[Array, Array]:
         """Derivatives (A, M, N, P) of the offsets between two frames, and their residuals (A, M, N) in px."""
         middles, offsets = self._offsets(measurements, origin)
         wave = self._waves(middles)
         by_rate = _between(self.coefficients[..., None, None] * wave * middles)
         amplitude = _between(wave)
-        parts = torch.stack([amplitude.real, -amplitude.imag, by_rate.real, -by_rate.imag], 3)  # (A, M, K, 4, N)
-        parts = parts * (self.coefficients.abs() > 0)[..., None, None]
-        drift = _powers(middles).expand(*parts.shape[:2], -1, -1)
-        return torch.cat([parts.flatten(2, 3), drift], 2).mT, offsets[:, None] - sum(self._expected(wave, middles))
+        parts = np.stack([amplitude.real, -amplitude.imag, by_rate.real, -by_rate.imag], 3)  # (A, M, K, 4, N)
+        parts = parts * (np.abs(self.coefficients) > 0)[..., None, None]
+        powers = _powers(middles)
+        drift = np.broadcast_to(powers, (*parts.shape[:2], *powers.shape))
+        return np.concatenate([parts.reshape(*parts.shape[:2], -1, parts.shape[-1]), drift], 2).mT, offsets[
+            :, None
+        ] - sum(self._expected(wave, middles))
 
-    def _offsets(self, measurements: Measurements, origin: float) -> tuple[Tensor, Tensor]:
+    def _offsets(self, measurements: Measurements, origin: float) -> tuple[Array, Array]:
         """Mid-exposures (N, 2) from the reference time in s, and the measured offsets (A, N) in px."""
         middles = measurements.exposure_starts[0] + (0.5 * self.exposure_time + origin - self.time)
-        return middles, _between(measurements.displacements[0].permute(2, 0, 1))
+        return middles, _between(np.moveaxis(measurements.displacements[0], -1, 0))
 
-    def _waves(self, middles: Tensor) -> Tensor:
+    def _waves(self, middles: Array) -> Array:
         """(A, M, K, N, 2) displacements by unit tones at times (N, 2)."""
-        attenuation = torch.sinc(self.rates.imag * (0.5 / math.pi * self.exposure_time))
-        return (self.rates[..., None, None] * middles).exp() * attenuation[..., None, None]
+        attenuation = np.sinc(self.rates.imag * (0.5 / math.pi * self.exposure_time))
+        return np.exp(self.rates[..., None, None] * middles) * attenuation[..., None, None]
 
-    def _expected(self, wave: Tensor, middles: Tensor) -> tuple[Tensor, Tensor]:
+    def _expected(self, wave: Array, middles: Array) -> tuple[Array, Array]:
         """(A, M, N) px each, offsets by the tones with ``_waves``, and by the drift."""
         tones = (self.coefficients[:, :, None] @ _between(wave))[:, :, 0].real
         return tones, self.drift @ _powers(middles)
 
-    def _robust(self, jacobian: Tensor, residual: Tensor, weights: Tensor) -> Tensor:
+    def _robust(self, jacobian: Array, residual: Array, weights: Array) -> Array:
         """Weights (A, N) in px^-2 by the residual of a fit without prior: outliers have weight 0.
 
         The variance of the rows is that of the residuals, as in ``fit_tones``.
         """
         best = self.probability.argmax(-1)[:, None]
-        jacobian = jacobian.take_along_dim(best[..., None, None], 1)[:, 0]
-        residual = residual.take_along_dim(best[..., None], 1)[:, 0]
-        columns = jacobian / jacobian.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
-        eye = torch.eye(columns.shape[-1], dtype=columns.dtype, device=columns.device)
+        jacobian = np.take_along_axis(jacobian, best[..., None, None], 1)[:, 0]
+        residual = np.take_along_axis(residual, best[..., None], 1)[:, 0]
+        columns = jacobian / np.maximum(np.sqrt(np.square(jacobian).mean(1, keepdims=True)), 1e-300)
+        eye = np.eye(columns.shape[-1])
         ridge = (1e-9 * weights.sum(-1)[:, None, None] + 1e-300) * eye
         robust = weights
         for _ in range(2):
             weighted = columns * robust[..., None]
-            solution = torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ residual[..., None])
-            apart = (residual - (columns @ solution)[..., 0]) * weights.sqrt()
-            measured = torch.where(weights > 0, apart.abs(), torch.nan)
-            spread = 1.4826 * measured.nanmedian(-1, keepdim=True).values.nan_to_num(1.0).clamp(min=1e-9)
-            share = (1 - (apart / (6 * spread)).square()).clamp(min=0.0).square()
+            solution = np.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ residual[..., None])
+            apart = (residual - (columns @ solution)[..., 0]) * np.sqrt(weights)
+            measured = np.where(weights > 0, np.abs(apart), np.nan)
+            spread = 1.4826 * np.maximum(without_nan(median(measured, -1, keepdims=True), 1.0), 1e-9)
+            share = np.square(np.maximum(1 - np.square(apart / (6 * spread)), 0.0))
             robust = weights * share
-        freedom = (share * (weights > 0)).sum(-1, keepdim=True) - columns.shape[-1]
-        variance = (share * apart.square()).sum(-1, keepdim=True) / freedom.clamp(min=1.0)
-        scaled: Tensor = robust / variance.clamp(min=1e-12)
+        freedom = (share * (weights > 0)).sum(-1, keepdims=True) - columns.shape[-1]
+        variance = (share * np.square(apart)).sum(-1, keepdims=True) / np.maximum(freedom, 1.0)
+        scaled: Array = robust / np.maximum(variance, 1e-12)
         return scaled
 
     # Results
 
-    def path(self, step: float) -> Tensor:
+    def path(self, step: float) -> Array:
         """(A,) px, displacement by v and a from the reference time to ``step`` s later."""
         drift = (self.probability[..., None] * self.drift).sum(1)
         return step * drift[:, 0] + 0.5 * step**2 * drift[:, 1]
@@ -246,55 +252,54 @@ class ToneFilter:
     def path_std(self, step: float) -> float:
         """px, standard deviation of ``path`` by the most probable filter; of the worse axis."""
         best = self.probability.argmax(-1)
-        covariance = self.covariance[..., -2:, -2:].take_along_dim(best[:, None, None, None], 1)[:, 0]
-        jerk = covariance.new_tensor(PROCESS_NOISE)[best, 1]
-        powers = covariance.new_tensor([step, 0.5 * step**2])
-        variance = (covariance @ powers) @ powers + jerk.square() * (abs(step) ** 5 / 20)
-        return float(variance.clamp(min=0.0).amax().sqrt())
+        covariance = np.take_along_axis(self.covariance[..., -2:, -2:], best[:, None, None, None], 1)[:, 0]
+        jerk = np.array(PROCESS_NOISE)[best, 1]
+        powers = np.array([step, 0.5 * step**2])
+        variance = (covariance @ powers) @ powers + np.square(jerk) * (abs(step) ** 5 / 20)
+        return float(np.sqrt(np.maximum(variance, 0.0).max()))
 
     def displacement_std(self) -> float:
         """px, standard deviation of the tones at the reference time, by the most probable filter; of the worse axis."""
         best = self.probability.argmax(-1)[:, None, None]
-        variance = self.covariance.diagonal(dim1=-2, dim2=-1).take_along_dim(best, 1)[:, 0, :-2]
+        variance = np.take_along_axis(self.covariance.diagonal(axis1=-2, axis2=-1), best, 1)[:, 0, :-2]
         real, imaginary = variance[:, ::4], variance[:, 1::4]
-        return float((0.5 * (real + imaginary)).sum(-1).clamp(min=0.0).amax().sqrt())
+        return float(np.sqrt(np.maximum((0.5 * (real + imaginary)).sum(-1), 0.0).max()))
 
     def as_fit(self, origin: float) -> ToneFit:
         """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""
         values, covariance = (part[:, 0] for part in self._moments(self.probability[..., None]))
-        unit, keep = torch.ones_like(values[0]), torch.ones_like(values[0], dtype=torch.bool)
+        unit, keep = np.ones_like(values[0]), np.ones_like(values[0], dtype=bool)
         unit[3:-2:4], keep[2:-2:4] = 0.5 / math.pi, False
         covariance = (covariance * unit[:, None] * unit)[:, keep][:, :, keep]
-        coefficients = torch.complex(values[:, :-2:4], values[:, 1:-2:4])
+        coefficients = values[:, :-2:4] + 1j * values[:, 1:-2:4]
         return ToneFit(
             coefficients[None],
             values[None, :, 3:-2:4] / (2 * math.pi),
-            (coefficients.abs() > 0)[None],
+            (np.abs(coefficients) > 0)[None],
             values[None, :, -2:],
-            torch.block_diag(*covariance)[None],
-            values.new_tensor([self.time - origin]),
+            block_diag(*covariance)[None],
+            np.array([self.time - origin]),
             MotionModel(1, 2),
         )
 
 
-def _packed(coefficients: Tensor, rates: Tensor, drift: Tensor) -> Tensor:
+def _packed(coefficients: Array, rates: Array, drift: Array) -> Array:
     """(..., P) parameters of coefficients and rates (..., K) and drift (..., 2)."""
-    tones = torch.stack([coefficients.real, coefficients.imag, rates.real, rates.imag], -1)
-    return torch.cat([tones.flatten(-2), drift], -1)
+    tones = np.stack([coefficients.real, coefficients.imag, rates.real, rates.imag], -1)
+    return np.concatenate([tones.reshape(*drift.shape[:-1], -1), drift], -1)
 
 
-def _between(values: Tensor) -> Tensor:
+def _between(values: Array) -> Array:
     """Differences (...) between the two frames of values (..., 2)."""
     return values[..., 1] - values[..., 0]
 
 
-def _powers(middles: Tensor) -> Tensor:
+def _powers(middles: Array) -> Array:
     """(2, N), offsets by unit v and a between times (N, 2)."""
-    return _between(torch.stack([middles, 0.5 * middles.square()]))
+    return _between(np.stack([middles, 0.5 * np.square(middles)]))
 
 
-def _as_matrix(numbers: Tensor) -> Tensor:
+def _as_matrix(numbers: Array) -> Array:
     """Complex numbers (...) as matrices (..., 2, 2) that multiply [Re, Im]."""
     real, imaginary = numbers.real, numbers.imag
-    matrices: Tensor = torch.stack([real, -imaginary, imaginary, real], -1).unflatten(-1, (2, 2))
-    return matrices
+    return split_axis(np.stack([real, -imaginary, imaginary, real], -1), -1, 2, 2)

@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.tables import table, tensor
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.assemble import assembled, offset_curve
 from rsvib_torch.detection.measurements import Measurements
@@ -123,13 +125,13 @@ class TrackedFrame:
         height, width = self.frame.images.shape[-2:]
         # Standard deviations, also of the displacement of the rows of this frame.
         _, std = vibration_of_fit(fit)
-        starts = timing.row_starts(1, height, fit.centre.device)[0, ::8]
-        std = replace(std, displacement=displacement_std(fit, starts, timing.exposure_time))
+        starts = table(timing.row_starts(1, height)[0, ::8])
+        std = replace(std, displacement=tensor(displacement_std(fit, starts, timing.exposure_time)))
         # The offset curve with the weights that a fit to these rows would have.
         robust = measurements.reweighted(residual_of(measurements, fit))
-        weights = robust.weights / measurements.weights.clamp(min=1e-300)
-        curve, fitted = offset_curve(robust, fit, weights, [2])
-        interval, scale = float(measurements.exposure_starts.diff(dim=-1).mean()), FieldScale(2, width, height)
+        weights = robust.weights / np.maximum(measurements.weights, 1e-300)
+        curve, fitted = offset_curve(robust, fit, weights, [2], self.frame.images.device)
+        interval, scale = float(np.diff(measurements.exposure_starts).mean()), FieldScale(2, width, height)
         user_timing, findings = self.frame.image_timing, (self.tones.findings,)
         results = assembled(
             fit, std, curve, fitted, findings, user_timing, scale=scale, num_frames=self.window, interval=interval

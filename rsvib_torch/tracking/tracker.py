@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,9 +25,16 @@ from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.tables import Array, table, tables, tensor
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.rows.displacements import FrameGroup, differential_motion, measure_group, stack_spectra
+from rsvib_torch.detection.rows.displacements import (
+    FrameGroup,
+    differential_motion,
+    joined_groups,
+    measure_group,
+    stack_spectra,
+)
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
@@ -35,6 +43,7 @@ from rsvib_torch.detection.tones.fit import (
     displacement_std,
     motion_of_fit,
     offset_gain,
+    tone_displacements,
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
@@ -110,8 +119,8 @@ class _Scene:
     """The scene that rows are compared with."""
 
     gradients: RowGradients  # of its rows
-    differential: Tensor  # (1, 2) px, their ``differential_motion``
-    path: Tensor  # (2,) px, place on the path where they were computed
+    differential: Array  # (1, 2) px, their ``differential_motion``
+    path: Array  # (2,) px, place on the path where they were computed
     age: int = 0  # number of frames that they have been used for
 
 
@@ -125,7 +134,7 @@ class _Track:
     columns: slice  # that are measured
     scene: _Scene | None = None  # None before a frame has been measured, as are the tones
     tones: TrackedTones | None = None  # at the last frame
-    trusted: tuple[Tensor, ...] = ()  # (2,) bool for each of the last frames: axes whose tones were reliable
+    trusted: tuple[Array, ...] = ()  # (2,) bool for each of the last frames: axes whose tones were reliable
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,9 +144,7 @@ class _State:
     time: float = -math.inf  # s, exposure start of the last frame
     frames: tuple[_GreyFrame, ...] = ()  # the last ones that could be used, at most a window
     track: _Track | None = None  # the motion that is followed; None if it is not known
-    path: Tensor = field(  # (2,) px, image motion from the first tracked frame to the reference time of the filter
-        default_factory=lambda: torch.zeros(2, dtype=torch.float64)
-    )
+    path: Array = field(default_factory=lambda: np.zeros(2))  # (2,) px, image motion to the time of the filter
     places: tuple[tuple[float, Tensor], ...] = ()  # times and paths of the frames that the steady image follows
     untried: int = 0  # frames since the last attempt to detect the vibration
     attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
@@ -301,25 +308,25 @@ class VibrationTracker:
 
         # 2. The gradients of the scene are used again unless they are old or the scene has moved.
         scene = track.scene
-        if scene is not None and (scene.age > _MAX_AGE or float((path - scene.path).abs().amax()) > _MAX_PATH):
+        if scene is not None and (scene.age > _MAX_AGE or np.abs(path - scene.path).max() > _MAX_PATH):
             scene = None
 
         # 3. Measure the rows around the prediction and correct it; again if the correction is large. Neighbouring pairs
         # share a frame: after many pairs, the variance of a tone is gain^2 / 2 times that of independent offsets.
         spectra = frame.spectra(track.columns)
-        starts = torch.tensor([track.start, frame.time], dtype=torch.float64, device=path.device) - centre
-        group = FrameGroup(track.spectra.followed_by(spectra), starts[None])
-        gain = offset_gain(fit.frequencies, (starts[1] - starts[0])[None])[0] * fit.active[0]
-        noise_factor = (0.5 * gain.amax(-1).square()).clamp(min=1.0)
+        starts, device = np.array([track.start, frame.time]) - centre, frame.images.device
+        group = FrameGroup(track.spectra.followed_by(spectra), tensor(starts)[None].to(device))
+        gain = offset_gain(fit.frequencies, np.diff(starts))[0] * fit.active[0]
+        noise_factor = np.maximum(0.5 * np.square(gain.max(-1)), 1.0)
         for _ in range(_MAX_ROUNDS):
             anchor, known = (path, None) if scene is None else (scene.path, scene.gradients)
-            motion = replace(motion_of_fit(fit), image_shift=(path - anchor)[None])
-            measurements, gradients = measure_group(group, self._rows, motion, known)
+            motion = replace(motion_of_fit(fit), image_shift=tensor(path - anchor)[None])
+            measured, gradients = measure_group(group, self._rows, motion.to(device), known)
+            measurements = joined_groups([measured], self._rows.exposure_time)
             corrected = prediction.updated(measurements, centre, noise_factor)
             by_tones, by_drift = corrected.explained(measurements, centre)
-            around = motion.mean_displacement(measurements.exposure_starts, self._rows.exposure_time)
-            change = by_tones + by_drift - measurements.relative(around)
-            largest = float(change.abs().amax())
+            around = motion.mean_displacement(tensor(measurements.exposure_starts), self._rows.exposure_time)
+            largest = float(np.abs(by_tones + by_drift - measurements.relative(table(around))).max())
             if not math.isfinite(largest):  # the rows were not measured
                 return replace(state, track=None)
             if largest < _MAX_CHANGE:
@@ -332,12 +339,12 @@ class VibrationTracker:
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
-        if not float(other.unexplained.amax()) < _MAX_UNEXPLAINED:
+        if not other.unexplained.max() < _MAX_UNEXPLAINED:
             return replace(state, track=None)
         fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
-        trusted = torch.tensor([not against for against in tones.findings], device=path.device)
+        trusted = np.array([not against for against in tones.findings])
         trusted_axes = (*track.trusted, trusted)[-self.window :]
         track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
         if any(contradicted_axes(tones.findings)):
@@ -351,15 +358,14 @@ class VibrationTracker:
         exposure_time = self._rows.exposure_time
         # Displacement of the rows of the frame by the tones, and its standard deviation.
         vibration, std = vibration_of_fit(fit)
-        starts = self._rows.row_starts(1, frame.images.shape[-2], fit.centre.device)[:, ::8]
-        moved = vibration.mean_displacement(starts, exposure_time) - vibration.drift(starts)
-        known_std = displacement_std(fit, starts[0], exposure_time)
+        starts = table(self._rows.row_starts(1, frame.images.shape[-2])[0, ::8])
+        known_std = displacement_std(fit, starts, exposure_time)
         (findings,) = judged(
             vibration,
-            replace(std, displacement=known_std),
+            replace(std, displacement=tensor(known_std)),
             other_motion,
-            intervals=measurements.exposure_starts.diff(dim=-1).mean((1, 2)),
-            displacement=moved.std(1, correction=0),
+            intervals=np.diff(measurements.exposure_starts).mean((1, 2)),
+            displacement=tone_displacements(fit, starts, exposure_time).std(1),
             known_std=known_std,
             timing=self._rows,
             max_tones=MAX_TONES,
@@ -458,7 +464,7 @@ class VibrationTracker:
             middle: s, the time origin of the detection.
             record: s, from the first to the last frame of it.
         """
-        vibration, std, curve = found.vibration[0], found.std[0], found.fitted.offsets[0]
+        vibration, std, curve = found.vibration[0], found.std[0], found.fitted.offsets[0].to("cpu")
         # 1. Image motion. A record does not distinguish a tone of less than one period from a drift, and its amplitude
         # is not known: it becomes a part of the drift. Without tones, the drift of the fit is wrong as well.
         tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * chosen
@@ -479,12 +485,14 @@ class VibrationTracker:
         parts = torch.stack([size_std, size_std, growth_std, 2 * math.pi * std.frequency], -1)
         tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
         all_std = torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1)
-        started = ToneFilter.started(middle, tones, vibration.frequency, drift, all_std, self._rows.exposure_time)
+        coefficients, frequency, start, start_std = tables(tones, vibration.frequency, drift, all_std)
+        exposure_time = self._rows.exposure_time
+        started = ToneFilter.started(middle, coefficients, frequency, start, start_std, exposure_time)
         # 3. The last frame is compared with the one before.
         before, last = state.frames[-2:]
         columns = slice(None) if self.columns is None else detailed_columns(last.images[0, 0], self.columns)
         track = _Track(started, before.spectra(columns), before.time, columns)
-        return self._measured(replace(state, track=track, path=state.path.to(drift.device)))
+        return self._measured(replace(state, track=track))
 
     # Results
 
@@ -500,14 +508,14 @@ class VibrationTracker:
                 measurements = tones.measurements
             # The time origin of the tones is the first row, that of the motion the middle of the frame.
             half = time_to_middle(prepared.images.shape[-2], self._rows)
-            motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half))[0]
+            motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half), device)[0]
             # An axis moves if its tones were reliable in one of the last frames.
-            trusted = torch.stack(track.trusted).any(0)
+            trusted = tensor(np.any(track.trusted, 0)).to(device)
             followed = ~trusted.new_tensor(contradicted_axes(tones.findings)) if self.wobble else trusted
             motion = replace(motion.scaled(followed), amplitude=motion.amplitude * trusted[:, None])
             motion = motion.from_row_order(self.timing)
-            path = state.path + track.filter.path(state.time + half - track.filter.time)
-            path = offsets_from_row_order(path, self.timing)
+            place = state.path + track.filter.path(state.time + half - track.filter.time)
+            path = offsets_from_row_order(tensor(place).to(device), self.timing)
             label = "searching" if state.contradictions >= _PATIENCE else "tracking"
         return TrackedFrame(
             time=state.time,

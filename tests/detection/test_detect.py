@@ -235,17 +235,16 @@ def synthetic_measurements(noise, seed, batch):
 
     offsets = mean(later) - mean(starts) + np.array(motion.image_motion) * interval
     offsets = offsets + noise * np.random.default_rng(seed).standard_normal((batch, *offsets.shape))
-    values = torch.from_numpy(offsets)
-    information = torch.eye(2, dtype=torch.float64).expand(*values.shape[:2], 2, 2)
-    times = [torch.from_numpy(t).expand(batch, -1) for t in (starts, later)]
+    information = np.broadcast_to(np.eye(2), (*offsets.shape[:2], 2, 2))
+    times = [np.repeat(t[None], batch, 0) for t in (starts, later)]
     average = (height * ROW_TIME, height * ROW_TIME)
-    return Measurements.of_pairs(*times, values, information, exposure, average), motion
+    return Measurements.of_pairs(*times, offsets, information, exposure, average), motion
 
 
 def fitted_vibration(measurements, start=(52.0, 28.5)):
     batch = len(measurements.exposure_starts)
-    frequencies = torch.tensor(start, dtype=torch.float64).expand(batch, 2)[..., None].clone()
-    fit = fit_tones(measurements, frequencies, torch.ones(batch, 2, 1, dtype=torch.bool))
+    frequencies = np.repeat(np.array(start)[None, :, None], batch, 0)
+    fit = fit_tones(measurements, frequencies, np.ones((batch, 2, 1), dtype=bool))
     return vibration_of_fit(fit)
 
 

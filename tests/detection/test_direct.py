@@ -17,7 +17,8 @@ from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
     amplitude_std,
-    shrunk_motion,
+    motion_of_fit,
+    shrunk,
     vibration_of_fit,
 )
 from rsvib_torch.evaluation import resolution_chart
@@ -232,23 +233,22 @@ def test_changes_of_the_last_rounds_count_as_errors(paper_camera):
     translation = Hypothesis(FieldScale(2, frames.shape[-1], 512))
     rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.refined
     fit = rows.fit
-    along_y = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+    along_y = np.array([[0.0], [1.0]])
     fits = [
         replace(fit, coefficients=fit.coefficients * (1 + more * along_y / fit.amplitude)) for more in (0.3, 0.4, 0)
     ]
-    motion, not_converged = shrunk_motion(fit, torch.tensor([0.04], dtype=torch.float64)), torch.tensor([True])
-    std = amplitude_std(with_unknown_changes(rows, motion, motion, fits, not_converged).fit)
-    expected = (amplitude_std(fit).square() + 0.5**2 * along_y).sqrt()
-    torch.testing.assert_close(std, expected, rtol=1e-6, atol=0)
-    unchanged = with_unknown_changes(rows, motion, motion, fits, ~not_converged)
-    assert torch.equal(unchanged.fit.covariance, fit.covariance)
+    around, not_converged = shrunk(fit, np.array([0.04])), np.array([True])
+    std = amplitude_std(with_unknown_changes(rows, around, around, fits, not_converged).fit)
+    np.testing.assert_allclose(std, np.sqrt(amplitude_std(fit) ** 2 + 0.5**2 * along_y), rtol=1e-6)
+    unchanged = with_unknown_changes(rows, around, around, fits, ~not_converged)
+    np.testing.assert_array_equal(unchanged.fit.covariance, fit.covariance)
 
 
 @pytest.mark.parametrize("size", [2.0, 59.0])
 def test_large_tones_of_blind_frequencies_do_not_displace_frames(size):
     """Offsets contain next to nothing of such tones, and a fit of small errors may have any amplitude."""
     fit = tone_fit([2.4, size], [47.0, 30.005])
-    warped_by = shrunk_motion(fit, torch.tensor([1 / 30, 2 / 30], dtype=torch.float64))
+    warped_by = shrunk(fit, np.array([1 / 30, 2 / 30]))
     assert warped_by.amplitude[0, :, 0].tolist() == pytest.approx([2.4, size if size < 30 else 0.0], rel=1e-3)
 
 
@@ -333,8 +333,8 @@ def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
     stacks = grey_frames(frames, paper_camera, None, None, None)
     options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
     start = attempt(stacks, timing, options, Hypothesis(FieldScale(2, *frames.shape[:-3:-1]))).fitted.fit
-    intervals = torch.tensor([timing.frame_period], dtype=torch.float64)
-    rows = grouped_frames(stacks.images, None, timing, shrunk_motion(start, intervals))
+    intervals = np.array([timing.frame_period])
+    rows = grouped_frames(stacks.images, None, timing, motion_of_fit(shrunk(start, intervals)))
     refinement = Refinement(rows, intervals, start, None)
     while not refinement.is_finished:
         refinement.step()
@@ -351,14 +351,13 @@ def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
 
 def tone_fit(coefficients, frequencies):
     """A fit of one tone per axis with standard deviations of 0.01 px and 0.02 Hz."""
-    deviations = torch.tensor([0.01, 0.01, 0.02, 1.0] * 2, dtype=torch.float64)
     return ToneFit(
-        torch.tensor(coefficients, dtype=torch.complex128).reshape(1, 2, 1),
-        torch.tensor(frequencies, dtype=torch.float64).reshape(1, 2, 1),
-        torch.ones(1, 2, 1, dtype=torch.bool),
-        torch.zeros(1, 2, 1, dtype=torch.float64),
-        torch.diag_embed(deviations.square())[None],
-        torch.zeros(1, dtype=torch.float64),
+        np.reshape(coefficients, (1, 2, 1)).astype(complex),
+        np.reshape(frequencies, (1, 2, 1)).astype(float),
+        np.ones((1, 2, 1), dtype=bool),
+        np.zeros((1, 2, 1)),
+        np.diag(np.square([0.01, 0.01, 0.02, 1.0] * 2))[None],
+        np.zeros(1),
         MotionModel(),
     )
 
@@ -378,7 +377,7 @@ def tone_fit(coefficients, frequencies):
 )
 def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, ratio, converged):
     before = tone_fit([1.0, 2.0], [50.0, 30.0])
-    ratio = None if ratio is None else torch.tensor([ratio], dtype=torch.float64)
+    ratio = None if ratio is None else np.array([ratio])
     for after in (
         tone_fit([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
         tone_fit([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),

@@ -2,8 +2,8 @@
 
 import math
 
+import numpy as np
 import pytest
-import torch
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.periodogram import strongest_frequencies
@@ -13,20 +13,12 @@ EXPOSURE = 4e-4
 
 def measurements_of(rows, frames, seed=0):
     """Random displacements and weights of rows that some frames do not contain, at unequal times."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(*shape):
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    starts = (
-        3e-4 * torch.arange(rows, dtype=torch.float64)[:, None]
-        + 0.04 * torch.arange(frames)
-        + 2e-5 * random(1, rows, frames)
-    )
-    visible = (random(1, rows, frames) > 0.1).double()
-    information = torch.diag_embed(0.1 + random(1, rows, 2))
-    record = Measurements(starts, torch.zeros(1, rows, frames, 2, dtype=torch.float64), visible, information, EXPOSURE)
-    values = record.relative(random(1, rows, frames, 2) - 0.5)
+    random = np.random.default_rng(seed).random
+    starts = 3e-4 * np.arange(rows)[:, None] + 0.04 * np.arange(frames) + 2e-5 * random((1, rows, frames))
+    visible = (random((1, rows, frames)) > 0.1).astype(float)
+    information = (0.1 + random((1, rows, 2, 1))) * np.eye(2)
+    record = Measurements(starts, np.zeros((1, rows, frames, 2)), visible, information, EXPOSURE)
+    values = record.relative(random((1, rows, frames, 2)) - 0.5)
     return Measurements(starts, values, visible, information, EXPOSURE)
 
 
@@ -35,19 +27,19 @@ def decrease(record, weight, frequency, axis):
     time = record.middles[0, ..., 0, 0]
     size = math.sin(math.pi * frequency * EXPOSURE) / (math.pi * frequency * EXPOSURE)
     angle = 2 * math.pi * frequency * time
-    columns = torch.stack([size * angle.cos(), size * angle.sin(), time], -1)
-    columns = record.relative(columns[None])[0].flatten(0, 1)
-    each = (weight[:, None] * record.visible[0]).flatten()
+    columns = np.stack([size * np.cos(angle), size * np.sin(angle), time], -1)
+    columns = record.relative(columns[None])[0].reshape(-1, 3)
+    weights = (weight[:, None] * record.visible[0]).ravel()
     prior = 0.5 * 0.1**2 * float((weight * record.num_differences[0]).sum())
-    normal = columns.mT @ (each[:, None] * columns) + torch.diag(torch.tensor([prior, prior, 0.0]).double())
-    right = columns.mT @ (each * record.displacements[0, ..., axis].flatten())
-    return float(right @ torch.linalg.solve(normal, right))
+    normal = columns.T @ (weights[:, None] * columns) + np.diag([prior, prior, 0.0])
+    right = columns.T @ (weights * record.displacements[0, ..., axis].ravel())
+    return float(right @ np.linalg.solve(normal, right))
 
 
 @pytest.mark.parametrize(("rows", "frames"), [(40, 2), (60, 5)])
 def test_strongest_frequencies_are_those_of_least_squares_fits(rows, frames):
     record = measurements_of(rows, frames)
-    weights = torch.stack([record.weights, record.weights.flip(1)], 1)
+    weights = np.stack([record.weights, record.weights[:, ::-1]], 1)
     found = strongest_frequencies(record, 6e-4, 1, 1, weights)
     step = 1 / (8 * (float(record.duration[0]) + 6e-4))
     frequencies = [step * place for place in range(4, int(0.5 / 6e-4 / step) + 1)]

@@ -174,9 +174,9 @@ def test_smooth_motion_continues_over_the_blanking_time(highest, known):
     frames = np.broadcast_to(np.arange(8.0), rows.shape)
     values = smooth_motion(frames * period + rows * row_time, highest, 1)
     values = values + noise * generator.standard_normal(values.shape)
-    values, rows, frames = (torch.from_numpy(np.ascontiguousarray(part))[None] for part in (values, rows, frames))
-    information = (torch.eye(2, dtype=torch.float64) / noise**2).expand(1, rows.shape[1], 2, 2)
-    measured = Measurements(rows * 0.0, values - values.mean(2, keepdim=True), torch.ones_like(rows), information, 1e-4)
+    values, rows, frames = (part[None] for part in (values, rows, frames))
+    information = np.broadcast_to(np.eye(2) / noise**2, (1, rows.shape[1], 2, 2))
+    measured = Measurements(rows * 0.0, values - values.mean(2, keepdims=True), np.ones_like(rows), information, 1e-4)
     found = row_time_of_splines(FramePlaces(measured, rows, frames, period), 256, 60e-6, period / 256, (1.0, -1.0))
     assert (found is not None) == known
     if found is not None:

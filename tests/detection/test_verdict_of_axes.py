@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -29,11 +30,11 @@ def verdict(
     vibration = Vibration([[[amplitude], [2.0]]], [[[frequency], [50.0]]])
     size = torch.tensor([[[std[0]], [0.01]]], dtype=torch.float64)
     hertz = torch.tensor([[[std[1]], [0.01]]], dtype=torch.float64)
-    curve = torch.sin(torch.linspace(0, 12, 40, dtype=torch.float64))[:, None] * torch.tensor([3.0, 2.0]).double()
+    curve = np.sin(np.linspace(0, 12, 40))[:, None] * np.array([3.0, 2.0])
     bands = BandOffsets(
         (curve if offsets is None else offsets(curve))[None],
         (curve if fitted is None else fitted(curve))[None],
-        torch.ones(1, 40, dtype=torch.bool),
+        np.ones((1, 40), dtype=bool),
     )
     std_of_tones = VibrationStd(
         amplitude=size,
@@ -48,9 +49,9 @@ def verdict(
         vibration,
         std_of_tones,
         bands if rows is None else rows,
-        intervals=torch.tensor([0.04096], dtype=torch.float64),
-        displacement=torch.tensor([[amplitude, 2.0]]) / 2**0.5,
-        known_std=torch.tensor([[displacement_std if known_std is None else known_std, 0.01]]),
+        intervals=np.array([0.04096]),
+        displacement=np.array([[amplitude, 2.0]]) / 2**0.5,
+        known_std=np.array([[displacement_std if known_std is None else known_std, 0.01]]),
         timing=TIMING.in_row_order(),
         **options,
     )
@@ -63,7 +64,7 @@ def codes(findings):
 
 def missing(count):
     def change(curve):
-        curve = curve.clone()
+        curve = curve.copy()
         curve[:count] = math.nan
         return curve
 
@@ -119,7 +120,7 @@ def test_a_blind_tone_at_a_multiple_of_the_frame_rate_may_be_caused_by_frame_row
 
 def test_stacks_of_a_batch_are_judged_independently():
     both = [rows_of(unexplained=0.3), rows_of(blur=(0.5, 0.1, 0.05))]
-    values = [torch.cat(of) for of in zip(*(vars(one).values() for one in both), strict=True)]
+    values = [np.concatenate(of) for of in zip(*(vars(one).values() for one in both), strict=True)]
     tones = Vibration([[[3.0], [2.0]]] * 2, [[[30.0], [50.0]]] * 2)
     small = torch.full((2, 2, 1), 0.01)
     std = VibrationStd(small, small, small, small, torch.zeros(2, 2), torch.zeros(2, 2), torch.full((2, 2), 0.01))
@@ -127,9 +128,9 @@ def test_stacks_of_a_batch_are_judged_independently():
         tones,
         std,
         OtherMotion(*values),
-        intervals=torch.tensor([0.04096]),
-        displacement=torch.full((2, 2), 1.5),
-        known_std=torch.full((2, 2), 0.01),
+        intervals=np.array([0.04096]),
+        displacement=np.full((2, 2), 1.5),
+        known_std=np.full((2, 2), 0.01),
         timing=TIMING.in_row_order(),
     )
     assert [codes(one) for one in findings] == [
@@ -140,8 +141,8 @@ def test_stacks_of_a_batch_are_judged_independently():
 
 def rows_of(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blur=(1.2, 0.1, 0.05), size=1.0):
     """Residual motion along x only, beside tones with offsets of ``size`` px along both axes."""
-    axes = (torch.tensor([[value, 0.0]]) for value in (unexplained, correlated, differential))
-    return OtherMotion(torch.full((1, 2), size), *axes, torch.tensor([measured]), torch.tensor([blur]))
+    axes = (np.array([[value, 0.0]]) for value in (unexplained, correlated, differential))
+    return OtherMotion(np.full((1, 2), size), *axes, np.array([measured]), np.array([blur]))
 
 
 @pytest.mark.parametrize(
@@ -189,9 +190,9 @@ def test_the_displacement_by_several_tones_must_be_known_better(ratio, found):
         tones,
         VibrationStd(small, small, small, small, torch.zeros(1, 2), torch.zeros(1, 2), uncertain),
         rows_of(),
-        intervals=torch.tensor([0.04096], dtype=torch.float64),
-        displacement=torch.tensor([[1.5, 1.5]]),
-        known_std=uncertain,
+        intervals=np.array([0.04096]),
+        displacement=np.array([[1.5, 1.5]]),
+        known_std=uncertain.numpy(),
         timing=TIMING.in_row_order(),
     )
     assert codes(findings) == [found, []]

@@ -12,7 +12,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 import pytest
-import torch
 from truth import draw_scene
 
 import rsvib_torch as rsv
@@ -202,11 +201,11 @@ class Tracked:
     """Offsets of rows by a known displacement, as a tracked frame."""
 
     def __init__(self, time, displacement):
-        rows = torch.arange(4.5, 300.0, 8, dtype=torch.float64) * TIMING.row_time
-        starts = torch.stack([rows - TIMING.frame_period, rows], -1)
-        middles = starts.numpy() + 0.5 * TIMING.exposure_time + time
-        moved = torch.as_tensor(displacement(middles[:, 1]) - displacement(middles[:, 0]))
-        information = torch.eye(2, dtype=torch.float64).expand(1, len(rows), 2, 2)
+        rows = np.arange(4.5, 300.0, 8) * TIMING.row_time
+        starts = np.stack([rows - TIMING.frame_period, rows], -1)
+        middles = starts + 0.5 * TIMING.exposure_time + time
+        moved = displacement(middles[:, 1]) - displacement(middles[:, 0])
+        information = np.broadcast_to(np.eye(2), (1, len(rows), 2, 2))
         self.time = time
         self.measurements = Measurements.of_pairs(
             starts[None, :, 0], starts[None, :, 1], moved[None], information, TIMING.exposure_time

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.detection.measurements import Measurements
@@ -64,14 +63,13 @@ def test_equations_6_to_8_invert_the_offsets(amplitude, frequency, phase):
     offset = integral(amplitude, frequency, phase, ends + CAMERA.frame_period) - integral(
         amplitude, frequency, phase, ends
     )
-    starts = torch.from_numpy(ROWS[::8] * CAMERA.row_time)[None]
-    offsets = torch.from_numpy(np.stack([offset, offset], -1))[None]
-    information = torch.eye(2, dtype=torch.float64).expand(1, offsets.shape[1], 2, 2)
+    starts, offsets = ROWS[None, ::8] * CAMERA.row_time, np.stack([offset, offset], -1)[None]
+    information = np.broadcast_to(np.eye(2), (1, offsets.shape[1], 2, 2))
     measurements = Measurements.of_pairs(
         starts, starts + CAMERA.frame_period, offsets, information, CAMERA.exposure_time, (0.0, 0.0)
     )
-    start = torch.full((1, 2, 1), 1.02 * frequency, dtype=torch.float64)
-    found, _ = vibration_of_fit(fit_tones(measurements, start, torch.ones(1, 2, 1, dtype=torch.bool)))
+    start = np.full((1, 2, 1), 1.02 * frequency)
+    found, _ = vibration_of_fit(fit_tones(measurements, start, np.ones((1, 2, 1), dtype=bool)))
     for axis in (0, 1):
         assert found.amplitude[0, axis, 0].item() == pytest.approx(amplitude, rel=1e-6)
         assert found.period[0, axis, 0].item() == pytest.approx(1 / frequency, rel=1e-7)

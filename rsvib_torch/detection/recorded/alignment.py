@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack, overload
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.recorded.band_vectors import band_vectors
@@ -252,7 +254,7 @@ def align_motion(
         )
     bands = RegistrationOptions(registration or "ncc", band_rows, band_step, search)
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
-    turned = recorded.to_row_order(timing).to(grey.device)
+    turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned, first, last, offsets)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = best_offset(measured, turned, low, high, rowwise)
@@ -260,18 +262,17 @@ def align_motion(
     clock, _, _ = fit_clock(measured, turned, clock, False, fit_gain)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
     clock, covariance, _ = fit_clock(weighed, turned, clock, fit_scale, fit_gain)
-    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1))
+    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
-        measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1))
+        measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1).to(grey.device))
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
         clock, covariance, _ = fit_clock(weighed, turned, clock, fit_scale, fit_gain)
     aligned = clock.motion(turned)
     residual = residual_of_motion(measured, aligned)
-    independent = measured.independent_fraction(residual)
-    std = (covariance.diagonal() / independent).clamp(min=0.0).sqrt()
-    # offset = at - scale * middle
-    gradient = torch.tensor([1.0, -clock.middle], dtype=torch.float64, device=std.device)
-    offset_std = float((gradient @ covariance[:2, :2] @ gradient / independent).clamp(min=0.0).sqrt())
+    covariance = covariance / measured.independent_fraction(residual)
+    std = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    gradient = np.array([1.0, -clock.middle])  # offset = at - scale * middle
+    offset_std = float(np.sqrt(np.maximum(gradient @ covariance[:2, :2] @ gradient, 0.0)))
     rest = measured.unexplained(residual)[0]
     reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
     drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
@@ -285,7 +286,7 @@ def align_motion(
         scale_std=float(std[1]),
         gain=in_image.gain,
         drift=drift,
-        unexplained=magnitudes_from_row_order(rest, timing),
+        unexplained=magnitudes_from_row_order(tensor(rest), timing).to(grey.device),
         reliable=not reasons,
         findings=reasons_from_row_order(reasons, timing),
     )
@@ -296,11 +297,11 @@ def best_offset(
 ) -> tuple[float, float | None]:
     """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
     every = max(1, measured.exposure_starts.shape[1] // 400)  # 400 scene rows are enough for a start
-    used = (measured.weights[0] > 0).all(-1).nonzero()[::every, 0]
-    exposure_starts = measured.exposure_starts[0, used] + 0.5 * measured.exposure_time
-    seen = measured.visible[0, used]
-    values = (measured.displacements[0, used] * seen[..., None]).flatten(0, 1)
-    weight = (measured.weights[0, used, None] * seen[..., None]).flatten(0, 1)
+    used = np.flatnonzero((measured.weights[0] > 0).all(-1))[::every]
+    exposure_starts = tensor(measured.exposure_starts[0, used] + 0.5 * measured.exposure_time)
+    seen = tensor(measured.visible[0, used])
+    values = (tensor(measured.displacements[0, used]) * seen[..., None]).flatten(0, 1)
+    weight = (tensor(measured.weights[0, used])[:, None] * seen[..., None]).flatten(0, 1)
 
     def relative(of: Tensor) -> Tensor:  # (..., N, G, A)
         mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
@@ -336,8 +337,8 @@ def fit_clock(
     clock: FittedClock,
     fit_scale: bool,
     fit_gain: bool,
-    rows: Tensor | None = None,
-) -> tuple[FittedClock, Tensor, float]:
+    rows: Array | None = None,
+) -> tuple[FittedClock, Array, float]:
     """Gauss-Newton on clock reading, scale, gain and drift, and on the row time.
 
     Args:
@@ -355,40 +356,37 @@ def fit_clock(
     """
     row_time = 0.0
     exposure_starts = measured.exposure_starts
-    free = torch.tensor(
-        [True, fit_scale, fit_gain, fit_gain, True, True, rows is not None], device=exposure_starts.device
-    )
-    places = torch.zeros_like(exposure_starts) if rows is None else rows
-    covariance = torch.zeros(7, 7, dtype=torch.float64, device=exposure_starts.device)
+    free = np.array([True, fit_scale, fit_gain, fit_gain, True, True, rows is not None])
+    places = np.zeros_like(exposure_starts) if rows is None else rows
     for _ in range(12):
+        # 1. Displacement and velocity of the recording at the measured rows.
         measured = replace(measured, exposure_starts=exposure_starts + places * row_time)
         starts = measured.exposure_starts
         middle = starts + 0.5 * measured.exposure_time - clock.middle
-        own = recorded.retimed(clock.offset, clock.scale)
-        gain = exposure_starts.new_tensor(clock.gain)
-        speed = own.velocity(starts + 0.5 * measured.exposure_time) * gain / clock.scale
-        value = own.mean_displacement(starts, measured.exposure_time)
-        zero = torch.zeros_like(value[..., 0])
-        columns = torch.stack(
-            [
-                speed,
-                speed * middle[..., None],
-                torch.stack([value[..., 0], zero], -1),
-                torch.stack([zero, value[..., 1]], -1),
-                torch.stack([middle, zero], -1),
-                torch.stack([zero, middle], -1),
-                clock.scale * speed * places[..., None],
-            ],
-            -1,
-        )
-        columns = measured.relative(columns) * free
+        in_time = recorded.retimed(clock.offset, clock.scale)
+        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) * clock.gain / clock.scale
+        value = table(in_time.mean_displacement(tensor(starts), measured.exposure_time))
+        # 2. Derivatives (1, N, G, 2, 7) of the displacements by the parameters.
+        x, y = np.eye(2)
+        columns = [
+            speed,
+            speed * middle[..., None],
+            value * x,
+            value * y,
+            middle[..., None] * x,
+            middle[..., None] * y,
+            clock.scale * speed * places[..., None],
+        ]
+        jacobian = measured.relative(np.stack(columns, -1)) * free
+        # 3. The normal equations, in units of the sizes of the columns, and the step.
         residual = residual_of_motion(measured, clock.motion(recorded))
-        gram = torch.einsum("bngap,bnac,bngcq->pq", columns, measured.information, columns)
-        right = torch.einsum("bngap,bnac,bngc->p", columns, measured.information, residual)
-        scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).sqrt()
-        inverse = torch.linalg.pinv(gram / scale / scale[:, None], rtol=1e-10, hermitian=True) / scale / scale[:, None]
+        weighted = np.einsum("bnac,bngcq->bngaq", measured.information, jacobian)
+        gram = np.einsum("bngap,bngaq->pq", jacobian, weighted)
+        right = np.einsum("bngap,bnga->p", weighted, residual)
+        scale = np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1.0))
+        inverse = np.linalg.pinv(gram / scale / scale[:, None], rcond=1e-10, hermitian=True) / scale / scale[:, None]
         change = inverse @ right
-        known = measured.num_measurements.sum().clamp(min=8.0) - free.sum()
+        known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
         at, speedup, gain_x, gain_y, drift_x, drift_y, later = change.tolist()
         row_time += later
@@ -399,6 +397,6 @@ def fit_clock(
             (clock.drift[0] + drift_x, clock.drift[1] + drift_y),
             clock.middle,
         )
-        if bool((change.abs() <= 1e-3 * covariance.diagonal().sqrt()).all()):
+        if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
     return clock, covariance, row_time

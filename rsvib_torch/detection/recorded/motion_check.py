@@ -15,6 +15,7 @@ from rsvib_torch.core.precision import full_precision, outside_graphs, without_g
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
+from rsvib_torch.core.tables import tensor
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
@@ -138,10 +139,10 @@ def check_motion(
     bands = RegistrationOptions(registration, band_rows, band_step, search)
     rowwise, curve, _ = start_curve(stack, timing, bands)
     measured = measurements_of_curve(curve, rowwise, band_step)
-    turned = motion.to(stack.images.device).to_row_order(timing)
-    offsets = _offsets(measured.displacements)
+    turned = motion.to("cpu").to_row_order(timing)
+    offsets = _offsets(tensor(measured.displacements))
     residual = offsets - _offsets(_averaged(turned, measured))
-    used = measured.weights[0].amin(-1) > 0
+    used = tensor(measured.weights[0].min(-1) > 0)
     before, after = (offsets_from_row_order(_rms(values[used]), timing).abs() for values in (offsets, residual))
     findings = []
     for name, moved, rest in zip(AXIS_NAMES, before.tolist(), after.tolist(), strict=False):
@@ -154,7 +155,9 @@ def check_motion(
     rest, moved = float(after.norm()), float(before.norm())
     if rest >= moved and not findings:
         findings.append(Reason("offsets_not_reduced", None, rest, moved))
-    return MotionCheck(before, after, rest < moved, tuple(findings), measured.exposure_starts[0, used, 0], *of_bands)
+    return MotionCheck(
+        before, after, rest < moved, tuple(findings), tensor(measured.exposure_starts[0, :, 0])[used], *of_bands
+    )
 
 
 def _offsets(displacements: Tensor) -> Tensor:
@@ -166,9 +169,9 @@ def _averaged(motion: Motion, measured: Measurements) -> Tensor:
     """Mean displacement (1, N, 2, 2) over exposure and rows of the bands."""
     duration = measured.average_times[1]
     nodes, weights = gauss_legendre(3)
-    mean = torch.zeros_like(measured.displacements)
+    mean = torch.zeros_like(tensor(measured.displacements))
     for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
-        times = measured.exposure_starts + (node - 0.5) * duration
+        times = tensor(measured.exposure_starts) + (node - 0.5) * duration
         mean = mean + weight * motion.mean_displacement(times, measured.exposure_time)
     return mean
 

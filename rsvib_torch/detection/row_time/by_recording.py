@@ -67,8 +67,9 @@ def row_time_of_recording(
             if not clock.allows(row_time):
                 continue
             residual = residual_of_motion(places.timed(row_time), fitted.motion(recorded))
-            std = float(covariance[-1, -1].clamp(min=0.0) / places.measurements.independent_fraction(residual)) ** 0.5
-            size = float(weighted.square(residual).sum() / weighted.num_measurements.sum().clamp(min=1.0))
+            independent = float(places.measurements.independent_fraction(residual)[0])
+            std = (max(float(covariance[-1, -1]), 0.0) / independent) ** 0.5
+            size = float(weighted.square(residual).sum()) / max(float(weighted.num_measurements.sum()), 1.0)
             found.append((size, Candidate(row_time, std, 0.0), fitted))
     if not found:
         return RowTimeFit(math.nan, math.nan, (), None, None, (Reason("recording_explains_nothing"),))

@@ -6,11 +6,12 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.refinement import refine
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_frames
@@ -25,7 +26,7 @@ from rsvib_torch.detection.row_time.row_tones import (
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
-from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, residual_of, shrunk_motion
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, motion_of_fit, residual_of, shrunk
 from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
 from rsvib_torch.detection.verdict import residual_reasons
 from rsvib_torch.frames.grey import GreyFrames
@@ -106,7 +107,8 @@ def bands_of_frames(
     rows = torch.stack([curve.rows.expand(pairs, count), curve.rows + curve.offsets[0, ..., 1].nan_to_num(0.0)], -1)
     frames = curve.pairs[:, None].expand(pairs, count, 2).flatten(0, 1)
     measured = measurements_of_curve(curve, timing, options.band_step)
-    return curve, FramePlaces(measured, rows.flatten(0, 1)[None], frames[None].double(), clock.period)
+    places = FramePlaces(measured, table(rows.flatten(0, 1))[None], table(frames.double())[None], clock.period)
+    return curve, places
 
 
 def row_time_of_tones(
@@ -164,14 +166,14 @@ def _as_good_as_the_first(possible: list[Candidate]) -> list[Candidate]:
     return [one for one in possible if one.chi_square <= possible[0].chi_square + MAX_CHI_SQUARE]
 
 
-def _tones_at(tones: list[RowTones], row_time: float, period: float) -> tuple[Tensor, Tensor]:
+def _tones_at(tones: list[RowTones], row_time: float, period: float) -> tuple[Array, Array]:
     """Frequencies (1, 2, K) in Hz of tones of both axes at a row time, and which of them exist."""
     count = max(1, *(len(one.tones) for one in tones))
-    frequencies = tones[0].values.new_zeros(1, 2, count)
-    active = torch.zeros_like(frequencies, dtype=torch.bool)
+    frequencies = np.zeros((1, 2, count))
+    active = np.zeros_like(frequencies, dtype=bool)
     for axis, one in enumerate(tones):
-        nu, phi = one.tones[:, 2], one.tones[:, 3]
-        frequencies[0, axis, : len(nu)] = (phi + (nu * period / row_time - phi).round()).abs() / period
+        nu, phi = table(one.tones[:, 2:]).T
+        frequencies[0, axis, : len(nu)] = np.abs(phi + (nu * period / row_time - phi).round()) / period
         active[0, axis, : len(nu)] = True
     return frequencies, active
 
@@ -218,10 +220,10 @@ def _measured_with(
     timing = clock.timing(size)
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     start, _ = robust_fit(measurements_of_curve(curve, timing, options.band_step), frequencies, active, MotionModel())
-    intervals = compared_intervals(timing, stack.images.shape[1], MAX_GROUP_FRAMES, stack.images.device)
+    intervals, device = table(compared_intervals(timing, stack.images.shape[1], MAX_GROUP_FRAMES)), stack.images.device
     exposure = None
     for _ in range(4):
-        rows = grouped_frames(stack.images, stack.valid, timing, shrunk_motion(start, intervals))
+        rows = grouped_frames(stack.images, stack.valid, timing, motion_of_fit(shrunk(start, intervals), device))
         found = refine(rows, intervals, start, None)
         if found.measurements.independent <= 0:  # too few rows agree with each other
             return None
@@ -244,15 +246,12 @@ def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, cl
     coefficients, frequencies = fit.coefficients[0, axis][active], fit.frequencies[0, axis][active]
     # the record of ``fit`` has another middle than that of the rows
     record = places.of_axis(axis, clock.num_rows, row_time)
-    middle = places.frames[0] * clock.period + places.rows[0] * row_time - record.frames * clock.period
-    middle = (middle - record.rows * row_time).mean() + 0.5 * places.measurements.exposure_time
-    turn = 2 * math.pi * frequencies * (middle - fit.centre)
-    coefficients = coefficients * torch.polar(torch.ones_like(turn), turn)
-    coefficients = coefficients * torch.sinc(frequencies * places.measurements.exposure_time)
-    tones = torch.stack(
-        [coefficients.real, coefficients.imag, frequencies * row_time, frequencies * clock.period], -1
-    ).flatten()
-    return fit_row_tones(record, torch.cat([tones, fit.drift[0, axis, :1] * clock.period]))
+    middle = places.frames[0] * clock.period + places.rows[0] * row_time - table(record.frames) * clock.period
+    middle = (middle - table(record.rows) * row_time).mean() + 0.5 * places.measurements.exposure_time
+    turned = coefficients * np.exp(2j * math.pi * frequencies * (middle - fit.centre))
+    turned = turned * np.sinc(frequencies * places.measurements.exposure_time)
+    tones = np.stack([turned.real, turned.imag, frequencies * row_time, frequencies * clock.period], -1)
+    return fit_row_tones(record, tensor(np.concatenate([tones.ravel(), fit.drift[0, axis, :1] * clock.period])))
 
 
 def _exposure(other: OtherMotion, timing: RowTiming) -> tuple[float, float] | None:

@@ -8,9 +8,9 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 from dataclasses import dataclass, replace
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.row_time.row_tones import RowRecord
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, fit_tones, motion_of_fit, residual_of
@@ -31,8 +31,8 @@ class FramePlaces:
     """
 
     measurements: Measurements
-    rows: Tensor
-    frames: Tensor
+    rows: Array
+    frames: Array
     period: float
 
     def timed(self, row_time: float) -> Measurements:
@@ -42,13 +42,14 @@ class FramePlaces:
     def of_axis(self, axis: int, num_rows: int, row_time: float) -> RowRecord:
         """The displacements along one axis, for tones of independent frequencies."""
         measured = self.measurements
+        frames = self.frames[0] - 0.5 * (self.frames.min() + self.frames.max())
         return RowRecord(
-            self.rows[0] - 0.5 * (num_rows - 1),
-            self.frames[0] - 0.5 * (self.frames.amin() + self.frames.amax()),
-            measured.displacements[0, ..., axis],
-            measured.visible[0],
-            measured.inverse_variances[0, :, axis],
-            float(measured.independent),
+            tensor(self.rows[0] - 0.5 * (num_rows - 1)),
+            tensor(frames),
+            tensor(measured.displacements[0, ..., axis]),
+            tensor(measured.visible[0]),
+            tensor(measured.inverse_variances[0, :, axis]),
+            float(np.squeeze(measured.independent)),
             row_time / self.period,
         )
 
@@ -63,15 +64,15 @@ def rows_of_frames(measured: Measurements, period: float, row_time: float, num_r
         num_rows: Rows of a frame.
     """
     blank = 0.5 * (period - num_rows * row_time)  # rows up to half of the blanking outside of a frame are its rows
-    frames = ((measured.exposure_starts + blank) / period).floor()
+    frames = np.floor((measured.exposure_starts + blank) / period)
     return FramePlaces(measured, (measured.exposure_starts - frames * period) / row_time, frames, period)
 
 
-def row_time_columns(measured: Measurements, rows: Tensor, motion: Motion) -> Tensor:
+def row_time_columns(measured: Measurements, rows: Array, motion: Motion) -> Array:
     """Derivatives (1, N, G, 2) of the relative displacements by the row time: velocity times row."""
-    starts, exposure = measured.exposure_starts, measured.exposure_time
+    starts, exposure = tensor(measured.exposure_starts), measured.exposure_time
     velocity = (motion.displacement(starts + exposure) - motion.displacement(starts)) / exposure
-    return measured.relative(velocity * rows[..., None])
+    return measured.relative(table(velocity) * rows[..., None])
 
 
 def fit_row_time(
@@ -93,26 +94,27 @@ def fit_row_time(
         measured = places.timed(row_time)
         fit = fit_tones(measured, fit.frequencies, fit.active, fit.model)
         residual = residual_of(measured, fit)
-        free = (fit.active.sum(-1) * 3 + fit.drift.shape[-1]).double()
-        variance = measured.square(residual) / (measured.num_measurements - free - 0.5).clamp(min=1.0)
-        weighted = measured.scaled(1 / variance.clamp(min=1e-300))
+        free = fit.active.sum(-1) * 3 + fit.drift.shape[-1]
+        variance = measured.square(residual) / np.maximum(measured.num_measurements - free - 0.5, 1.0)
+        weighted = measured.scaled(1 / np.maximum(variance, 1e-300))
         tones = [axis_jacobian(measured, fit, axis)[0][0] for axis in range(2)]  # (N, G, M)
-        zero = torch.zeros_like(tones[0])
-        columns = torch.cat(
+        zero = np.zeros_like(tones[0])
+        columns = np.concatenate(
             [
-                torch.stack([tones[0], zero], 2),
-                torch.stack([zero, tones[1]], 2),
+                np.stack([tones[0], zero], 2),
+                np.stack([zero, tones[1]], 2),
                 row_time_columns(measured, places.rows, motion_of_fit(fit))[0, ..., None],
             ],
             -1,
         )  # (N, G, 2, P)
-        gram = torch.einsum("ngap,nac,ngcq->pq", columns, weighted.information[0], columns)
-        right = torch.einsum("ngap,nac,ngc->p", columns, weighted.information[0], residual[0])
-        scale = torch.where(gram.diagonal() > 0, gram.diagonal(), 1.0).rsqrt()
-        eye = torch.diag(1e-13 + (gram.diagonal() <= 0).double())
-        inverse = torch.linalg.inv(gram * scale * scale[:, None] + eye) * scale * scale[:, None]
+        of_information = np.einsum("nac,ngcq->ngaq", weighted.information[0], columns)
+        gram = np.einsum("ngap,ngaq->pq", columns, of_information)
+        right = np.einsum("ngap,nga->p", of_information, residual[0])
+        scale = 1 / np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1.0))
+        eye = np.diag(1e-13 + (gram.diagonal() <= 0))
+        inverse = np.linalg.inv(gram * scale * scale[:, None] + eye) * scale * scale[:, None]
         step = float((inverse @ right)[-1])
-        std = float(inverse[-1, -1].clamp(min=0.0).sqrt()) / float(measured.independent) ** 0.5
+        std = (max(float(inverse[-1, -1]), 0.0) / float(np.squeeze(measured.independent))) ** 0.5
         row_time = row_time + min(max(step, -0.02 * row_time), 0.02 * row_time)
         if abs(step) < 1e-2 * std:
             break

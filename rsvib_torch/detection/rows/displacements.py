@@ -12,13 +12,16 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
@@ -36,6 +39,7 @@ __all__ = [
     "BLOCK_ROWS",
     "MAX_GROUP_FRAMES",
     "FrameGroup",
+    "MeasuredGroup",
     "blur_ratio",
     "compared_intervals",
     "differential_motion",
@@ -187,7 +191,7 @@ def measure_group(
     timing: RowTiming,
     motion: Motion,
     gradients: RowGradients | None = None,
-) -> tuple[Measurements, RowGradients]:
+) -> tuple["MeasuredGroup", RowGradients]:
     """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
 
     The displacement of the motion is added to the measured residual displacement, so that the measurements do not
@@ -243,7 +247,7 @@ def measure_strips(
     strips: ColumnStrips,
     factors: Callable[[Tensor, Tensor], Tensor],
     gradients: RowGradients | None = None,
-) -> tuple[Measurements, RowGradients]:
+) -> tuple["MeasuredGroup", RowGradients]:
     """``measure_group`` for a motion with roll or zoom, from frames (B S) that are cut into S strips of columns.
 
     Every strip is warped by the motion of its middle. Strips are joined with weights that are linear between middles,
@@ -301,6 +305,23 @@ def measure_strips(
     return _measured(group, timing, motion, starts, visible, gradients, products), gradients
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredGroup:
+    """Displacements of N blocks of rows in the G frames of a group, as ``Measurements`` on the device of the frames.
+
+    Attributes:
+        exposure_starts: (B, N, G) s.
+        displacements: (B, N, G, A) px, up to the displacement of the scene.
+        visible: (B, N, G), 1 where a frame contains the block, else 0.
+        information: (B, N, A, A) px^-2.
+    """
+
+    exposure_starts: Tensor
+    displacements: Tensor
+    visible: Tensor
+    information: Tensor
+
+
 def _measured(
     group: FrameGroup,
     timing: RowTiming,
@@ -309,7 +330,7 @@ def _measured(
     visible: Tensor,
     gradients: RowGradients,
     products: Tensor,
-) -> Measurements:
+) -> MeasuredGroup:
     """Measurements of blocks from the products of the gradients with the differences of the frames.
 
     Args:
@@ -328,14 +349,12 @@ def _measured(
     first, height_time = group.starts[: len(exposure_starts), :, None], group.spectra.height * timing.row_time
     exposure_starts = exposure_starts.clamp(first - height_time, first + 2 * height_time)
     around = motion.mean_displacement(exposure_starts, timing.exposure_time)
-    measurements = Measurements(
+    return MeasuredGroup(
         exposure_starts=exposure_starts.transpose(1, 2),
         displacements=(around + residual).transpose(1, 2),
         visible=_in_blocks(visible)[..., 0].transpose(1, 2),
         information=information,
-        exposure_time=timing.exposure_time,
     )
-    return replace(measurements, displacements=measurements.relative(measurements.displacements))
 
 
 def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -380,28 +399,28 @@ def measure_groups(
     for group, of_group in zip(groups, known, strict=True):
         measured.append(measure_group(group, timing, motion, of_group))
         advance()
-    return joined_groups([part for part, _ in measured]), [of_group for _, of_group in measured]
+    return joined_groups([part for part, _ in measured], timing.exposure_time), [of_group for _, of_group in measured]
 
 
-def joined_groups(parts: list[Measurements]) -> Measurements:
-    """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
-    most = max(part.exposure_starts.shape[-1] for part in parts)
+def joined_groups(parts: list[MeasuredGroup], exposure_time: float) -> Measurements:
+    """Measurements of all groups as one record, by one transfer to the CPU.
 
-    def padded(values: Tensor) -> Tensor:
-        return functional.pad(values, (0, 0) * (values.ndim - 3) + (0, most - values.shape[2]))
+    Smaller groups get frames in which no row is visible.
+    """
+    arrays = tables(*(value for part in parts for value in vars(part).values()))
+    starts, displacements, visible, information = (arrays[first::4] for first in range(4))
+    most = max(part.shape[2] for part in starts)
 
-    def repeated(exposure_starts: Tensor) -> Tensor:
-        return torch.cat(
-            [exposure_starts, exposure_starts[:, :, :1].expand(-1, -1, most - exposure_starts.shape[2])], 2
-        )
+    def joined(values: list[Array], mode: Literal["constant", "edge"] = "constant") -> Array:
+        padded = [
+            np.pad(part, [(0, 0), (0, 0), (0, most - part.shape[2]), (0, 0)][: part.ndim], mode=mode) for part in values
+        ]
+        return np.concatenate(padded, 1)
 
-    return replace(
-        parts[0],
-        exposure_starts=torch.cat([repeated(part.exposure_starts) for part in parts], 1),
-        displacements=torch.cat([padded(part.displacements) for part in parts], 1),
-        visible=torch.cat([padded(part.visible) for part in parts], 1),
-        information=torch.cat([part.information for part in parts], 1),
+    measurements = Measurements(
+        joined(starts, "edge"), joined(displacements), joined(visible), np.concatenate(information, 1), exposure_time
     )
+    return replace(measurements, displacements=measurements.relative(measurements.displacements))
 
 
 def without_column_pattern(
@@ -422,7 +441,7 @@ def without_column_pattern(
     return [replace(group, spectra=group.spectra.without(pattern)) for group in groups]
 
 
-def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Array:
     """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
 
     Rotation of the camera and parallax move the halves differently.
@@ -434,7 +453,7 @@ def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Ten
     return _rms_of_contrasts(gradients, rows, [[-1.0, 1.0]])
 
 
-def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Array:
     """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
 
     Parallax, clouds and objects that move by themselves cause it, roll and zoom do not.
@@ -447,7 +466,7 @@ def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
     return _rms_of_contrasts(gradients, rows, [quadratic, cubic])
 
 
-def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[list[float]]) -> Tensor:
+def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[list[float]]) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
     Args:
@@ -461,7 +480,7 @@ def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[li
         contrasts = residual.new_tensor(weights)
         excess = ((contrasts @ residual).square() - contrasts.square() @ noise).sum(2)
         excesses.append(torch.where(regular[..., None], excess, torch.nan))
-    return trimmed_mean(torch.cat(excesses, 1)).clamp(min=0.0).sqrt()
+    return np.sqrt(np.maximum(trimmed_mean(table(torch.cat(excesses, 1))), 0.0))
 
 
 def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,10 +7,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.tables import Array, table
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroup,
@@ -52,15 +54,15 @@ class MeasuredRows:
 
     measurements: Measurements
     gradients: list[RowGradients]
-    apart: Tensor | None = None
+    apart: Array | None = None
 
-    def differential(self) -> Tensor:
+    def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
         if self.apart is None:
             return differential_motion(self.gradients)
-        return trimmed_mean(self.apart).clamp(min=0.0).sqrt()
+        return np.sqrt(np.maximum(trimmed_mean(self.apart), 0.0))
 
-    def uneven(self) -> Tensor:
+    def uneven(self) -> Array:
         """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
         return uneven_motion(self.gradients) if self.apart is None else self.differential()
 
@@ -151,9 +153,10 @@ class GroupedStrips(GroupedFrames):
             measured.append(measure_strips(group, self.timing, motion, view, self.strips, factors, of_group))
             advance()
         gradients = [of_group for _, of_group in measured]
-        return MeasuredRows(joined_groups([part for part, _ in measured]), gradients, self._apart(gradients))
+        measurements = joined_groups([part for part, _ in measured], self.timing.exposure_time)
+        return MeasuredRows(measurements, gradients, self._apart(gradients))
 
-    def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Tensor:
+    def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Array:
         """``MeasuredRows.apart``, from sums over parts of ``rows`` rows."""
         excesses = []
         for of_group in gradients:
@@ -161,7 +164,7 @@ class GroupedStrips(GroupedFrames):
             share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
             excess = 0.5 * (residual.square() - share * noise).mean(2) / share
             excesses.append(torch.where(regular[..., None], excess, torch.nan))
-        return torch.cat(excesses, 1)
+        return table(torch.cat(excesses, 1))
 
     def without_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Self | None:
         """As for whole rows: all strips of a row have the same noise."""

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -23,6 +24,7 @@ from rsvib_torch.core.precision import full_precision, outside_graphs, without_g
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
+from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
@@ -49,7 +51,6 @@ __all__ = [
     "bands_reasons",
     "detect_motion",
     "measure_freely",
-    "precision_of_axis",
     "residual_of_motion",
     "rms_motion",
     "start_curve",
@@ -243,14 +244,15 @@ def _detect(
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
-    starts = rowwise.frame_starts(stack.images.shape[1], stack.images.device)
+    starts = rowwise.frame_starts(stack.images.shape[1])
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
-        middle = torch.zeros(1, dtype=torch.float64, device=starts.device)
+        middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
     of_bands = [*bands_reasons(banded, of_middle[0]), [], []][: scale.axes]
-    return _report(motion[0], fit, measured, timing, starts, scale, of_bands, rows.differential()[0])
+    report = _report(motion[0], fit, measured, timing, starts, scale, of_bands, rows.differential()[0])
+    return report.to(stack.images.device)
 
 
 def _measure_field(
@@ -269,6 +271,7 @@ def _measure_field(
     motion = FreeMotion(torch.cat([start.coefficients, still], 1), start.start, start.spacing, tones)
 
     def strips_for(motion: FreeMotion) -> GroupedStrips:
+        motion = motion.to(stack.images.device)
         return grouped_strips(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
 
     # strips follow the size of roll and zoom, which are unknown in the first round
@@ -301,7 +304,7 @@ def _rounds(
         The measurements of the last round with their weights, and the motion.
     """
     for number in range(count):
-        measured = rows.measure(motion)
+        measured = rows.measure(motion.to(rows.groups[0].starts.device))
         measurements = measured.measurements
         if number or weighted:
             measurements = measurements.reweighted(residual_of_motion(measurements, motion[0]))
@@ -337,7 +340,9 @@ def measure_freely(
     measured = measurements_of_curve(curve, timing, bands.band_step)
     fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * timing.row_time), record)
     motion = _motion(fit)
-    rows = GroupedFrames(frame_groups(stack_spectra(stack.images, stack.valid), timing, motion), timing)
+    rows = GroupedFrames(
+        frame_groups(stack_spectra(stack.images, stack.valid), timing, motion.to(stack.images.device)), timing
+    )
     return *_rounds(rows, motion, spacing, record, iterations), spacing
 
 
@@ -364,16 +369,21 @@ def start_curve(
     return rowwise, curve, (float(starts[0]), end)
 
 
-def residual_of_motion(measured: Measurements, motion: Motion) -> Tensor:
-    """Residual displacements (1, N, G, 2) in px of a motion (not a batch)."""
-    predicted = motion.mean_displacement(measured.exposure_starts, measured.exposure_time)
-    return measured.relative(measured.displacements - predicted)
+def residual_of_motion(measured: Measurements, motion: Motion) -> Array:
+    """Residual displacements (1, N, G, 2) in px of a motion (not a batch, on the CPU)."""
+    return measured.relative(measured.displacements - _moved(measured, motion))
 
 
-def rms_motion(measured: Measurements, motion: Motion) -> Tensor:
-    """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion (not a batch)."""
-    moved = measured.relative(motion.mean_displacement(measured.exposure_starts, measured.exposure_time))[0]
-    return moved.square().sum(1).div(measured.num_differences[0].clamp(min=1.0)[:, None]).mean(0).sqrt()
+def rms_motion(measured: Measurements, motion: Motion) -> Array:
+    """(2,) px, rms displacement of scene rows about their mean over the frames, by a motion as above."""
+    moved = measured.relative(_moved(measured, motion))[0]
+    square = np.square(moved).sum(1) / np.maximum(measured.num_differences[0], 1.0)[:, None]
+    return np.sqrt(square.mean(0))
+
+
+def _moved(measured: Measurements, motion: Motion) -> Array:
+    """Displacements (1, N, G, 2) in px of the rows by a motion."""
+    return table(motion.mean_displacement(tensor(measured.exposure_starts), measured.exposure_time))
 
 
 def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[list[Reason]]:
@@ -386,11 +396,11 @@ def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75
         motion: The motion (not a batch).
         counted: Fraction of the bands that count, the best ones: clouds may cover the others.
     """
-    used = banded.weights[0].amin(-1) > 0
+    used = banded.weights[0].min(-1) > 0
     values, rest = (x[0, used, 1] - x[0, used, 0] for x in (banded.displacements, residual_of_motion(banded, motion)))
-    size = (values - values.mean(0)).abs().mean(0).tolist()
+    size = np.abs(values - values.mean(0)).mean(0).tolist()
     count = math.ceil(counted * len(rest))
-    residual = rest.abs().sort(dim=0).values[:count].mean(0).tolist()
+    residual = np.sort(np.abs(rest), 0)[:count].mean(0).tolist()
     allowed = [max(0.1, 0.3 * axis) for axis in size]  # px; smaller ones are errors of registration, as for tones
     compared = zip(AXIS_NAMES, residual, allowed, strict=False)
     return [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
@@ -465,10 +475,9 @@ def _fit_spline(
     first, last = record
     axes = measurements.displacements.shape[-1]
     count = math.ceil((last - first) / spacing) + 3
-    device = measurements.exposure_starts.device
     shape = _SplineFit(
-        torch.zeros(axes, count, dtype=torch.float64, device=device),
-        torch.zeros(axes, 0, 0, device=device, dtype=torch.float32),
+        torch.zeros(axes, count, dtype=torch.float64, device="cpu"),
+        torch.zeros(axes, 0, 0, dtype=torch.float64, device="cpu"),
         first,
         spacing,
     )
@@ -478,10 +487,8 @@ def _fit_spline(
 
 def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: bool) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of one axis and their covariance (N, N)."""
-    values = (measurements.displacements[..., axis] * measurements.visible)[0]
-    weight = measurements.inverse_variances[0, :, axis]  # the other axes being unknown too
-    if measurements.information.shape[-1] == 2:
-        weight = precision_of_axis(measurements.information[0], axis)
+    values = tensor((measurements.displacements[..., axis] * measurements.visible)[0])
+    weight = tensor(measurements.inverse_variances[0, :, axis])  # the other axes being unknown too
     count = shape.coefficients.shape[-1]
     gram = torch.zeros(count, count, dtype=torch.float64, device=values.device)
     right = torch.zeros(count, dtype=torch.float64, device=values.device)
@@ -495,7 +502,7 @@ def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: b
         right[used] += weighted.mT @ values[part].flatten()
     energy = (weight[:, None] * values.square()).sum()
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
-    known = ((measurements.num_differences[0] * (weight > 0)).sum() * measurements.independent).clamp(min=1.0)
+    known = max(float(measurements.num_measurements[0, axis]), 1.0)
     scale = gram.diagonal().mean() + 1e-300
     second = torch.eye(count, dtype=torch.float64, device=values.device).diff(n=2, dim=0)
     bend = second.mT @ second
@@ -525,7 +532,7 @@ def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: b
 
 def _design(measurements: Measurements, shape: _SplineFit, axis: int, part: slice) -> Tensor:
     """Derivatives (n, G, N) of the relative displacements of some scene rows by the coefficients of an axis."""
-    exposure_starts = measurements.exposure_starts[0, part]
+    exposure_starts = tensor(measurements.exposure_starts[0, part])
     average = measurements.average_times[axis if axis < 2 else 0] + measurements.exposure_time
     nodes, weights = gauss_legendre(3 + math.ceil(2 * average / shape.spacing))
     first = exposure_starts + 0.5 * (measurements.exposure_time - average)
@@ -533,17 +540,9 @@ def _design(measurements: Measurements, shape: _SplineFit, axis: int, part: slic
     for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
         at = (first + average * node).flatten()
         columns = columns + weight * shape.columns(at).unflatten(0, exposure_starts.shape)
-    seen = measurements.visible[0, part][..., None]
+    seen = tensor(measurements.visible[0, part])[..., None]
     mean = (seen * columns).sum(1, keepdim=True) / seen.sum(1, keepdim=True).clamp(min=1.0)
     return seen * (columns - mean)
-
-
-def precision_of_axis(information: Tensor, axis: int) -> Tensor:
-    """(N,) inverse variance of one axis from information (N, 2, 2), the other axis being unknown too."""
-    other = information[:, 1 - axis, 1 - axis]
-    own = information[:, axis, axis]
-    cross = information[:, 0, 1].square() / torch.where(other > 0, other, 1.0)
-    return torch.where(other > 0, own - cross, own).clamp(min=0.0)
 
 
 def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
@@ -598,7 +597,7 @@ def _report(
     starts: Tensor,
     scale: FieldScale,
     of_bands: list[list[Reason]],
-    apart: Tensor,
+    apart: Array,
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at up to 32 rows of every frame.
 
@@ -626,7 +625,7 @@ def _report(
     std = variance(columns - mean).sqrt().unflatten(0, times.shape)
     std_seen = variance(visible).mean(0).sqrt()
     unseen = variance(common - mean).mean(0).sqrt()
-    rest = measured.unexplained(residual_of_motion(measured, motion))[0]
+    rest = tensor(measured.unexplained(residual_of_motion(measured, motion))[0])
     value = motion.displacement(times)
     value = value - value.mean((0, 1))
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
@@ -659,10 +658,10 @@ def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Tensor
     Returns:
         (S, N), the displacement in each frame less the mean over the frames; (R, N), that mean.
     """
-    seen = measured.visible[0]
+    seen = tensor(measured.visible[0])
     several = seen.sum(-1) > 1
     seen = seen[several]
-    exposure_starts = measured.exposure_starts[0, several] + 0.5 * measured.exposure_time
+    exposure_starts = tensor(measured.exposure_starts[0])[several] + 0.5 * measured.exposure_time
     columns = fit.columns(exposure_starts.flatten()).unflatten(0, seen.shape)
     mean = (seen[..., None] * columns).sum(1) / seen.sum(-1)[:, None]
     return (columns - mean[:, None])[seen > 0], mean

@@ -15,12 +15,12 @@ from rsvib_torch.core.precision import full_precision, outside_graphs, without_g
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
+from rsvib_torch.core.tables import table, tensor
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import (
     bands_reasons,
-    precision_of_axis,
     residual_of_motion,
     rms_motion,
     start_curve,
@@ -237,10 +237,12 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     def motion_of(values: Tensor) -> FreeMotion:
         return _motion(values, record, _step(values, record, rowwise))
 
-    groups = frame_groups(stack_spectra(stack.images, stack.valid), rowwise, motion_of(fits).expanded(1))
+    groups = frame_groups(
+        stack_spectra(stack.images, stack.valid), rowwise, motion_of(fits).expanded(1).to(stack.images.device)
+    )
     for _ in range(iterations):
         motion = motion_of(fits)
-        measured, _ = measure_groups(groups, rowwise, motion.expanded(1))
+        measured, _ = measure_groups(groups, rowwise, motion.expanded(1).to(stack.images.device))
         weighed = measured.reweighted(residual_of_motion(measured, motion))
         solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
         starts = [one[0][:4] for one in solved]
@@ -251,12 +253,12 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     motion = motion_of(fits)
     residual = residual_of_motion(measured, motion)
     independent = weighed.independent_fraction(residual) * measured.share_counted(residual)
-    rest = measured.unexplained(residual)[0]
-    covariances = covariances / independent
-    others = [_equally_good(one, float(independent), covariances[axis]) for axis, one in enumerate(solved)]
-    times = measured.exposure_starts[0] + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
+    rest = tensor(measured.unexplained(residual)[0])
+    covariances = covariances / float(independent[0])
+    others = [_equally_good(one, float(independent[0]), covariances[axis]) for axis, one in enumerate(solved)]
+    times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
     uncertain = torch.stack([_rms_std(_relative(measured, _columns(times, fits[i])), covariances[i]) for i in range(2)])
-    moved, frames = rms_motion(measured, motion), len(stack.images[0])
+    moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
     against = bands_reasons(banded, motion)
     return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, frames)
 
@@ -305,7 +307,7 @@ def _columns(times: Tensor, fits: Tensor) -> Tensor:
 
 def _relative(measured: Measurements, values: Tensor) -> Tensor:
     """Values (N, G, P) less their mean over the frames that contain the row."""
-    return measured.relative(values[None])[0]
+    return tensor(measured.relative(table(values)[None])[0])
 
 
 def _start(measured: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
@@ -321,7 +323,6 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
             f"frames cover {span:.3g} s; starts of the swept model up to {highest:.4g} Hz are searched in at most "
             f"{longest:.3g} s: pass fewer frames, or larger band_rows for lower frequencies"
         )
-    device = measured.exposure_starts.device
     grid = []
     for frequency in torch.arange(0.5 / span, highest, 0.5 / span, dtype=torch.float32, device="cpu").tolist():
         sweep = 1.5 * frequency / span  # Hz/s, at most
@@ -331,10 +332,10 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
             for step in range(-steps, steps + 1)
             for decay in (-4.0, 0.0, 4.0, 10.0, 20.0)  # e-folds in the record
         ]
-    fits = torch.tensor(grid, dtype=torch.float64, device=device)
-    weight = precision_of_axis(measured.information[0], axis)
-    values = (measured.displacements[0, ..., axis] * measured.visible[0])[..., None]
-    times = measured.exposure_starts[0] + 0.5 * measured.exposure_time - middle
+    fits = torch.tensor(grid, dtype=torch.float64, device="cpu")
+    weight = tensor(measured.inverse_variances[0, :, axis])
+    values = tensor(measured.displacements[0, ..., axis] * measured.visible[0])[..., None]
+    times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - middle
     drift = _relative(measured, times[..., None])[..., 0]
     gains = []
     for part in fits.split(32):  # (N, G, 32, 3) values at a time
@@ -375,13 +376,13 @@ def _settle(
         tone, and chi-square less that of the best fit (S,).
     """
     middle = 0.5 * (record[0] + record[1])
-    weight = precision_of_axis(measured.information[0], axis)
-    values = measured.displacements[0, ..., axis] * measured.visible[0]
-    known = ((measured.num_differences[0] * (weight > 0)).sum() * measured.independent).clamp(min=7.0)
+    weight = tensor(measured.inverse_variances[0, :, axis])
+    values = tensor(measured.displacements[0, ..., axis] * measured.visible[0])
+    known = max(float(measured.num_measurements[0, axis]), 7.0)
     row_weight = weight[:, None].expand_as(values)
     # a displacement is a mean over the exposure and the rows of a band
     duration = measured.exposure_time + measured.average_times[axis]
-    first = measured.exposure_starts[0] + 0.5 * (measured.exposure_time - duration) - middle
+    first = tensor(measured.exposure_starts[0]) + 0.5 * (measured.exposure_time - duration) - middle
     nodes, shares = gauss_legendre(4)
     quadrature = list(zip(nodes.tolist(), shares.tolist(), strict=True))
 

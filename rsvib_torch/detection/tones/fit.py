@@ -10,10 +10,11 @@ from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 import torch
-from torch import Tensor
-from torch.nn import functional
+from scipy.linalg import block_diag
 
+from rsvib_torch.core.tables import Array, split_axis, tensor, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
@@ -38,8 +39,9 @@ __all__ = [
     "offset_gain",
     "residual_of",
     "select_stacks",
-    "shrunk_motion",
+    "shrunk",
     "strongest_only",
+    "tone_displacements",
     "tone_response",
     "vibration_of_fit",
     "with_axes",
@@ -88,41 +90,41 @@ class ToneFit:
         model: Structure of the motion.
     """
 
-    coefficients: Tensor
-    frequencies: Tensor
-    active: Tensor
-    drift: Tensor
-    covariance: Tensor
-    centre: Tensor
+    coefficients: Array
+    frequencies: Array
+    active: Array
+    drift: Array
+    covariance: Array
+    centre: Array
     model: MotionModel
 
     @property
-    def tones(self) -> Tensor:
+    def tones(self) -> Array:
         """(B, 2, K, 3) Re C, Im C and f."""
-        return torch.stack([self.coefficients.real, self.coefficients.imag, self.frequencies], -1)
+        return np.stack([self.coefficients.real, self.coefficients.imag, self.frequencies], -1)
 
     @property
-    def parameters(self) -> Tensor:
+    def parameters(self) -> Array:
         """(B, 2, P) parameters of each axis, in the order of the covariance."""
-        return torch.cat([self.tones.flatten(-2), self.drift], -1)
+        return np.concatenate([self.tones.reshape(*self.drift.shape[:2], -1), self.drift], -1)
 
     @property
-    def amplitude(self) -> Tensor:
+    def amplitude(self) -> Array:
         """(B, 2, K) px, 0 for tones that are not active."""
-        return torch.where(self.active, self.coefficients.abs(), 0.0)
+        return np.where(self.active, np.abs(self.coefficients), 0.0)
 
-    def about(self, centre: Tensor) -> "ToneFit":
+    def about(self, centre: Array) -> "ToneFit":
         """The same motion with another centre (B,) in s; only the covariance is not changed."""
         moved = (centre - self.centre)[:, None]
         turn = 2 * math.pi * self.frequencies * moved[..., None]
         drift = self.drift
         if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
-            drift = torch.stack([drift[..., 0] + drift[..., 1] * moved, drift[..., 1]], -1)
-        turned = self.coefficients * torch.complex(turn.cos(), turn.sin())
+            drift = np.stack([drift[..., 0] + drift[..., 1] * moved, drift[..., 1]], -1)
+        turned = self.coefficients * np.exp(1j * turn)
         return replace(self, coefficients=turned, drift=drift, centre=centre)
 
 
-def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
+def tone_response(measurements: Measurements, frequencies: Array) -> Array:
     """Relative displacements that unit tones cause at the measurements.
 
     ``S(f) exp(2 pi i f (t - centre))`` at the mid-exposures t of the rows, less the mean over the frames of the group.
@@ -137,43 +139,43 @@ def tone_response(measurements: Measurements, frequencies: Tensor) -> Tensor:
     Returns:
         complex128 (B, N, G, 2, K).
     """
-    attenuation = torch.sinc(frequencies * measurements.smearing_times).prod(0)[:, None, None]
+    attenuation = np.sinc(frequencies * measurements.smearing_times).prod(0)[:, None, None]
     angle = 2 * math.pi * frequencies[:, None, None] * measurements.middles
-    return measurements.relative(torch.complex(attenuation * angle.cos(), attenuation * angle.sin()))
+    return measurements.relative(attenuation * np.exp(1j * angle))
 
 
-def drift_response(measurements: Measurements, order: int) -> Tensor:
+def drift_response(measurements: Measurements, order: int) -> Array:
     """Relative displacements (B, N, G, J) of unit drifts s^j / j!, averaged over the exposure."""
     return measurements.drifts[..., :order]
 
 
-def model_displacements(measurements: Measurements, fit: ToneFit) -> Tensor:
+def model_displacements(measurements: Measurements, fit: ToneFit) -> Array:
     """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
     fit = fit.about(measurements.centre)
     tones = fit.coefficients[:, None, None] * tone_response(measurements, fit.frequencies)
     response = drift_response(measurements, fit.drift.shape[-1])
-    return tones.real.sum(-1) + torch.einsum("bngj,baj->bnga", response, fit.drift)
+    return tones.real.sum(-1) + np.einsum("bngj,baj->bnga", response, fit.drift)
 
 
-def residual_of(measurements: Measurements, fit: ToneFit) -> Tensor:
+def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
     """Residual displacements (B, N, G, 2) in px of a fit."""
     return measurements.relative(measurements.displacements - model_displacements(measurements, fit))
 
 
-def select_stacks(where: Tensor, one: Result, other: Result) -> Result:
-    """Dataclass of batched tensors with the stacks of ``one`` where ``where`` (B,) is true, else those of ``other``."""
+def select_stacks(where: Array, one: Result, other: Result) -> Result:
+    """Dataclass of batched arrays with the stacks of ``one`` where ``where`` (B,) is true, else those of ``other``."""
     chosen = {}
     for field in fields(one):
         first, second = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(first, Tensor):
-            chosen[field.name] = torch.where(where.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
+        if isinstance(first, np.ndarray):
+            chosen[field.name] = np.where(where.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
     return replace(one, **chosen)
 
 
 # --- Weighted least squares ---
 
 
-def _jacobian_of_tones(smearing_times: Tensor, time: Tensor, tones: Tensor) -> Tensor:
+def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Array:
     """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C and f of each tone.
 
     Args:
@@ -184,29 +186,29 @@ def _jacobian_of_tones(smearing_times: Tensor, time: Tensor, tones: Tensor) -> T
     frequencies = tones[..., 2]
     smeared, smeared_slope = _sinc(frequencies * smearing_times)
     attenuation = smeared[0] * smeared[1]
-    slope = (smeared_slope * smearing_times * smeared.flip(0)).sum(0)
+    slope = (smeared_slope * smearing_times * smeared[::-1]).sum(0)
     # the frequency changes the attenuation and the angle: Re((slope + 2 pi i time attenuation) C exp(i angle))
-    by_attenuation = (tones[..., :2] * slope[..., None])[:, None, None].unbind(-1)
-    by_angle = (tones[..., :2] * (2 * math.pi * attenuation)[..., None])[:, None, None].unbind(-1)
+    by_attenuation = np.moveaxis((tones[..., :2] * slope[..., None])[:, None, None], -1, 0)
+    by_angle = np.moveaxis((tones[..., :2] * (2 * math.pi * attenuation)[..., None])[:, None, None], -1, 0)
     angle = (2 * math.pi * frequencies)[:, None, None] * time
-    cos, sin, attenuation = angle.cos(), angle.sin(), attenuation[:, None, None]
-    by_frequency = cos * torch.addcmul(by_attenuation[0], time, by_angle[1], value=-1)
-    by_frequency.addcmul_(sin, torch.addcmul(by_attenuation[1], time, by_angle[0]), value=-1)
-    return torch.stack([attenuation * cos, -attenuation * sin, by_frequency], dim=-1).flatten(-2)
+    cos, sin, attenuation = np.cos(angle), np.sin(angle), attenuation[:, None, None]
+    by_frequency = cos * (by_attenuation[0] - time * by_angle[1]) - sin * (by_attenuation[1] + time * by_angle[0])
+    by_tones = np.stack([attenuation * cos, -attenuation * sin, by_frequency], -1)
+    return by_tones.reshape(*angle.shape[:-1], -1)
 
 
-def _sinc(x: Tensor) -> tuple[Tensor, Tensor]:
+def _sinc(x: Array) -> tuple[Array, Array]:
     """sin(pi x) / (pi x) of x >= 0 and its derivative, which is -3e-4 instead of 0 below 1e-4."""
-    value, positive = torch.sinc(x), x.clamp(min=1e-4)
-    return value, ((math.pi * positive).cos() - torch.sinc(positive)) / positive
+    value, positive = np.sinc(x), np.maximum(x, 1e-4)
+    return value, (np.cos(math.pi * positive) - np.sinc(positive)) / positive
 
 
 @cache
-def _constraints(model: MotionModel, tones: int, axes: int, device: torch.device) -> Tensor:
+def _constraints(model: MotionModel, tones: int, axes: int) -> Array:
     """Matrix (A (3 K + J), A M) from the free parameters of A axes to all: harmonics share a frequency."""
     families = tones // model.harmonics
     count = 2 * tones + families + model.drift_order
-    matrix = torch.zeros(3 * tones + model.drift_order, count, dtype=torch.float64, device="cpu")
+    matrix = np.zeros((3 * tones + model.drift_order, count))
     column = 0
     for tone in range(tones):
         harmonic = tone % model.harmonics
@@ -217,8 +219,8 @@ def _constraints(model: MotionModel, tones: int, axes: int, device: torch.device
         column += 3 if harmonic == 0 else 2
     for power in range(model.drift_order):
         matrix[3 * tones + power, column + power] = 1.0
-    of_axes: Tensor = torch.block_diag(*[matrix] * axes)
-    return of_axes.to(device)
+    of_axes: Array = block_diag(*[matrix] * axes)
+    return of_axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,12 +236,12 @@ class _Estimate:
         right: (B, M) its right-hand side.
     """
 
-    values: Tensor
-    jacobian: Tensor
-    residual: Tensor
-    cost: Tensor
-    matrix: Tensor
-    right: Tensor
+    values: Array
+    jacobian: Array
+    residual: Array
+    cost: Array
+    matrix: Array
+    right: Array
 
 
 class _Problem:
@@ -251,103 +253,102 @@ class _Problem:
         model: Structure of the motion.
     """
 
-    def __init__(self, measurements: Measurements, active: Tensor, model: MotionModel) -> None:
+    def __init__(self, measurements: Measurements, active: Array, model: MotionModel) -> None:
         self.measurements, self.active, self.model = measurements, active, model
         (self.axes, self.tones), order = active.shape[1:], model.drift_order
-        self.to_all: Tensor | None = None  # (A P, M); None: all parameters are free
+        self.to_all: Array | None = None  # (A P, M); None: all parameters are free
         if model.harmonics > 1:
-            self.to_all = _constraints(model, self.tones, self.axes, active.device)
-        exists = functional.pad(active.repeat_interleave(3, -1), (0, order), value=True)
-        place = torch.arange(exists.shape[-1], device=active.device)
+            self.to_all = _constraints(model, self.tones, self.axes)
+        exists = np.pad(np.repeat(active, 3, -1), ((0, 0), (0, 0), (0, order)), constant_values=True)
+        place = np.arange(exists.shape[-1])
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
         self.free, self.linear = (self._of_free(these) for these in (exists, exists & ~self.is_frequency))  # (B, M)
-        self.drift_columns = drift_response(measurements, order)[..., None, :].expand(-1, -1, -1, self.axes, -1)
+        drift = drift_response(measurements, order)[..., None, :]
+        self.drift_columns = np.repeat(drift, self.axes, -2)  # (B, N, G, A, J)
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 
-    def _of_free(self, parameters: Tensor) -> Tensor:
+    def _of_free(self, parameters: Array) -> Array:
         """(B, M) bool, free parameters that change any of the parameters (B, 2, P)."""
-        these = parameters.flatten(1)
-        return these if self.to_all is None else these.double() @ self.to_all > 0
+        these = parameters.reshape(len(parameters), -1)
+        return these if self.to_all is None else these.astype(np.float64) @ self.to_all > 0
 
-    def tones_of(self, values: Tensor) -> Tensor:
+    def tones_of(self, values: Array) -> Array:
         """Tones (B, 2, K, 3) of parameters (B, 2, P), as in ``_jacobian_of_tones``."""
-        tones: Tensor = values[..., : 3 * self.tones].unflatten(-1, (self.tones, 3))
-        return tones
+        return split_axis(values[..., : 3 * self.tones], -1, self.tones, 3)
 
-    def fit(self, values: Tensor, covariance: Tensor) -> ToneFit:
+    def fit(self, values: Array, covariance: Array) -> ToneFit:
         """The parameters (B, 2, P) as a ``ToneFit``."""
-        real, imaginary, frequencies = self.tones_of(values).unbind(-1)
-        coefficients, drift = torch.complex(real, imaginary), values[..., 3 * self.tones :]
+        real, imaginary, frequencies = np.moveaxis(self.tones_of(values), -1, 0)
+        coefficients, drift = real + 1j * imaginary, values[..., 3 * self.tones :]
         centre = self.measurements.centre
         return ToneFit(coefficients, frequencies, self.active, drift, covariance, centre, self.model)
 
-    def jacobian(self, values: Tensor) -> Tensor:
+    def jacobian(self, values: Array) -> Array:
         """Derivatives (B, N, G, 2, P) of the displacements of each axis by its parameters (B, 2, P)."""
         measurements = self.measurements
         tones = _jacobian_of_tones(measurements.smearing_times, measurements.middles, self.tones_of(values))
-        return torch.cat([measurements.relative(tones), self.drift_columns], dim=-1)
+        return np.concatenate([measurements.relative(tones), self.drift_columns], -1)
 
     @property
-    def num_spare(self) -> Tensor:
+    def num_spare(self) -> Array:
         """(B, 2) number of independent measurements of each axis, less that of its free parameters."""
         # `num_measurements` counts independent measurements only: overlapping bands repeat each other
-        spare: Tensor = self.measurements.num_measurements - self.free.unflatten(1, (self.axes, -1)).sum(-1)
-        return spare
+        return self.measurements.num_measurements - split_axis(self.free, 1, self.axes, -1).sum(-1)
 
-    def variances(self, state: _Estimate) -> Tensor:
+    def variances(self, state: _Estimate) -> Array:
         """(B, 2) variance of the errors of each axis, in units of those of the measurements, from the residual."""
-        spare = self.num_spare.clamp(min=1.0)
+        spare = np.maximum(self.num_spare, 1.0)
         if self.axes > 2:  # unequal variances would not keep the precise combinations of correlated components
-            return (state.cost / spare.sum(-1))[:, None].expand_as(spare)
+            return np.broadcast_to((state.cost / spare.sum(-1))[:, None], spare.shape)
         return self.measurements.square(state.residual) / spare
 
-    def covariance(self, state: _Estimate, deviation: Tensor) -> Tensor:
+    def covariance(self, state: _Estimate, deviation: Array) -> Array:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
-        matrix, scale = _scaled(state, self.free, torch.zeros_like(state.cost))
-        inverse = torch.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
+        matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
+        inverse = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
         # W = R^T R, and the whitened errors R e have the covariance T T^T with T = R S R^-1; T^T R = R^-T S W
-        diagonal = self.root.diagonal(dim1=-2, dim2=-1)
-        safe = self.root + torch.diag_embed((diagonal == 0).to(diagonal))
+        diagonal = self.root.diagonal(axis1=-2, axis2=-1)
+        safe = self.root + (diagonal == 0)[..., None] * np.eye(self.axes)
         scaled = deviation[:, None, None, :, None] * (self.root.mT @ self.root)
-        mixed = torch.linalg.solve_triangular(safe.mT, scaled, upper=False)  # (B, N, 1, A, A)
+        mixed = np.linalg.solve(safe.mT, scaled)  # (B, N, 1, A, A)
         to_all = inverse if self.to_all is None else self.to_all @ inverse
         columns = self._whitened(mixed, state.jacobian) @ to_all
-        covariance: Tensor = columns.mT @ columns
+        covariance = columns.mT @ columns
         return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
 
     @staticmethod
-    def _whitened(root: Tensor, jacobian: Tensor) -> Tensor:
+    def _whitened(root: Array, jacobian: Array) -> Array:
         """Derivatives (B, N G A, A P) of the displacements times ``root``, from those of each axis (B, N, G, A, P)."""
-        factors = root.repeat_interleave(jacobian.shape[-1], -1)  # long inner loops are twice as fast
-        return (factors * jacobian.flatten(-2)[..., None, :]).flatten(1, 3)
+        factors = np.repeat(root, jacobian.shape[-1], -1)  # long inner loops are twice as fast
+        return (factors * jacobian.reshape(*jacobian.shape[:-2], 1, -1)).reshape(len(jacobian), -1, factors.shape[-1])
 
-    def evaluate(self, values: Tensor) -> _Estimate:
+    def evaluate(self, values: Array) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
         jacobian = self.jacobian(values)
-        linear = values.masked_fill(self.is_frequency, 0.0)[:, None, None]
+        linear = np.where(self.is_frequency, 0.0, values)[:, None, None]
         residual = self.measurements.displacements - (jacobian * linear).sum(-1)
-        whitened = (self.root @ residual[..., None]).flatten(1)[..., None]
+        whitened = (self.root @ residual[..., None]).reshape(len(residual), -1, 1)
         columns = self._whitened(self.root, jacobian)
         if self.to_all is not None:
             columns = columns @ self.to_all
         right = (columns.mT @ whitened)[..., 0]
-        return _Estimate(values, jacobian, residual, whitened.square().sum((1, 2)), columns.mT @ columns, right)
+        return _Estimate(values, jacobian, residual, np.square(whitened).sum((1, 2)), columns.mT @ columns, right)
 
-    def moved(self, values: Tensor, step: Tensor) -> Tensor:
+    def moved(self, values: Array, step: Array) -> Array:
         """Parameters after a step (B, M) of the free ones; frequencies stay positive."""
-        values = values + (step if self.to_all is None else step @ self.to_all.T).unflatten(1, (self.axes, -1))
-        return torch.where(self.is_frequency, values.abs(), values)
+        values = values + (step if self.to_all is None else step @ self.to_all.T).reshape(values.shape)
+        return np.where(self.is_frequency, np.abs(values), values)
 
-    def is_lone_and_resolved(self, values: Tensor) -> Tensor:
+    def is_lone_and_resolved(self, values: Array) -> Array:
         """(B,) bool, one tone of each axis, of half a period or more: valleys of others lead to tones of 1e4 px."""
         periods = self.tones_of(values)[..., 2] * self.measurements.span[:, None, None]
-        return (self.tones == 1) & ((periods >= 0.5) | ~self.active).flatten(1).all(1)
+        return (self.tones == 1) & ((periods >= 0.5) | ~self.active).all((1, 2))
 
     def with_best_amplitudes(self, state: _Estimate) -> _Estimate:
         """The estimate with the amplitudes, phases and drifts that fit its frequencies best."""
-        return self.evaluate(self.moved(state.values, _step(state, self.linear, torch.zeros_like(state.cost))))
+        return self.evaluate(self.moved(state.values, _step(state, self.linear, np.zeros_like(state.cost))))
 
-    def solve(self, start: Tensor | ToneFit, iterations: int, tolerance: float) -> _Estimate:
+    def solve(self, start: Array | ToneFit, iterations: int, tolerance: float) -> _Estimate:
         """Levenberg-Marquardt from start frequencies or another fit, each stack on its own.
 
         Args:
@@ -358,15 +359,15 @@ class _Problem:
         # 1. Start values.
         if isinstance(start, ToneFit):
             start = start.about(self.measurements.centre)
-            tones = torch.where(self.active[..., None], start.tones, 0.0)
-            state = self.evaluate(torch.cat([tones.flatten(-2), start.drift], -1))
+            tones = np.where(self.active[..., None], start.tones, 0.0)
+            state = self.evaluate(np.concatenate([tones.reshape(*tones.shape[:2], -1), start.drift], -1))
         else:  # amplitudes, phases and drifts are linear once the frequencies are given
-            values = start.new_zeros(len(start), self.axes, len(self.is_frequency))
-            values[..., self.is_frequency] = torch.where(self.active, start, 0.0)
+            values = np.zeros((len(start), self.axes, len(self.is_frequency)))
+            values[..., self.is_frequency] = np.where(self.active, start, 0.0)
             state = self.with_best_amplitudes(self.evaluate(values))
         # 2. Damped steps. A step that decreases the cost is taken, and the damping of a stack decreases or increases.
-        damping = torch.full_like(state.cost, 1e-3)
-        done = torch.zeros_like(state.cost, dtype=torch.bool)
+        damping = np.full_like(state.cost, 1e-3)
+        done = np.zeros_like(state.cost, dtype=bool)
         for _ in range(iterations):
             step = _step(state, self.free, damping)
             done = done | ((step * state.right).sum(-1) <= tolerance * state.cost)
@@ -381,29 +382,30 @@ class _Problem:
             better = trial.cost <= state.cost
             taken = better & ~done
             state = trial if bool(taken.all()) else select_stacks(taken, trial, state)
-            damping = torch.where(better, damping * 0.1, damping * 10.0).clamp(1e-12, 1e6)
+            damping = np.clip(np.where(better, damping * 0.1, damping * 10.0), 1e-12, 1e6)
         return state
 
 
-def _scaled(state: _Estimate, free: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+def _scaled(state: _Estimate, free: Array, damping: Array) -> tuple[Array, Array]:
     """Damped normal matrix of the ``free`` (B, M) parameters, each divided by its size, and the factors (B, M)."""
-    size = state.matrix.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where(free & (size > 1e-200), size.clamp(min=1e-200).rsqrt(), 0.0)
+    size = state.matrix.diagonal(axis1=-2, axis2=-1)
+    scale = np.where(free & (size > 1e-200), 1 / np.sqrt(np.maximum(size, 1e-200)), 0.0)
     matrix = state.matrix * scale[:, :, None] * scale[:, None]
-    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(free, 1e-12 + damping[:, None], 1.0))
+    place = np.arange(matrix.shape[-1])
+    matrix[:, place, place] += np.where(free, 1e-12 + damping[:, None], 1.0)
     return matrix, scale
 
 
-def _step(state: _Estimate, free: Tensor, damping: Tensor) -> Tensor:
+def _step(state: _Estimate, free: Array, damping: Array) -> Array:
     """Step (B, M) of the ``free`` (B, M) parameters."""
     matrix, scale = _scaled(state, free, damping)
-    scaled: Tensor = torch.linalg.solve(matrix, state.right * scale)
+    scaled: Array = np.linalg.solve(matrix, (state.right * scale)[..., None])[..., 0]
     return scaled * scale
 
 
 def fit_roughly(
-    measurements: Measurements, start: Tensor | ToneFit, active: Tensor, model: MotionModel, iterations: int = 5
-) -> tuple[ToneFit, Tensor]:
+    measurements: Measurements, start: Array | ToneFit, active: Array, model: MotionModel, iterations: int = 5
+) -> tuple[ToneFit, Array]:
     """A few steps of ``fit_tones``, as a start for another fit.
 
     Returns:
@@ -416,8 +418,8 @@ def fit_roughly(
 
 def fit_tones(
     measurements: Measurements,
-    start: Tensor | ToneFit,
-    active: Tensor,
+    start: Array | ToneFit,
+    active: Array,
     model: MotionModel | None = None,
     iterations: int = 30,
 ) -> ToneFit:
@@ -440,7 +442,7 @@ def fit_tones(
     """
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations, tolerance=1e-7)
-    return problem.fit(state.values, problem.covariance(state, problem.variances(state).sqrt()))
+    return problem.fit(state.values, problem.covariance(state, np.sqrt(problem.variances(state))))
 
 
 def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
@@ -460,56 +462,57 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
     fit = fit.about(measurements.centre)
     state = problem.evaluate(fit.parameters)
     whole = measurements.square(measurements.relative(measurements.displacements))
-    largest = whole / measurements.num_measurements.clamp(min=1.0)
-    variances = torch.where(unknown, largest, problem.variances(state))
-    return replace(fit, covariance=problem.covariance(state, variances.sqrt()))
+    largest = whole / np.maximum(measurements.num_measurements, 1.0)
+    variances = np.where(unknown, largest, problem.variances(state))
+    return replace(fit, covariance=problem.covariance(state, np.sqrt(variances)))
 
 
 # px, motion during an exposure; px and px/s, amplitude and drift; Hz. Fits beyond diverge: frames are smaller
 _MAX_PATH, _MAX_SIZE, _MAX_FREQUENCY = 1e3, 1e6, 1e9
 
 
-def is_bounded(fit: ToneFit, exposure_time: float) -> Tensor:
+def is_bounded(fit: ToneFit, exposure_time: float) -> Array:
     """(B,) bool, fits whose parameters are finite and of a size that frames can be warped by.
 
     Args:
         fit: With its covariance.
         exposure_time: T_e in seconds.
     """
-    amplitude, drift = fit.amplitude, fit.drift.abs().amax(-1)
-    cycles = (fit.frequencies * exposure_time).nan_to_num(0.0)
-    path = (amplitude * torch.minimum(2 * math.pi * cycles, 4 * cycles + 2)).sum(-1) + drift * exposure_time  # (B, A)
-    variances = fit.covariance.diagonal(dim1=-2, dim2=-1)
+    amplitude, drift = fit.amplitude, np.abs(fit.drift).max(-1)
+    cycles = without_nan(fit.frequencies * exposure_time, 0.0)
+    path = (amplitude * np.minimum(2 * math.pi * cycles, 4 * cycles + 2)).sum(-1) + drift * exposure_time  # (B, A)
+    variances = fit.covariance.diagonal(axis1=-2, axis2=-1)
     return (
-        ((path <= _MAX_PATH) & (amplitude.amax(-1) <= _MAX_SIZE) & (fit.frequencies.amax(-1) <= _MAX_FREQUENCY)).all(-1)
+        ((path <= _MAX_PATH) & (amplitude.max(-1) <= _MAX_SIZE) & (fit.frequencies.max(-1) <= _MAX_FREQUENCY)).all(-1)
         & (drift <= _MAX_SIZE * _MAX_PATH).all(-1)
-        & torch.isfinite(variances).all(-1)
+        & np.isfinite(variances).all(-1)
     )
 
 
 # --- Inversion ---
 
 
-def offset_gain(frequencies: Tensor, intervals: Tensor) -> Tensor:
+def offset_gain(frequencies: Array, intervals: Array) -> Array:
     """Largest gain (...) from displacement to offset (Eq. 7) of tones (...) over intervals (M,) s between frames."""
-    return 2 * torch.sin(math.pi * frequencies[..., None] * intervals).abs().amax(-1)
+    return 2 * np.abs(np.sin(math.pi * frequencies[..., None] * intervals)).max(-1)
 
 
-def motion_of_fit(fit: ToneFit) -> Vibration:
+def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration:
     """Vibration (B, 2, K) of a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8).
 
     Gain and exposure are part of the fit. Tones that are not active have amplitude and frequency 0.
     """
     centre = fit.centre[:, None, None]
-    frequency = torch.where(fit.active, fit.frequencies, 0.0)
-    phase = fit.coefficients.angle() + 0.5 * math.pi - 2 * math.pi * frequency * centre
-    phase = torch.remainder(phase + math.pi, 2 * math.pi) - math.pi
-    phase = torch.where(fit.active, phase, 0.0)
-    motion, acceleration = fit.drift[..., 0], torch.zeros_like(fit.drift[..., 0])
+    frequency = np.where(fit.active, fit.frequencies, 0.0)
+    phase = np.angle(fit.coefficients) + 0.5 * math.pi - 2 * math.pi * frequency * centre
+    phase = np.where(fit.active, np.mod(phase + math.pi, 2 * math.pi) - math.pi, 0.0)
+    motion, acceleration = fit.drift[..., 0], np.zeros_like(fit.drift[..., 0])
     if fit.drift.shape[-1] > 1:  # speed at the time origin instead of the middle of the record
         acceleration = fit.drift[..., 1]
         motion = motion - acceleration * centre[..., 0]
-    return Vibration(fit.amplitude, frequency, phase, motion, acceleration)
+    values = (fit.amplitude, frequency, phase, motion, acceleration)
+    tones, frequencies, phases, image_motion, image_acceleration = (tensor(part).to(device) for part in values)
+    return Vibration(tones, frequencies, phases, image_motion, image_acceleration)
 
 
 def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
@@ -519,43 +522,32 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
     """
     centre = fit.centre[:, None, None]
     real, imaginary, amplitude = _direction(fit)
-    zero = torch.zeros_like(real)
+    zero = np.zeros_like(real)
     gradients = [
-        torch.stack([real, imaginary, zero], -1),  # of the amplitude, frequency and phase
-        torch.stack([zero, zero, zero + 1.0], -1),
-        torch.stack([-imaginary / amplitude, real / amplitude, zero - 2 * math.pi * centre], -1),
+        np.stack([real, imaginary, zero], -1),  # of the amplitude, frequency and phase
+        np.stack([zero, zero, zero + 1.0], -1),
+        np.stack([-imaginary / amplitude, real / amplitude, zero - 2 * math.pi * centre], -1),
     ]
-    deviations = _propagated(fit, torch.stack(gradients))
-    if real.shape[-1] > 1:  # the order of the tones of a Vibration
-        order = fit.amplitude.argsort(dim=-1, descending=True, stable=True)
-        deviations = deviations.take_along_dim(order[None], -1)
-        frequencies, active = (values.take_along_dim(order, -1) for values in (fit.frequencies, fit.active))
-    else:
-        frequencies, active = fit.frequencies, fit.active
-    amplitude_deviation, frequency_deviation, phase_deviation = deviations
-    std = {
-        "amplitude": amplitude_deviation,
-        "frequency": frequency_deviation,
-        "period": frequency_deviation / torch.where(active & (frequencies > 0), frequencies, 1.0).square(),
-        "phase": phase_deviation,
-    }
+    deviations = _propagated(fit, np.stack(gradients))
+    order = (-fit.amplitude).argsort(-1, stable=True)  # the order of the tones of a Vibration
+    amplitude_std, frequency_std, phase_std = np.take_along_axis(deviations, order[None], -1)
+    frequency = np.take_along_axis(np.where(fit.active, fit.frequencies, 0.0), order, -1)
+    period_std = frequency_std / np.square(np.where(frequency > 0, frequency, 1.0))
     drift = _covariance_of_axes(fit)[..., 3 * fit.frequencies.shape[-1] :, 3 * fit.frequencies.shape[-1] :]
-    motion_variance, acceleration_variance = drift[..., 0, 0], torch.zeros_like(drift[..., 0, 0])
+    motion_variance, acceleration_variance = drift[..., 0, 0], np.zeros_like(drift[..., 0, 0])
     if fit.drift.shape[-1] > 1:
         acceleration_variance = drift[..., 1, 1]
         to_origin = centre[..., 0]
         motion_variance = (
-            motion_variance - 2 * to_origin * drift[..., 0, 1] + to_origin.square() * acceleration_variance
+            motion_variance - 2 * to_origin * drift[..., 0, 1] + np.square(to_origin) * acceleration_variance
         )
-    of_vibration = VibrationStd(
-        **std,
-        image_motion=motion_variance.clamp(min=0.0).sqrt(),
-        image_acceleration=acceleration_variance.clamp(min=0.0).sqrt(),
-    )
-    return motion_of_fit(fit), of_vibration
+    variances = np.maximum([motion_variance, acceleration_variance], 0.0)
+    motion_std, acceleration_std = np.sqrt(variances)
+    of_parameters = (amplitude_std, frequency_std, period_std, phase_std, motion_std, acceleration_std)
+    return motion_of_fit(fit), VibrationStd(*map(tensor, of_parameters))
 
 
-def displacement_std(fit: ToneFit, exposure_starts: Tensor, exposure_time: float) -> Tensor:
+def displacement_std(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
     """Standard deviation (B, 2) in px of the displacement of rows without their mean, rms over the rows.
 
     Args:
@@ -563,41 +555,47 @@ def displacement_std(fit: ToneFit, exposure_starts: Tensor, exposure_time: float
         exposure_starts: (N,) s, exposure starts of the rows.
         exposure_time: T_e in seconds.
     """
-    jacobian = displacement_jacobian(fit, exposure_starts.expand(len(fit.centre), -1), exposure_time)
-    jacobian = jacobian - jacobian.mean(1, keepdim=True)
+    jacobian = displacement_jacobian(fit, exposure_starts[None], exposure_time)
+    jacobian = jacobian - jacobian.mean(1, keepdims=True)
     covariance = _covariance_of_axes(fit)
-    jacobian = jacobian.transpose(1, 2)  # (B, A, N, P)
-    return ((jacobian @ covariance) * jacobian).sum(-1).clamp(min=0.0).mean(-1).sqrt()
+    jacobian = jacobian.swapaxes(1, 2)  # (B, A, N, P)
+    return np.sqrt(np.maximum(((jacobian @ covariance) * jacobian).sum(-1), 0.0).mean(-1))
 
 
-def displacement_jacobian(fit: ToneFit, exposure_starts: Tensor, exposure_time: float) -> Tensor:
+def displacement_jacobian(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
     """Derivatives (B, N, 2, P) of the mean displacements of exposures from starts (B, N) by the parameters."""
     time = (exposure_starts + 0.5 * exposure_time - fit.centre[:, None])[..., None, None, None]
-    smearing = torch.tensor([exposure_time, 0.0], dtype=time.dtype, device=time.device)[:, None, None, None]
-    axes = fit.coefficients.shape[1]
-    tones = _jacobian_of_tones(smearing.expand(2, 1, axes, 1), time, fit.tones)
-    powers = [time, 0.5 * time.square()][: fit.drift.shape[-1]]
-    drift = torch.cat(powers, -1).expand(*tones.shape[:-1], -1)
-    return torch.cat([tones, drift], -1)[:, :, 0]
+    tones = _jacobian_of_tones(np.array([exposure_time, 0.0])[:, None, None, None], time, fit.tones)
+    powers = [time, 0.5 * np.square(time)][: fit.drift.shape[-1]]
+    drift = np.broadcast_to(np.concatenate(powers, -1), (*tones.shape[:-1], len(powers)))
+    return np.concatenate([tones, drift], -1)[:, :, 0]
 
 
-def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
+def tone_displacements(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
+    """Mean displacements (B, N, A) in px of exposures from starts (N,) in s, by the tones without the image motion."""
+    jacobian = displacement_jacobian(fit, exposure_starts[None], exposure_time)
+    tones = np.where(np.arange(3) < 2, fit.tones, 0.0)  # the frequencies are not linear
+    count = 3 * fit.frequencies.shape[-1]
+    return (jacobian[..., :count] * tones.reshape(len(tones), 1, -1, count)).sum(-1)
+
+
+def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, Array]:
     """Derivatives (B, N, G, M) of the displacements of an axis by its free parameters, and the matrix (P, M) to all."""
     problem = _Problem(measurements, fit.active, fit.model)
     jacobian = problem.jacobian(fit.parameters)[..., axis, :]
-    free = problem.free.unflatten(1, (problem.axes, -1))[:, axis]
-    to_all = _constraints(fit.model, fit.active.shape[-1], 1, fit.active.device)
+    free = split_axis(problem.free, 1, problem.axes, -1)[:, axis]
+    to_all = _constraints(fit.model, fit.active.shape[-1], 1)
     return (jacobian @ to_all) * free[:, None, None], to_all
 
 
-def amplitude_std(fit: ToneFit) -> Tensor:
+def amplitude_std(fit: ToneFit) -> Array:
     """Standard deviation (B, 2, K) of the amplitudes in px; 0 for tones that are not active."""
     real, imaginary, _ = _direction(fit)
-    return _propagated(fit, torch.stack([real, imaginary, torch.zeros_like(real)], -1))
+    return _propagated(fit, np.stack([real, imaginary, np.zeros_like(real)], -1))
 
 
-def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
-    """Motion of a fit with uncertain amplitudes near blind frequencies reduced, for warping frames by it.
+def shrunk(fit: ToneFit, intervals: Array) -> ToneFit:
+    """The fit with uncertain amplitudes near blind frequencies reduced, for warping frames by its motion.
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
     where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays.
@@ -607,23 +605,21 @@ def shrunk_motion(fit: ToneFit, intervals: Tensor) -> Vibration:
         fit: With its covariance.
         intervals: (M,) s, times between the frames compared.
     """
-    blindness = 1 / (1 + (offset_gain(fit.frequencies, intervals) / MIN_GAIN).square())
-    noise = (amplitude_std(fit) / fit.coefficients.abs().clamp(min=1e-30)).square()
-    share = (1 - blindness * noise).clamp(min=0.0)
-    largest = share.new_tensor(LARGEST)[: share.shape[1], None]
-    share = torch.where(blindness * (fit.amplitude / largest).square() < 1, share, 0.0)
-    return motion_of_fit(replace(fit, coefficients=fit.coefficients * share))
+    blindness = 1 / (1 + np.square(offset_gain(fit.frequencies, intervals) / MIN_GAIN))
+    noise = np.square(amplitude_std(fit) / np.maximum(np.abs(fit.coefficients), 1e-30))
+    share = np.maximum(1 - blindness * noise, 0.0)
+    largest = np.array(LARGEST)[: share.shape[1], None]
+    share = np.where(blindness * np.square(fit.amplitude / largest) < 1, share, 0.0)
+    return replace(fit, coefficients=np.where(fit.active, fit.coefficients * share, 0.0))
 
 
 def strongest_only(fit: ToneFit) -> ToneFit:
     """The fit with only the strongest tone (or family) of each axis."""
     harmonics = fit.model.harmonics
-    family = fit.amplitude.unflatten(-1, (-1, harmonics)).sum(-1).argmax(-1)[..., None, None]
-    place = family.expand(-1, -1, 1, harmonics)
+    family = split_axis(fit.amplitude, -1, -1, harmonics).sum(-1).argmax(-1)[..., None, None]
 
-    def pick(values: Tensor) -> Tensor:
-        picked: Tensor = values.unflatten(-1, (-1, harmonics)).gather(2, place)[:, :, 0]
-        return picked
+    def pick(values: Array) -> Array:
+        return np.take_along_axis(split_axis(values, -1, -1, harmonics), family, 2)[:, :, 0]
 
     return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))
 
@@ -633,8 +629,8 @@ def with_axes(fit: ToneFit, axes: int) -> ToneFit:
     fit = strongest_only(fit)
     missing = axes - fit.active.shape[1]
 
-    def extended(values: Tensor) -> Tensor:
-        return functional.pad(values, (0, 0, 0, missing))
+    def extended(values: Array) -> Array:
+        return np.pad(values, ((0, 0), (0, missing), (0, 0)))
 
     return replace(
         fit,
@@ -646,24 +642,24 @@ def with_axes(fit: ToneFit, axes: int) -> ToneFit:
     )
 
 
-def _covariance_of_axes(fit: ToneFit) -> Tensor:
+def _covariance_of_axes(fit: ToneFit) -> Array:
     """Covariances (B, 2, P, P) of the parameters of each axis."""
     axes = fit.coefficients.shape[1]
     size = fit.covariance.shape[-1] // axes
-    return fit.covariance.reshape(-1, axes, size, axes, size).diagonal(dim1=1, dim2=3).movedim(-1, 1)
+    return np.moveaxis(fit.covariance.reshape(-1, axes, size, axes, size).diagonal(axis1=1, axis2=3), -1, 1)
 
 
-def _direction(fit: ToneFit) -> tuple[Tensor, Tensor, Tensor]:
+def _direction(fit: ToneFit) -> tuple[Array, Array, Array]:
     """Real and imaginary part of the coefficients over their modulus, and the modulus, 1 where there is no tone."""
     amplitude = fit.amplitude
-    modulus = torch.where(amplitude > 0, amplitude, 1.0)
+    modulus = np.where(amplitude > 0, amplitude, 1.0)
     return fit.coefficients.real / modulus, fit.coefficients.imag / modulus, modulus
 
 
-def _propagated(fit: ToneFit, gradient: Tensor) -> Tensor:
+def _propagated(fit: ToneFit, gradient: Array) -> Array:
     """Standard deviations (..., B, 2, K) of functions with gradients (..., B, 2, K, 3) by Re C, Im C and f of tones."""
     tones = fit.frequencies.shape[-1]
     covariance = _covariance_of_axes(fit)
-    blocks = torch.stack([covariance[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], dim=2)
-    variance = ((gradient[..., None, :] @ blocks)[..., 0, :] * gradient).sum(-1).clamp(min=0.0)
-    return torch.where(fit.active, variance.sqrt(), 0.0)
+    blocks = np.stack([covariance[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(tones)], 2)
+    variance = np.maximum(((gradient[..., None, :] @ blocks)[..., 0, :] * gradient).sum(-1), 0.0)
+    return np.where(fit.active, np.sqrt(variance), 0.0)

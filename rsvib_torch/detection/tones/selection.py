@@ -1,8 +1,8 @@
 """Number of tones: added one by one, strongest first, while they are significant, with weights against outliers."""
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from rsvib_torch.core.tables import Array, median, quantile, split_axis, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import (
     LARGEST,
@@ -36,10 +36,10 @@ _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of nois
 
 def robust_fit(
     measurements: Measurements,
-    frequencies: Tensor,
-    active: Tensor,
+    frequencies: Array,
+    active: Array,
     model: MotionModel,
-    residual: Tensor | None = None,
+    residual: Array | None = None,
     *,
     steps: int = 2,
     iterations: int = 30,
@@ -69,9 +69,9 @@ def robust_fit(
     return fit_tones(weighted, frequencies, active, model, iterations), weighted
 
 
-def typical_size(measurements: Measurements, fit: ToneFit) -> Tensor:
+def typical_size(measurements: Measurements, fit: ToneFit) -> Array:
     """(B,) median square of the normalised residual of both axes, which stretches of outliers hardly raise."""
-    return measurements.sizes(residual_of(measurements, fit)).nanmedian(1).values.square().sum(-1)
+    return np.square(median(measurements.sizes(residual_of(measurements, fit)), 1)).sum(-1)
 
 
 def find_tones(
@@ -81,7 +81,7 @@ def find_tones(
     model: MotionModel | None = None,
     least_gain: float = 0.2,
     start: ToneFit | None = None,
-    blind: Tensor | None = None,
+    blind: Array | None = None,
     accuracy: float = 0.0,
     *,
     stretches: bool = True,
@@ -152,16 +152,16 @@ class _Search:
         self.stretches, self.iterations, self.has_start = stretches, iterations, start is not None
         stacks, axes = len(measurements.exposure_starts), measurements.displacements.shape[-1]
         if start is None:
-            none = measurements.exposure_starts.new_zeros((stacks, axes, model.harmonics), dtype=torch.bool)
+            none = np.zeros((stacks, axes, model.harmonics), dtype=bool)
             self.accepted = none[..., :0]
-            self.fit, self.weighted = self.refitted(none.double(), none)
+            self.fit, self.weighted = self.refitted(none.astype(np.float64), none)
         else:
             self.accepted = start.active
             residual = residual_of(measurements, start)
             self.fit, self.weighted = self.refitted(start.frequencies, start.active, residual)
-        self.open_axes = torch.ones_like(self.fit.active[..., 0])
+        self.open_axes: Array = np.ones_like(self.fit.active[..., 0])
         if start is not None and accuracy:  # a tone of roll in bands of strips is found as a tone of x or y otherwise
-            self.open_axes = ~start.active.any(-1)
+            self.open_axes = ~np.any(start.active, -1)
         self._remaining = MAX_TONES - (self.accepted.shape[-1] // model.harmonics if tones is None else 0)
 
     def step(self) -> bool:
@@ -201,23 +201,23 @@ class _Search:
         self.fit, self.weighted, self.accepted = fit, weighted, fit.active
         return True
 
-    def with_one_more(self) -> Tensor:
+    def with_one_more(self) -> Array:
         """(B, 2, K) bool, the accepted tones and a further one (or family) of the axes that need it."""
-        return torch.cat([self.accepted, self.open_axes[..., None].expand(-1, -1, self.model.harmonics)], -1)
+        return np.concatenate([self.accepted, np.repeat(self.open_axes[..., None], self.model.harmonics, -1)], -1)
 
     def refitted(
-        self, frequencies: Tensor, active: Tensor, residual: Tensor | None = None
+        self, frequencies: Array, active: Array, residual: Array | None = None
     ) -> tuple[ToneFit, Measurements]:
         """``robust_fit`` of all measurements."""
         return robust_fit(self.measurements, frequencies, active, self.model, residual, iterations=self.iterations)
 
-    def candidate(self, residual: Tensor, active: Tensor, *, leave_out: bool = False) -> tuple[ToneFit, Tensor]:
+    def candidate(self, residual: Array, active: Array, *, leave_out: bool = False) -> tuple[ToneFit, Array]:
         """``best_candidate``: a rough fit with a further tone, and its residual."""
         return best_candidate(
             self.measurements, self.weighted, self.fit, residual, active, self.sample_interval, leave_out=leave_out
         )
 
-    def fitted(self, residual: Tensor, rough: tuple[ToneFit, Tensor]) -> tuple[ToneFit, Measurements]:
+    def fitted(self, residual: Array, rough: tuple[ToneFit, Array]) -> tuple[ToneFit, Measurements]:
         """The fit with a further tone, of all rows or without a stretch, and the measurements with its weights."""
         active = self.with_one_more()
         fit, weighted = self.refitted(rough[0].frequencies, active, rough[1])
@@ -232,38 +232,38 @@ class _Search:
         better = disturbed & (typical_size(self.measurements, other) < typical_size(self.measurements, fit))
         return select_stacks(better, other, fit), select_stacks(better, other_weighted, weighted)
 
-    def is_visible(self, fit: ToneFit) -> Tensor:
+    def is_visible(self, fit: ToneFit) -> Array:
         """(B, 2) bool, whether the last tone (or family) of each axis is visible."""
         return visibility(self.measurements, fit.frequencies[..., -self.model.harmonics :]) > 0.5
 
-    def is_inexact(self, residual: Tensor) -> Tensor:
+    def is_inexact(self, residual: Array) -> Array:
         """(B, 2) bool, axes with residuals above the accuracy that is needed."""
-        most = self.measurements.distances(residual).nanquantile(0.9, dim=1).nan_to_num(torch.inf)
+        most = without_nan(quantile(self.measurements.distances(residual), 0.9, 1), np.inf)
         return (most > self.accuracy) | (self.accuracy == 0)
 
-    def decreases(self, weighted: Measurements, before: Tensor, after: Tensor, *, share: float = 1.0) -> Tensor:
+    def decreases(self, weighted: Measurements, before: Array, after: Array, *, share: float = 1.0) -> Array:
         """(B, 2) bool, whether the residual decreases by a share of what is needed for a further tone."""
         first, second = weighted.square(before), weighted.square(after)
         parameters, families = 2 * self.model.harmonics + 1, self.with_one_more().sum(-1) // self.model.harmonics
         spare = self.measurements.num_measurements - parameters * families - 1
-        needed = torch.maximum(_F_THRESHOLD * parameters * second / spare.clamp(min=1.0), self.least_gain * first)
+        needed = np.maximum(_F_THRESHOLD * parameters * second / np.maximum(spare, 1.0), self.least_gain * first)
         return first - second > share * needed
 
 
-def _disturbed(measurements: Measurements, residual: Tensor) -> Tensor:
+def _disturbed(measurements: Measurements, residual: Array) -> Array:
     """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
-    most = measurements.sizes(residual).nanquantile(0.9, dim=1)
-    whole = measurements.sizes(measurements.relative(measurements.displacements)).nanmedian(1).values
-    return ~(most < 0.05 * whole).all(-1)
+    most = quantile(measurements.sizes(residual), 0.9, 1)
+    whole = median(measurements.sizes(measurements.relative(measurements.displacements)), 1)
+    return ~np.all(most < 0.05 * whole, -1)
 
 
-def _resolved(measurements: Measurements, fit: ToneFit) -> Tensor:
+def _resolved(measurements: Measurements, fit: ToneFit) -> Array:
     """(B, 2) bool: all tones of an axis are at least 0.7 of 1 / duration apart; closer ones fit one tone and noise."""
-    order = torch.where(fit.active, fit.frequencies, torch.nan).sort(dim=-1).values
+    order = np.sort(np.where(fit.active, fit.frequencies, np.nan), -1)
     return ~((order[..., 1:] - order[..., :-1]) * measurements.span[:, None, None] < 0.7).any(-1)
 
 
-def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: ToneFit, blind: Tensor) -> ToneFit:
+def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: ToneFit, blind: Array) -> ToneFit:
     """The fit with a tone of a blind frequency in place of its side tones, where that explains no less.
 
     With motion of frequency f_m along the scan, rows are not exactly one frame apart when they are compared. A tone of
@@ -274,26 +274,26 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
         return fit
     # 1. Weak tones near the side frequencies of a blind frequency and a large tone along the scan.
     size = fit.amplitude
-    weak_limit = 0.2 * size[:, 1].amax(-1, keepdim=True)  # px; side tones are weaker
-    carrier = torch.where(size[:, 1] > weak_limit, fit.frequencies[:, 1], torch.nan)[:, None, None, None]  # (B,1,1,1,K)
+    weak_limit = 0.2 * size[:, 1].max(-1, keepdims=True)  # px; side tones are weaker
+    carrier = np.where(size[:, 1] > weak_limit, fit.frequencies[:, 1], np.nan)[:, None, None, None]  # (B,1,1,1,K)
     tone, middle = fit.frequencies[..., None, None], blind[:, None]
-    sides = torch.stack([middle + carrier, (middle - carrier).abs()], -1)  # (B, 1, 1, F, K, 2)
-    distance = (tone[..., None] - sides).abs() * measurements.span.view(-1, 1, 1, 1, 1, 1)
-    distance = distance.nan_to_num(torch.inf).amin((-2, -1))  # (B, 2, K, F) cycles in the record
+    sides = np.stack([middle + carrier, np.abs(middle - carrier)], -1)  # (B, 1, 1, F, K, 2)
+    distance = np.abs(tone[..., None] - sides) * measurements.span.reshape(-1, 1, 1, 1, 1, 1)
+    distance = without_nan(distance, np.inf).min((-2, -1))  # (B, 2, K, F) cycles in the record
     weak = fit.active & (size > 0) & (size < weak_limit[:, None])
     near = (distance < 1.0) & weak[..., None]
     # 2. For each axis the blind frequency with most side tones, then the nearest.
-    score = near.sum(2) + 0.5 / (1 + distance.amin(2))
+    score = near.sum(2) + 0.5 / (1 + distance.min(2))
     best = score.argmax(-1)  # (B, 2)
-    side = near.gather(-1, best[:, :, None, None].expand(-1, -1, near.shape[2], 1))[..., 0]  # (B, 2, K)
-    suspected = side.any(-1)
+    side = np.take_along_axis(near, best[:, :, None, None], -1)[..., 0]  # (B, 2, K)
+    suspected = np.any(side, -1)
     if not bool(suspected.any()):
         return fit
     place = side & (side.cumsum(-1) == 1)  # the blind tone takes the place of the first of them
 
-    def replaced(axes: Tensor) -> tuple[Tensor, Tensor]:
+    def replaced(axes: Array) -> tuple[Array, Array]:
         changed = axes[..., None]
-        frequencies = torch.where(place & changed, blind[best][..., None], fit.frequencies)
+        frequencies = np.where(place & changed, blind[best][..., None], fit.frequencies)
         return frequencies, fit.active & ~(side & ~place & changed)
 
     # 3. The tone of this frequency instead of its side tones, kept where it explains no less per parameter.
@@ -303,16 +303,16 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     after = weighted.square(residual_of(measurements, other))
     spare = measurements.num_measurements - 3 * fit.active.sum(-1)
     fewer = 3 * (fit.active.sum(-1) - active.sum(-1))
-    better = suspected & (after / (spare + fewer).clamp(min=1.0) <= before / spare.clamp(min=1.0))
+    better = suspected & (after / np.maximum(spare + fewer, 1.0) <= before / np.maximum(spare, 1.0))
     # frames without motion along the scan contain nothing of a blind tone: its fitted amplitude was 3e16 px
-    better = better & (other.amplitude < other.amplitude.new_tensor(LARGEST)[: size.shape[1], None]).all(-1)
+    better = better & (other.amplitude < np.array(LARGEST)[: size.shape[1], None]).all(-1)
     if not bool(better.any()):
         return fit
     frequencies, active = replaced(better)
     return robust_fit(measurements, frequencies, active, fit.model)[0]
 
 
-def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor) -> ToneFit:
+def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array) -> ToneFit:
     """The fit without the tones, other than the strongest of an axis, that are not significant or too small.
 
     A tone is significant if its amplitude is, or if the fit without it fails the F-test: the amplitudes of two tones
@@ -326,28 +326,28 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Tensor
         intervals: (M,) s, times between the frames compared.
     """
     harmonics = fit.model.harmonics
-    needed = torch.zeros_like(fit.active)
+    needed = np.zeros_like(fit.active)
     while True:
         # 1. The weakest tone (or family) of each axis that is neither significant nor needed.
         size, std = fit.amplitude, amplitude_std(fit)
         gain = offset_gain(fit.frequencies, intervals)
-        attenuation = torch.sinc(fit.frequencies * measurements.exposure_time).abs()
+        attenuation = np.abs(np.sinc(fit.frequencies * measurements.exposure_time))
         small = (size * attenuation * gain < MIN_OFFSET) & (gain >= MIN_GAIN)
-        kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.amax(-1, keepdim=True)) | needed
-        kept = (kept & fit.active).unflatten(-1, (-1, harmonics)).any(-1)
-        families = fit.active.unflatten(-1, (-1, harmonics)).any(-1)
-        ratio = (size / std.clamp(min=1e-300)).unflatten(-1, (-1, harmonics)).amax(-1)
-        least = torch.where(families & ~kept, ratio, torch.inf)
-        dropped = (least == least.amin(-1, keepdim=True)) & families & ~kept
+        kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.max(-1, keepdims=True)) | needed
+        kept = split_axis(kept & fit.active, -1, -1, harmonics).any(-1)
+        families = split_axis(fit.active, -1, -1, harmonics).any(-1)
+        ratio = split_axis(size / np.maximum(std, 1e-300), -1, -1, harmonics).max(-1)
+        least = np.where(families & ~kept, ratio, np.inf)
+        dropped = (least == least.min(-1, keepdims=True)) & families & ~kept
         if not bool(dropped.any()):
             return fit
-        dropped = dropped.repeat_interleave(harmonics, -1) & fit.active
+        dropped = np.repeat(dropped, harmonics, -1) & fit.active
         # 2. The fit without it. It is needed if the residual then increases significantly.
         other = fit_tones(measurements, fit, fit.active & ~dropped, fit.model)
         after = measurements.square(residual_of(measurements, fit))
         before = measurements.square(residual_of(measurements, other))
         spare = measurements.num_measurements - 3 * fit.active.sum(-1)
-        worse = before - after > _F_THRESHOLD * 3 * harmonics * after / spare.clamp(min=1.0)
+        worse = before - after > _F_THRESHOLD * 3 * harmonics * after / np.maximum(spare, 1.0)
         keep = dropped & worse[..., None] & ~small
         needed = needed | keep
         if bool(keep.any()):

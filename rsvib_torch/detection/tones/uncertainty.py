@@ -28,10 +28,11 @@ with the ratio B of the evidences with and without the tone, whose uncertainty i
 import math
 from dataclasses import dataclass, replace
 
-import torch
-from torch import Tensor
-from torch.nn import functional
+import numpy as np
+from scipy import special
 
+from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, valid_mean, without_nan
 from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
@@ -79,33 +80,34 @@ class LinearisedFit:
     """
 
     axes: list[int]
-    root: Tensor
-    jacobian: Tensor
-    inverse: Tensor
-    residual: Tensor
-    to_all: Tensor
+    root: Array
+    jacobian: Array
+    inverse: Array
+    residual: Array
+    to_all: Array
 
     @classmethod
     def of_axes(cls, measurements: Measurements, fit: ToneFit, axes: list[int]) -> "LinearisedFit":
         """The problem of one axis, or of all."""
         residual = residual_of(measurements, fit)[..., axes]
         jacobians, constraints = zip(*(axis_jacobian(measurements, fit, one) for one in axes), strict=True)
-        jacobian = torch.stack(jacobians, 3)  # (B, N, G, A, M)
-        spent = (jacobian.square().amax((1, 2)) > 0).sum((1, 2))
-        spare = (measurements.num_measurements[:, axes].sum(1) - spent).clamp(min=1.0)
+        jacobian = np.stack(jacobians, 3)  # (B, N, G, A, M)
+        spent = (np.square(jacobian).max((1, 2)) > 0).sum((1, 2))
+        spare = np.maximum(measurements.num_measurements[:, axes].sum(1) - spent, 1.0)
         one = measurements.inverse_variances[..., axes, None] if len(axes) == 1 else measurements.information
         root = cholesky_root(one)
-        whitened = (root[:, :, None] @ residual[..., None]).flatten(1)
-        deviation = (whitened.square().sum(1) / spare).clamp(min=1e-300).sqrt()[:, None, None, None]
+        whitened = (root[:, :, None] @ residual[..., None]).reshape(len(residual), -1)
+        deviation = np.sqrt(np.maximum(np.square(whitened).sum(1) / spare, 1e-300))[:, None, None, None]
         root = root / deviation
-        X = (root[:, :, None, :, :, None] * jacobian[..., None, :, :]).flatten(-2).flatten(1, 3)
-        return cls(axes, root, X, torch.linalg.pinv(X), whitened / deviation[:, :, 0, 0], constraints[0])
+        X = root[:, :, None, :, :, None] * jacobian[..., None, :, :]  # (B, N, G, A, A, M)
+        X = X.reshape(*whitened.shape, -1)
+        return cls(axes, root, X, pseudo_inverse(X), whitened / deviation[:, :, 0, 0], constraints[0])
 
-    def rounding(self, axis: int) -> Tensor:
+    def rounding(self, axis: int) -> Array:
         """(B,) error of the squared norm of whitened responses of about 1 px, for displacements without noise."""
-        return 1e-12 * self.root[..., self.axes.index(axis)].square().sum((1, 2))
+        return 1e-12 * np.square(self.root[..., self.axes.index(axis)]).sum((1, 2))
 
-    def unexplained(self, response: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    def unexplained(self, response: Array, axis: int) -> tuple[Array, Array]:
         """Part of a response that the parameters do not explain, and the change of the parameters by it.
 
         Args:
@@ -116,25 +118,26 @@ class LinearisedFit:
             Whitened responses (B, D, Q) and ``X^+ Z`` (B, A M, Q).
         """
         root = self.root[..., self.axes.index(axis)]
-        Z = (root[:, :, None, :, None] * response[:, :, :, None]).flatten(1, 3)
+        Z = root[:, :, None, :, None] * response[:, :, :, None]  # (B, N, G, A, Q)
+        Z = Z.reshape(*self.residual.shape, -1)
         change = self.inverse @ Z
         return Z - self.jacobian @ change, change
 
-    def add_covariance(self, total: Tensor, added: Tensor) -> None:
+    def add_covariance(self, total: Array, added: Array) -> None:
         """Add a covariance (B, A M, A M) of the free parameters to that of all of a fit (B, A' P, A' P), in place."""
         count = len(self.axes)
-        blocks = added.unflatten(-1, (count, -1)).unflatten(1, (count, -1))
+        blocks = split_axis(split_axis(added, -1, count, -1), 1, count, -1)
         # from the free parameters m, n of axes i, j to all parameters p, q of these axes
-        blocks = torch.einsum("pm,bimjn,qn->bipjq", self.to_all, blocks, self.to_all)
+        blocks = np.einsum("pm,bimjn,qn->bipjq", self.to_all, blocks, self.to_all, optimize=True)
         size = len(self.to_all)
-        of_parameters = total.view(len(total), total.shape[-1] // size, size, -1, size)
+        of_parameters = total.reshape(len(total), total.shape[-1] // size, size, -1, size)
         for row, first in enumerate(self.axes):
             for column, second in enumerate(self.axes):
                 of_parameters[:, first, :, second] += blocks[:, row, :, column]
 
-    def add_change(self, total: Tensor, change: Tensor) -> None:
+    def add_change(self, total: Array, change: Array) -> None:
         """Add a change (B, A M) of the free parameters to that of all of a fit (B, A', P), in place."""
-        total[:, self.axes] += change.unflatten(-1, (len(self.axes), -1)) @ self.to_all.T
+        total[:, self.axes] += split_axis(change, -1, len(self.axes), -1) @ self.to_all.T
 
 
 def _problems(measurements: Measurements, fit: ToneFit) -> list[tuple[int, LinearisedFit]]:
@@ -149,7 +152,7 @@ def _problems(measurements: Measurements, fit: ToneFit) -> list[tuple[int, Linea
 # --- Aliasing ---
 
 
-def without_aliasing(measurements: Measurements, fit: ToneFit, size: Tensor) -> ToneFit:
+def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> ToneFit:
     """The fit without the error by aliasing of x and y, and with its remaining uncertainty in the covariance.
 
     Args:
@@ -157,33 +160,33 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Tensor) -> 
         fit: With its covariance.
         size: (B,) px, prior standard deviation of b.
     """
-    precision = size.clamp(min=1e-9).square().reciprocal()[:, None]
-    covariance, axes = fit.covariance.clone(), fit.drift.shape[1]
-    change = fit.drift.new_zeros(len(covariance), axes, covariance.shape[-1] // axes)
+    precision = (1 / np.square(np.maximum(size, 1e-9)))[:, None]
+    covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
+    change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
     bias = _unit_bias(measurements, model_displacements(measurements, fit))
     for axis, problem in _problems(measurements, fit)[:2]:
         Z, by_unit = problem.unexplained(bias[..., axis, None], axis)
-        variance = 1 / (Z.square().sum(1) + problem.rounding(axis)[:, None] + precision)  # (B, 1), of b
-        b = variance * (Z[..., 0] * problem.residual).sum(1, keepdim=True)
+        variance = 1 / (np.square(Z).sum(1) + problem.rounding(axis)[:, None] + precision)  # (B, 1), of b
+        b = variance * (Z[..., 0] * problem.residual).sum(1, keepdims=True)
         problem.add_covariance(covariance, by_unit * variance[..., None] @ by_unit.mT)
         problem.add_change(change, -b * by_unit[..., 0])
-    tones, drift = change.split((3 * fit.frequencies.shape[-1], fit.drift.shape[-1]), dim=-1)
-    real, imaginary, frequency = tones.unflatten(-1, (-1, 3)).unbind(-1)
+    tones, drift = np.split(change, [3 * fit.frequencies.shape[-1]], -1)
+    real, imaginary, frequency = np.moveaxis(split_axis(tones, -1, -1, 3), -1, 0)
     return replace(
         fit,
-        coefficients=fit.coefficients + torch.complex(real, imaginary),
-        frequencies=(fit.frequencies + frequency).clamp(min=0.0),
+        coefficients=fit.coefficients + real + 1j * imaginary,
+        frequencies=np.maximum(fit.frequencies + frequency, 0.0),
         drift=fit.drift + drift,
         covariance=covariance,
     )
 
 
-def _unit_bias(measurements: Measurements, displacements: Tensor) -> Tensor:
+def _unit_bias(measurements: Measurements, displacements: Array) -> Array:
     """Bias (B, N, G, A) of relative displacements of that shape, for b = 1."""
     angle = 2 * math.pi * displacements
-    turn = torch.polar(torch.ones_like(angle), angle)
+    turn = np.ones_like(angle) * np.exp(1j * angle)
     visible = measurements.visible[..., None]
-    mean = (visible * turn).sum(2, keepdim=True) / visible.sum(2, keepdim=True).clamp(min=1.0)
+    mean = (visible * turn).sum(2, keepdims=True) / np.maximum(visible.sum(2, keepdims=True), 1.0)
     return measurements.relative((turn * mean.conj()).imag)
 
 
@@ -191,8 +194,8 @@ def _unit_bias(measurements: Measurements, displacements: Tensor) -> Tensor:
 
 
 def with_further_tones(
-    measurements: Measurements, fit: ToneFit, exposure_starts: Tensor, *, number_is_known: bool = False
-) -> tuple[ToneFit, Tensor]:
+    measurements: Measurements, fit: ToneFit, exposure_starts: Array, *, number_is_known: bool = False
+) -> tuple[ToneFit, Array]:
     """The fit with a covariance that allows for a further tone, and the uncertainty of the displacement of the rows.
 
     Args:
@@ -205,27 +208,27 @@ def with_further_tones(
         The fit, and the standard deviation (B, A) in px of the displacement of rows without their mean, rms over the
         rows; the effect of a further tone is that without linear trend, which the image motion contains.
     """
-    covariance, rows = fit.covariance.clone(), exposure_starts.expand(len(fit.centre), -1)
-    variance = displacement_std(fit, exposure_starts, measurements.exposure_time).square()
+    covariance, rows = fit.covariance.copy(), np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
+    variance = np.square(displacement_std(fit, exposure_starts, measurements.exposure_time))
     jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
     slow_errors = _slow_errors(measurements, fit)
     for axis, problem in _problems(measurements, fit):
         added, moved = _added(measurements, fit, axis, problem, rows, jacobian, slow_errors[:, axis], number_is_known)
         problem.add_covariance(covariance, added)
         variance[:, problem.axes] += moved
-    return replace(fit, covariance=covariance), variance.sqrt()
+    return replace(fit, covariance=covariance), np.sqrt(variance)
 
 
-def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Tensor, Tensor]:
+def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, Array]:
     """Frequencies (B, F) in Hz of the further tone of an axis, and those that count (bool): near its tones, or low."""
     duration = measurements.span[:, None]
-    tones = torch.where(fit.active, fit.frequencies, 0.0)[:, axis]  # (B, K)
-    centres = torch.cat([torch.zeros_like(tones[:, :1]), tones], 1)
+    tones = np.where(fit.active, fit.frequencies, 0.0)[:, axis]  # (B, K)
+    centres = np.concatenate([np.zeros_like(tones[:, :1]), tones], 1)
     # only places near a tone: fits of frames with a wrong timing may have frequencies of any size
-    reach = torch.arange(-_REACH * _POINTS - 1, _REACH * _POINTS + 2, dtype=torch.float64, device=tones.device)
-    places = ((centres * duration * _POINTS).round()[..., None] + reach).unique()
+    reach = np.arange(-_REACH * _POINTS - 1, _REACH * _POINTS + 2)
+    places = np.unique((centres * duration * _POINTS).round()[..., None] + reach)
     frequencies = places[places >= 1] / (_POINTS * duration)
-    near = ((frequencies[..., None] - centres[:, None]).abs() * duration[..., None] <= _REACH).any(-1)
+    near = (np.abs(frequencies[..., None] - centres[:, None]) * duration[..., None] <= _REACH).any(-1)
     used = near.any(0)
     return frequencies[:, used], near[:, used]
 
@@ -235,11 +238,11 @@ def _added(
     fit: ToneFit,
     axis: int,
     problem: LinearisedFit,
-    rows: Tensor,
-    jacobian: Tensor,
-    slow_error: Tensor,
+    rows: Array,
+    jacobian: Array,
+    slow_error: Array,
     number_is_known: bool,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Array, Array]:
     """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis.
 
     Args:
@@ -254,68 +257,70 @@ def _added(
     """
     axes = problem.axes
     of_displacement = _without_trend(jacobian[:, :, axes] @ problem.to_all, rows)
-    of_tone = torch.eye(len(axes), dtype=rows.dtype, device=rows.device)[axes.index(axis)][:, None, None]
+    of_tone = np.eye(len(axes))[axes.index(axis)][:, None, None]
     # 1. Prior of the quadratures: their precision, and the least precision that rounding leaves.
-    size = _PRIOR_SIZE * fit.amplitude[:, axis].square().sum(-1).sqrt()  # (B,) px
-    precision = torch.where(size > 0, size, 1.0).square().reciprocal()[:, None, None, None]
-    eye = torch.eye(2, dtype=rows.dtype, device=rows.device)
+    size = _PRIOR_SIZE * np.sqrt(np.square(fit.amplitude[:, axis]).sum(-1))  # (B,) px
+    precision = (1 / np.square(np.where(size > 0, size, 1.0)))[:, None, None, None]
+    eye = np.eye(2)
     limit = precision + problem.rounding(axis)[:, None, None, None]
     frequencies, counted = _grid(measurements, fit, axis)
     parts = []
-    for chunk in frequencies.split(max(1, _CHUNK // (4 * problem.residual.numel())), dim=1):
+    for part in runs(frequencies.shape[1], max(1, _CHUNK // (4 * problem.residual.size))):
+        chunk = frequencies[:, part]
         # 2. Posterior of the quadratures v of a tone of each frequency f, and its evidence; sums over measurements d.
-        response = tone_response(measurements, chunk[:, None].expand(-1, fit.coefficients.shape[1], -1))[..., axis, :]
-        unexplained = problem.unexplained(_quadratures(response).flatten(-2), axis)
-        Z, back = (part.unflatten(-1, (-1, 2)) for part in unexplained)
-        information = torch.einsum("bdfp,bdfq->bfpq", Z, Z)
-        right = torch.einsum("bdfq,bd->bfq", Z, problem.residual)
-        C = torch.linalg.inv(information + limit * eye)
+        of_axes = np.repeat(chunk[:, None], fit.coefficients.shape[1], 1)
+        response = tone_response(measurements, of_axes)[..., axis, :]
+        unexplained = problem.unexplained(_quadratures(response).reshape(*response.shape[:-1], -1), axis)
+        Z, back = (split_axis(values, -1, -1, 2) for values in unexplained)
+        information = np.einsum("bdfp,bdfq->bfpq", Z, Z)
+        right = np.einsum("bdfq,bd->bfq", Z, problem.residual)
+        C = np.linalg.inv(information + limit * eye)
         v = (C @ right[..., None])[..., 0]
-        evidence = 0.5 * (right * v).sum(-1) - 0.5 * torch.logdet(eye + information / precision)
+        evidence = 0.5 * (right * v).sum(-1) - 0.5 * np.linalg.slogdet(eye + information / precision)[1]
         # 3. Displacement S of the rows by unit tones, and by the change of the parameters m that they cause: mean
         # product over the rows n for each frequency f and axis a.
         S = _without_trend(_wave(fit, rows, chunk, measurements.exposure_time), rows)
-        changes = back.unflatten(1, (len(axes), -1))  # (B, A, M, F, 2)
-        S = S[:, :, None] * of_tone - torch.einsum("bnam,bamfq->bnafq", of_displacement, changes)
-        moved = torch.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
-        parts.append((evidence, C + v[..., :, None] * v[..., None, :], back.movedim(1, 2), moved))
-    evidence, second, back, moved = (torch.cat(values, 1) for values in zip(*parts, strict=True))
+        changes = split_axis(back, 1, len(axes), -1)  # (B, A, M, F, 2)
+        S = S[:, :, None] * of_tone - np.einsum("bnam,bamfq->bnafq", of_displacement, changes, optimize=True)
+        moved = np.einsum("bnafp,bnafq->bfapq", S, S) / S.shape[1]
+        parts.append((evidence, C + v[..., :, None] * v[..., None, :], np.moveaxis(back, 1, 2), moved))
+    evidence, second, back, moved = (np.concatenate(values, 1) for values in zip(*parts, strict=True))
     # 4. Probability of a tone of each frequency. One tone more, of any frequency, has the prior probability of none.
     counted = counted & (size > 0)[:, None]
-    prior = torch.where(counted, -counted.sum(1, keepdim=True).to(evidence.dtype).log(), -math.inf)
-    probability = functional.pad(evidence + prior, (1, 0)).softmax(-1)[:, 1:]
+    prior = np.where(counted, -np.log(np.maximum(counted.sum(1, keepdims=True), 1.0)), -math.inf)
+    probability = special.softmax(np.pad(evidence + prior, ((0, 0), (1, 0))), -1)[:, 1:]
     if number_is_known:
-        probability = torch.zeros_like(probability)
+        probability = np.zeros_like(probability)
     # 5. Mean over all frequencies, and slow errors with equal variances at the low frequencies.
     slow = frequencies * measurements.span[:, None] <= _SLOW
-    slow_variance = slow * (slow_error.square() / slow.sum(1).clamp(min=1))[:, None]
+    slow_variance = slow * (np.square(slow_error) / np.maximum(slow.sum(1), 1))[:, None]
     second = probability[..., None, None] * second + slow_variance[..., None, None] * eye
     return (back @ second @ back.mT).sum(1), (moved * second[:, :, None]).sum((1, 3, 4))
 
 
-def _slow_errors(measurements: Measurements, fit: ToneFit) -> Tensor:
+def _slow_errors(measurements: Measurements, fit: ToneFit) -> Array:
     """(B, A) px, standard deviation of errors that all rows of an axis have in common; 0 without a slow tone."""
     slow = (fit.active & (fit.frequencies * measurements.span[:, None, None] <= _SLOW)).any(-1)
     offset = math.sqrt(2) * measurements.distances(model_displacements(measurements, fit))
-    return slow * (_SLOW_ERROR * offset.square().nanmean(1).nan_to_num(0.0).sqrt()).clamp(max=_MAX_SLOW_ERROR)
+    return slow * np.minimum(_SLOW_ERROR * np.sqrt(without_nan(valid_mean(np.square(offset), 1), 0.0)), _MAX_SLOW_ERROR)
 
 
-def _quadratures(response: Tensor) -> Tensor:
+def _quadratures(response: Array) -> Array:
     """Real response (..., 2) to the real and the imaginary part of a coefficient."""
-    return torch.view_as_real(response.conj_physical().resolve_conj())
+    return np.stack([response.real, -response.imag], -1)
 
 
-def _wave(fit: ToneFit, exposure_starts: Tensor, frequencies: Tensor, exposure_time: float) -> Tensor:
+def _wave(fit: ToneFit, exposure_starts: Array, frequencies: Array, exposure_time: float) -> Array:
     """(B, N, F, 2) mean displacements of exposures by unit tones."""
     time = exposure_starts + 0.5 * exposure_time - fit.centre[:, None]
     angle = 2 * math.pi * frequencies[:, None] * time[..., None]
-    attenuation = torch.sinc(frequencies * exposure_time)[:, None]
-    return _quadratures(torch.polar(attenuation.expand_as(angle), angle))
+    attenuation = np.sinc(frequencies * exposure_time)[:, None]
+    return _quadratures(attenuation * np.exp(1j * angle))
 
 
-def _without_trend(values: Tensor, times: Tensor) -> Tensor:
+def _without_trend(values: Array, times: Array) -> Array:
     """Values (B, N, ...) at times (B, N) without their mean and linear trend."""
-    values = values - values.mean(1, keepdim=True)
-    t = (times - times.mean(1, keepdim=True)).reshape(*times.shape, *(1,) * (values.ndim - 2))
-    trend: Tensor = (t * values).sum(1, keepdim=True) / t.square().sum(1, keepdim=True)
+    values = values - values.mean(1, keepdims=True)
+    t = (times - times.mean(1, keepdims=True)).reshape(*times.shape, *(1,) * (values.ndim - 2))
+    trend: Array = (t * values).sum(1, keepdims=True) / np.square(t).sum(1, keepdims=True)
     return values - trend * t

@@ -1,0 +1,89 @@
+"""Small NumPy tables with missing values (NaN): the input of fits, which run on the CPU in float64.
+
+An operation on a small array takes NumPy 0.5 to 1 us and PyTorch 3 to 5 us.
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+__all__ = [
+    "Array",
+    "median",
+    "pseudo_inverse",
+    "quantile",
+    "split_axis",
+    "table",
+    "tables",
+    "tensor",
+    "valid_mean",
+    "without_nan",
+]
+
+Array = npt.NDArray[Any]
+
+
+def table(values: Tensor) -> Array:
+    """A tensor as an array on the CPU."""
+    array: Array = values.detach().resolve_conj().cpu().numpy()
+    return array
+
+
+def split_axis(values: Array, axis: int, *sizes: int) -> Array:
+    """The values with one axis split into several of the given sizes, one of which may be -1 (``Tensor.unflatten``)."""
+    axis %= values.ndim
+    return values.reshape(*values.shape[:axis], *sizes, *values.shape[axis + 1 :])
+
+
+def without_nan(values: Array, replacement: float) -> Array:
+    """The values with a number in place of NaN."""
+    return np.where(np.isnan(values), replacement, values)
+
+
+def valid_mean(values: Array, axis: int | tuple[int, ...]) -> Array:
+    """Mean along axes of the values that are not NaN; NaN if there are none."""
+    valid = ~np.isnan(values)
+    count = valid.sum(axis)
+    mean: Array = np.where(valid, values, 0.0).sum(axis) / np.maximum(count, 1)
+    return np.where(count > 0, mean, np.nan)
+
+
+def median(values: Array, axis: int, *, keepdims: bool = False) -> Array:
+    """Median along an axis of the values that are not NaN, the lower one of two; NaN if there are none."""
+    ordered = np.sort(values, axis)  # NaN come last
+    count = (~np.isnan(values)).sum(axis, keepdims=True)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis)
+    return middle if keepdims else middle.squeeze(axis)
+
+
+def quantile(values: Array, share: float, axis: int) -> Array:
+    """Quantile along an axis of the values that are not NaN, interpolated linearly; NaN if there are none."""
+    ordered = np.sort(values, axis)
+    place = share * np.maximum((~np.isnan(values)).sum(axis, keepdims=True) - 1, 0)
+    below = np.floor(place).astype(np.int64)
+    low, high = (np.take_along_axis(ordered, index, axis) for index in (below, np.ceil(place).astype(np.int64)))
+    between: Array = (low + (high - low) * (place - below)).squeeze(axis)
+    return between
+
+
+def pseudo_inverse(matrix: Array) -> Array:
+    """Pseudo-inverse of matrices (..., M, N); singular values below rounding are 0."""
+    inverse: Array = np.linalg.pinv(matrix, rcond=max(matrix.shape[-2:]) * np.finfo(np.float64).eps)
+    return inverse
+
+
+def tensor(values: Array) -> Tensor:
+    """An array as a tensor on the CPU, for motions, whose times are tensors."""
+    return torch.from_numpy(np.ascontiguousarray(values))
+
+
+def tables(*values: Tensor) -> list[Array]:
+    """Tensors as arrays on the CPU, by one transfer."""
+    if values[0].device.type == "cpu":
+        return [table(part) for part in values]
+    flat = table(torch.cat([part.to(torch.float64).flatten() for part in values]))
+    parts = np.split(flat, np.cumsum([part.numel() for part in values])[:-1])
+    return [array.reshape(part.shape) for array, part in zip(parts, values, strict=True)]
