@@ -3,27 +3,35 @@
 An operation on a small array takes NumPy 0.5 to 1 us and PyTorch 3 to 5 us.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 __all__ = [
     "Array",
     "median",
     "pseudo_inverse",
     "quantile",
+    "select_stacks",
     "split_axis",
     "table",
     "tables",
+    "take_stacks",
     "tensor",
     "valid_mean",
     "without_nan",
 ]
 
 Array = npt.NDArray[Any]
+Stacks = TypeVar("Stacks", bound="DataclassInstance")
 
 
 def table(values: Tensor) -> Array:
@@ -87,3 +95,24 @@ def tables(*values: Tensor) -> list[Array]:
     flat = table(torch.cat([part.to(torch.float64).flatten() for part in values]))
     parts = np.split(flat, np.cumsum([part.numel() for part in values])[:-1])
     return [array.reshape(part.shape) for array, part in zip(parts, values, strict=True)]
+
+
+# Dataclasses of arrays whose first axis is the batch of stacks
+
+
+def take_stacks(parts: Sequence[Stacks], index: Array) -> Stacks:
+    """The stacks ``index`` of several dataclasses behind each other; values without a batch are those of the first."""
+    taken = {}
+    for field in fields(parts[0]):
+        values = [getattr(part, field.name) for part in parts]
+        if isinstance(values[0], np.ndarray):
+            taken[field.name] = np.concatenate(values)[index]
+        elif is_dataclass(values[0]):
+            taken[field.name] = take_stacks(values, index)
+    return replace(parts[0], **taken)
+
+
+def select_stacks(where: Array, one: Stacks, other: Stacks) -> Stacks:
+    """A dataclass with the stacks of ``one`` where ``where`` (B,) is true, else those of ``other``."""
+    place = np.arange(len(where))
+    return take_stacks([one, other], np.where(where, place, place + len(where)))

@@ -7,19 +7,21 @@
 2. fit tones and image motion to the measurements by weighted least squares (``tones``),
 3. decide: stop, subtract a pattern of columns and begin again, or continue, possibly with a faster step.
 
-Step 1 does not depend on the model of the motion, step 2 does not depend on images. All B stacks take part in every
-round, until each of them is finished.
+Step 1 does not depend on the model of the motion, step 2 does not depend on images. All B stacks take part in a round;
+those that are finished leave the batch.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from rsvib_torch.core.tables import Array, median, table, valid_mean, without_nan
+from rsvib_torch.core.tables import Array, median, select_stacks, table, take_stacks, valid_mean, without_nan
 from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -31,9 +33,10 @@ from rsvib_torch.detection.tones.fit import (
     model_displacements,
     motion_of_fit,
     residual_of,
-    select_stacks,
     shrunk,
     strongest_only,
+    with_tone_parameters,
+    with_tones,
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, significant_only, typical_size
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
@@ -98,20 +101,21 @@ def refine(
     """
     # Rounds of measuring and fitting from the given start.
     refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
-    # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well.
+    # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
+    # one axis after the other.
     device = frames.groups[0].starts.device
-    if frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device)):
-        tried = np.zeros_like(start.active[..., 0])
-        for _ in range(2):  # one axis after the other
-            frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
-            if not bool(mirrored.any()):
-                break
-            tried = tried | mirrored
-            active = strongest_only(refined.fit).active
-            other, _ = robust_fit(refined.measurements, frequencies, active, start.model)
-            # a pattern that was subtracted does not appear again
-            again = _rounds(refined.frames, intervals, other, tones, False, has_pattern)
-            refined = _better_of_both(refined, again)
+    blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
+    tried = np.repeat(~blurred[:, None], start.active.shape[1], 1)
+    while not tried.all():
+        frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
+        if not mirrored.any():
+            break
+        tried = tried | mirrored
+        active, index = strongest_only(refined.fit).active, np.flatnonzero(mirrored.any(-1))
+        other, _ = robust_fit(refined.measurements, frequencies, active, start.model)
+        # a pattern that was subtracted does not appear again
+        again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones, False, has_pattern)
+        refined = _with_better(refined, again, index)
     # Tones that the exact fit does not confirm are left out.
     if tones is None:
         fit = significant_only(refined.measurements, refined.fit, intervals)
@@ -132,40 +136,49 @@ def _rounds(
     has_pattern: bool | None,
 ) -> FittedRows:
     """All rounds of a ``Refinement``."""
-    refinement = Refinement(frames, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)
-    while not refinement.is_finished:
+    running = [Refinement(frames, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)]
+    finished: list[Refinement] = []
+    while running:
+        refinement = running.pop()
         refinement.step()
-    return refinement.result()
+        continued = ~(refinement.ended | refinement.settled)
+        if refinement.ended.any():
+            finished.append(refinement.only(refinement.ended))
+        if refinement.settled.any():
+            part = refinement.only(refinement.settled)
+            (running if part.begins_again() else finished).append(part)
+        if continued.any():
+            part = refinement.only(continued)
+            part.accelerate()
+            running.append(part)
+    return _joined(finished, frames)
 
 
-@dataclass(eq=False)
-class ColumnPatterns:
-    """Patterns of columns that are fixed to the sensor, and subtracted after some of the rounds.
+def _joined(finished: list["Refinement"], frames: GroupedFrames) -> FittedRows:
+    """The results of refinements of parts of a batch, whose frames are given, as one of all its stacks."""
+    results = [refinement.result() for refinement in finished]
+    # Frames without the patterns of columns that were subtracted.
+    patterns = [(refinement.stacks, part) for refinement in finished if (part := refinement.pattern) is not None]
+    for stacks, pattern in patterns:
+        frames = frames.without(pattern, stacks)
+    if len(results) == 1:
+        return replace(results[0], frames=frames)
+    count, rounds = _room(results)
+    order = np.concatenate([refinement.stacks for refinement in finished]).argsort()
+    joined = take_stacks([_with_room(result, count, rounds) for result in results], order)
+    return replace(joined, frames=frames, has_pattern=bool(patterns))
 
-    Attributes:
-        remaining: Number of times that a pattern may be subtracted.
-        subtracted: Whether a pattern was subtracted.
-        refused: (B, A) residuals before the last pattern was subtracted, if all axes were refused; else None.
-    """
 
-    remaining: int
-    subtracted: bool = False
-    refused: Array | None = None
+def _room(results: Sequence[FittedRows]) -> tuple[int, int]:
+    """Largest number of tones of an axis, and of rounds in ``unknown``."""
+    return max(one.fit.active.shape[-1] for one in results), max(one.unknown.shape[-1] for one in results)
 
-    def without(
-        self, frames: GroupedFrames, motion: Vibration, gradients: list[RowGradients], refused: Array | None = None
-    ) -> GroupedFrames | None:
-        """The rows without their pattern; None if there is none, or if axes are refused again after the last one."""
-        if self.remaining == 0 or (refused is not None and self.refused is not None):
-            return None
-        cleared = frames.without_column_pattern(motion, gradients)
-        if cleared is not None:
-            self.remaining, self.subtracted, self.refused = self.remaining - 1, True, refused
-        return cleared
 
-    def were_not_the_cause(self, size: Array) -> bool:
-        """Whether refused axes have residuals (B, A) of more than half the size without the pattern."""
-        return self.refused is not None and bool((size > 0.5 * self.refused).all())
+def _with_room(fitted: FittedRows, count: int, rounds: int) -> FittedRows:
+    """The same with room for ``count`` tones on each axis and the changes of ``rounds`` rounds."""
+    unknown = with_tone_parameters(fitted.unknown, 2, fitted.fit.active.shape[-1], count)
+    unknown = np.pad(unknown, ((0, 0), (0, 0), (0, 0), (0, rounds - unknown.shape[-1])))
+    return replace(fitted, fit=with_tones(fitted.fit, count), unknown=unknown)
 
 
 class Refinement:
@@ -190,7 +203,11 @@ class Refinement:
         round: Number of the next round, from 0, and of the rounds that have been made.
         search_round: Round in which further tones are searched for. The first round removes the error of the band
             offsets; weak tones are significant after it.
-        is_finished: Whether the last round has been made.
+        stacks: (B,) indices of the stacks in the batch.
+        pattern: (R, U) spectrum of the column pattern that was subtracted from the R rows of stacks or strips; None for
+            none.
+        ended: (B,) bool, stacks that no further round is permitted for, or would help.
+        settled: (B,) bool, other stacks that need no further round, unless a pattern of columns is the cause.
         converged: (B,) bool, stacks whose next round would change little.
         abandoned: (B,) bool, stacks that are abandoned.
     """
@@ -208,8 +225,9 @@ class Refinement:
     ) -> None:
         self.frames, self.fit = frames, start
         self.around = self.warped_by = shrunk(start, intervals)
-        self.round, self.search_round, self.is_finished = 0, 1, False
-        self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
+        self.round, self.search_round = 0, 1
+        self.stacks = np.arange(len(start.centre))
+        self.ended = self.settled = self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
         self._intervals, self._tones, self._max_rounds = intervals, tones, max_rounds
         self._may_abandon, self._has_pattern = may_abandon, has_pattern
         # exposures average out faster tones
@@ -218,8 +236,12 @@ class Refinement:
         self._measured: MeasuredRows  # of the last round
         self._gradients: list[RowGradients] | None = None  # of the scene; None: compute them from the warped frames
         self._acceleration = Acceleration()
+        self._step: Step  # of the last round
+        self._stalled: Array  # (B, A) bool, after the last round
+        self.pattern: Tensor | None = None
         # a strong pattern biases its first estimate, so that it is subtracted twice
-        self._patterns = ColumnPatterns(remaining=0 if has_pattern is False else 2)
+        self._patterns_left = 0 if has_pattern is False else 2
+        self._refused: Array | None = None  # (B, A) residuals before a pattern was subtracted, if all axes were refused
         # of the rounds since the search: (B, A) typical residuals in standard deviations, and fits of the same tones
         self._sizes: list[Array] = []
         self._fits: list[ToneFit] = []
@@ -251,50 +273,85 @@ class Refinement:
         self.warped_by, self.around = self.around, shrunk(fit, self._intervals)
         self._gradients = measured.gradients
 
-        # 3. Begin again without a pattern of columns that is known, as soon as the motion is known roughly.
-        if number == 0 and self._has_pattern and self._subtract_pattern():
-            return
+        # 3. Stacks that no further round would help: those whose rows are not measured, those whose hypothesis leaves a
+        # large residual, and those whose residual remains although a pattern of columns was subtracted because of it.
+        if self._may_abandon and self.round == _TRIED_ROUNDS:
+            self.abandoned = _large_residual(self.frames, measured, self.fit)
+        self.ended = self.abandoned | ~(measurements.weights > 0).any((1, 2)) | (self.round == self._max_rounds)
+        if self._refused is not None and self.round == self.search_round + 2:
+            self.ended = self.ended | (size > 0.5 * self._refused).all(-1)
 
-        # 4. Stop if no further round is permitted, or if none would help.
-        self.is_finished = self._must_stop(measured, size)
-        if self.is_finished:
-            return
-
-        # 5. Stop if the next round would change the motion by much less than its standard deviation, or if the residual
-        # of an axis that is refused hardly decreases: unless a pattern of columns is the cause.
-        step = Step.between(measurements, self.warped_by, self.around)
-        converged = is_converged(previous, fit, self._acceleration.ratio(step) if same_tones else None)
+        # 4. Settled stacks: the next round would change the motion by much less than its standard deviation, or the
+        # residual of an axis that is refused hardly decreases.
+        self._step = Step.between(measurements, self.warped_by, self.around)
+        converged = is_converged(previous, fit, self._acceleration.ratio(self._step) if same_tones else None)
         converged = converged & (number >= self.search_round)
-        stalled = self._stalled(measured)
+        self._stalled = self._refused_for_good(measured)
         self.converged = np.all(converged, -1)
-        if bool((converged | stalled | self.abandoned[:, None]).all()):
-            self.is_finished = not self._subtract_pattern(size if bool(stalled.all()) else None)
-            return
+        self.settled = np.all(converged | self._stalled, -1) & ~self.ended
 
-        # 6. Continue with a faster step where the last one was too long or too short. The gradients of the scene are
-        # used again if the motion changes little.
-        self._acceleration.add(step, same_tones=len(self._fits) > 1)
-        faster = self._acceleration.applied(measurements, fit)
+        # 5. Begin again without a pattern of columns that is known, as soon as the motion is known roughly.
+        if number == 0 and self._has_pattern and self.begins_again():
+            self.settled = np.zeros_like(self.settled)
+
+    def begins_again(self) -> bool:
+        """Subtract a pattern of columns and begin again; False if there is none, or if all axes are refused again."""
+        refused = self._sizes[-1] if self._sizes and self._stalled.all() else None
+        if self._patterns_left == 0 or (refused is not None and self._refused is not None):
+            return False
+        assert self._gradients is not None
+        pattern = self.frames.column_pattern(self.motion, self._gradients)
+        if pattern is None:
+            return False
+        self.frames, self._gradients = self.frames.without(pattern), None
+        self.pattern = pattern if self.pattern is None else self.pattern + pattern
+        self._patterns_left, self._refused = self._patterns_left - 1, refused
+        self.converged = np.zeros_like(self.converged)
+        if self.round > 1:  # after the first round, the search is still to come
+            self.search_round = self.round
+            self._sizes = []
+            self._acceleration.clear()
+        return True
+
+    def accelerate(self) -> None:
+        """Continue with a faster step where the last one was too long or too short.
+
+        The gradients of the scene are used again if the motion changes little.
+        """
+        if self._gradients is None:  # it has just begun again
+            return
+        measurements = self._measured.measurements
+        self._acceleration.add(self._step, same_tones=len(self._fits) > 1)
+        faster = self._acceleration.applied(measurements, self.fit)
+        step = self._step
         if faster is not None:
-            self.fit = self._bounded(faster, fit)
+            self.fit = self._bounded(faster, self.fit)
             self.around = shrunk(self.fit, self._intervals)
             step = Step.between(measurements, self.warped_by, self.around)
         if float(np.abs(step.change).max()) > _SAME_GRADIENTS:
             self._gradients = None
 
-    def _must_stop(self, measured: MeasuredRows, size: Array) -> bool:
-        """Whether no further round is permitted, or none would help; stacks with a large residual are abandoned.
-
-        Args:
-            measured: The last round.
-            size: (B, A) typical residuals in standard deviations.
-        """
-        if self.round == self._max_rounds or not bool((measured.measurements.weights > 0).any()):
-            return True
-        if self._may_abandon and self.round == _TRIED_ROUNDS:
-            self.abandoned = _large_residual(self.frames, measured, self.fit)
-        pattern_was_not_the_cause = self.round == self.search_round + 2 and self._patterns.were_not_the_cause(size)
-        return pattern_was_not_the_cause or bool(self.abandoned.all())
+    def only(self, where: Array) -> "Refinement":
+        """The refinement of the stacks ``where`` (B,) is true."""
+        if where.all():
+            return self
+        index, part = np.flatnonzero(where), copy(self)
+        part.frames, part._measured = self.frames.stacks(index), self._measured.stacks(index)
+        part.fit, part.around, part.warped_by = (
+            take_stacks([fit], index) for fit in (self.fit, self.around, self.warped_by)
+        )
+        part._fits = [take_stacks([fit], index) for fit in self._fits]
+        part._step = take_stacks([self._step], index)
+        part._acceleration = Acceleration([take_stacks([step], index) for step in self._acceleration.steps])
+        part._sizes = [size[index] for size in self._sizes]
+        for name in ("stacks", "ended", "settled", "converged", "abandoned", "_stalled", "_refused"):
+            values = getattr(self, name)
+            setattr(part, name, None if values is None else values[index])
+        if self._gradients is not None:
+            part._gradients = part._measured.gradients
+        if self.pattern is not None:
+            part.pattern = self.pattern[self.frames.rows_of(index)]
+        return part
 
     def result(self) -> FittedRows:
         """The last measurements, with the exact fit to them."""
@@ -302,32 +359,13 @@ class Refinement:
         converged = self.converged | self.abandoned
         if not bool(converged.all()):
             fitted = with_unknown_changes(fitted, self.warped_by, self.around, self._fits, ~converged)
-        has_pattern = self._patterns.subtracted
-        return replace(fitted, has_pattern=has_pattern, converged=self.converged, abandoned=self.abandoned)
+        return replace(fitted, has_pattern=self.pattern is not None, converged=self.converged, abandoned=self.abandoned)
 
     def _searched(self, measurements: Measurements, residual: Array) -> ToneFit:
         """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
         independent = replace(measurements, independent=measurements.independent_fraction(residual))
         start = strongest_only(self.fit)
         return find_tones(independent, self._sample_interval, self._tones, start.model, 0.02, start, self._blind)
-
-    def _subtract_pattern(self, refused: Array | None = None) -> bool:
-        """Subtract a pattern of columns, and begin again; False if there is none.
-
-        Args:
-            refused: (B, A) residuals of the axes, if all of them are refused.
-        """
-        assert self._gradients is not None
-        cleared = self._patterns.without(self.frames, self.motion, self._gradients, refused)
-        if cleared is None:
-            return False
-        self.frames, self._gradients = cleared, None
-        self.converged = np.zeros_like(self.converged)
-        if self.round > 1:  # after the first round, the search is still to come
-            self.search_round = self.round
-            self._sizes = []
-            self._acceleration.clear()
-        return True
 
     def _bounded(self, fit: ToneFit, previous: ToneFit) -> ToneFit:
         """The fit, with the previous one for stacks whose fit diverges."""
@@ -338,7 +376,7 @@ class Refinement:
             return previous
         return select_stacks(bounded, fit, previous)
 
-    def _stalled(self, measured: MeasuredRows) -> Array:
+    def _refused_for_good(self, measured: MeasuredRows) -> Array:
         """(B, A) bool, axes whose typical residual hardly decreased in two rounds, and which are refused because of it.
 
         A quarter in two rounds is too little to reach what is permitted in the rounds that remain.
@@ -463,43 +501,12 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     return np.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
 
 
-def _better_of_both(first: FittedRows, second: FittedRows) -> FittedRows:
-    """For every stack the result with the smaller residual in the typical row."""
-    better = typical_size(second.measurements, second.fit) < typical_size(first.measurements, first.fit)
-    first = replace(first, frames=second.frames)
-    if not bool(better.any()):
-        return first
-    if bool(better.all()):
-        return replace(second, has_pattern=first.has_pattern, abandoned=first.abandoned)
-    # Tones of both fits side by side, where one has more than the other, are fitted to the chosen measurements.
-    count = max(first.fit.active.shape[-1], second.fit.active.shape[-1])
-
-    def tones(one: Array, other: Array) -> Array:
-        one, other = (np.pad(values, ((0, 0), (0, 0), (0, count - values.shape[-1]))) for values in (one, other))
-        return np.where(better[:, None, None], one, other)
-
-    measurements = select_stacks(better, second.measurements, first.measurements)
-    frequencies = tones(second.fit.frequencies, first.fit.frequencies)
-    active = tones(second.fit.active, first.fit.active)
-    fit = fit_tones(measurements, frequencies, active, first.fit.model)
-    chosen = better[:, None, None, None]
-    unknown = np.concatenate([_with_tones(second, count) * chosen, _with_tones(first, count) * ~chosen], -1)
-    return replace(
-        first,
-        measurements=measurements,
-        fit=replace(fit, covariance=fit.covariance + covariance_of_changes(unknown)),
-        unknown=unknown,
-        other_motion=select_stacks(better, second.other_motion, first.other_motion),
-        robust_weights=np.where(better[:, None, None], second.robust_weights, first.robust_weights),
-        aliasing=np.where(better, second.aliasing, first.aliasing),
-        converged=np.where(better, second.converged, first.converged),
-        uneven=np.where(better[:, None], second.uneven, first.uneven),
-    )
-
-
-def _with_tones(fitted: FittedRows, count: int) -> Array:
-    """``FittedRows.unknown`` of a fit with ``count`` tones on each axis; the further ones did not change."""
-    tones = fitted.fit.active.shape[-1]
-    further = np.zeros((*fitted.unknown.shape[:2], 3 * (count - tones), fitted.unknown.shape[-1]))
-    of_tones, of_drift = np.split(fitted.unknown, [3 * tones], 2)
-    return np.concatenate([of_tones, further, of_drift], 2)
+def _with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
+    """The result with another one of the stacks ``index`` where its residual in the typical row is smaller."""
+    sizes = typical_size(first.measurements, first.fit)[index], typical_size(second.measurements, second.fit)
+    better = sizes[1] < sizes[0]
+    place = np.arange(len(first.unknown))
+    place[index[better]] = len(place) + np.flatnonzero(better)
+    count, rounds = _room([first, second])
+    chosen = take_stacks([_with_room(first, count, rounds), _with_room(second, count, rounds)], place)
+    return replace(chosen, abandoned=first.abandoned)

@@ -84,6 +84,10 @@ class RowGradients:
     quarters: Tensor
     aliasing: Tensor
 
+    def stacks(self, index: Tensor) -> "RowGradients":
+        """The gradients of some stacks; they are copied."""
+        return RowGradients(*(values[index] for values in vars(self).values()))
+
 
 def row_gradients(
     spectra: WarpedRows,

@@ -41,6 +41,7 @@ __all__ = [
     "FrameGroup",
     "MeasuredGroup",
     "blur_ratio",
+    "column_pattern_of",
     "compared_intervals",
     "differential_motion",
     "differently_blurred",
@@ -52,7 +53,6 @@ __all__ = [
     "measure_strips",
     "stack_spectra",
     "uneven_motion",
-    "without_column_pattern",
 ]
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
@@ -423,10 +423,10 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float) -> Measureme
     return replace(measurements, displacements=measurements.relative(measurements.displacements))
 
 
-def without_column_pattern(
+def column_pattern_of(
     groups: list[FrameGroup], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
-) -> list[FrameGroup] | None:
-    """The frames without a pattern of columns that is fixed to the sensor; None if there is none.
+) -> Tensor | None:
+    """Spectrum (B, U) of a pattern of columns that is fixed to the sensor; None if there is none.
 
     The pattern would pull all displacements to zero.
     """
@@ -435,10 +435,7 @@ def without_column_pattern(
         positions = _Positions.of(group, timing, motion, EVERY)
         visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
         parts.append((group.spectra, positions.rows, positions.shift, visible, of_group.variance[:, ::EVERY]))
-    pattern = column_pattern(parts)
-    if pattern is None:
-        return None
-    return [replace(group, spectra=group.spectra.without(pattern)) for group in groups]
+    return column_pattern(parts)
 
 
 def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Array:

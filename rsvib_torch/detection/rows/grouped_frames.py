@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import Array, table
+from rsvib_torch.core.tables import Array, table, take_stacks, tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroup,
     blur_ratio,
+    column_pattern_of,
     differential_motion,
     differently_blurred,
     displacements_of_parts,
@@ -26,7 +27,6 @@ from rsvib_torch.detection.rows.displacements import (
     measure_strips,
     stack_spectra,
     uneven_motion,
-    without_column_pattern,
 )
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.frames.column_strips import ColumnStrips
@@ -55,6 +55,15 @@ class MeasuredRows:
     measurements: Measurements
     gradients: list[RowGradients]
     apart: Array | None = None
+
+    def stacks(self, stacks: Array) -> "MeasuredRows":
+        """The measurements of some stacks."""
+        rows = tensor(stacks).to(self.gradients[0].variance.device)
+        return MeasuredRows(
+            take_stacks([self.measurements], stacks),
+            [part.stacks(rows) for part in self.gradients],
+            None if self.apart is None else self.apart[stacks],
+        )
 
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
@@ -87,20 +96,37 @@ class GroupedFrames:
         """The motion of the stacks that are measured, with two components."""
         return motion
 
-    def without_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Self | None:
-        """The rows without a pattern of columns that is fixed to the sensor; None if there is none."""
-        groups = without_column_pattern(self.groups, self.timing, self.view(motion), gradients)
-        return None if groups is None else replace(self, groups=groups)
+    def rows_of(self, stacks: Array) -> Tensor:
+        """Indices of stacks in the batch of the groups."""
+        return tensor(stacks).to(self.groups[0].starts.device)
+
+    def stacks(self, stacks: Array) -> Self:
+        """The frames of some stacks; they are copied."""
+        rows = self.rows_of(stacks)
+        return replace(
+            self, groups=[FrameGroup(group.spectra.stacks(rows), group.starts[rows]) for group in self.groups]
+        )
+
+    def column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Tensor | None:
+        """Spectrum of a pattern of columns in each row of the batch, see ``column_pattern_of``."""
+        return column_pattern_of(self.groups, self.timing, self.view(motion), gradients)
+
+    def without(self, pattern: Tensor, stacks: Array | None = None) -> Self:
+        """The frames without a pattern of columns of all, or of some, stacks."""
+        if stacks is not None:
+            rows = len(self.groups[0].starts)
+            pattern = pattern.new_zeros(rows, pattern.shape[-1]).index_copy_(0, self.rows_of(stacks), pattern)
+        return replace(self, groups=[replace(group, spectra=group.spectra.without(pattern)) for group in self.groups])
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
         return torch.stack(blur_ratio(self.groups, self.timing, self.view(motion)), -1)
 
-    def differently_blurred(self, motion: Vibration) -> bool:
-        """Whether the frames of any group are blurred differently."""
-        view = self.view(motion)
-        height = self.groups[0].spectra.height
-        return any(bool(differently_blurred(group.starts, height, self.timing, view).any()) for group in self.groups)
+    def differently_blurred(self, motion: Vibration) -> Array:
+        """(B,) bool, stacks in which the frames of a group are blurred differently."""
+        view, height = self.view(motion), self.groups[0].spectra.height
+        rows = [differently_blurred(group.starts, height, self.timing, view) for group in self.groups]
+        return table(torch.stack(rows).any(0).unflatten(0, (len(motion.amplitude), -1)).any(1))
 
 
 def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
@@ -166,11 +192,16 @@ class GroupedStrips(GroupedFrames):
             excesses.append(torch.where(regular[..., None], excess, torch.nan))
         return table(torch.cat(excesses, 1))
 
-    def without_column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Self | None:
+    def rows_of(self, stacks: Array) -> Tensor:
+        """Indices of the strips of stacks in the batch of the groups."""
+        count = len(self.columns)
+        return super().rows_of((stacks[:, None] * count + np.arange(count)).ravel())
+
+    def column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Tensor | None:
         """As for whole rows: all strips of a row have the same noise."""
         count = len(self.columns)
         of_strips = [replace(part, variance=part.variance.repeat_interleave(count, 0)) for part in gradients]
-        return super().without_column_pattern(motion, of_strips)
+        return super().column_pattern(motion, of_strips)
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motions of the strips (B S)."""

@@ -6,20 +6,16 @@ coupling of the scan with motion along it are part of the model, and all tones o
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
 from scipy.linalg import block_diag
 
-from rsvib_torch.core.tables import Array, split_axis, tensor, without_nan
+from rsvib_torch.core.tables import Array, select_stacks, split_axis, tensor, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 __all__ = [
     "LARGEST",
@@ -38,13 +34,14 @@ __all__ = [
     "motion_of_fit",
     "offset_gain",
     "residual_of",
-    "select_stacks",
     "shrunk",
     "strongest_only",
     "tone_displacements",
     "tone_response",
     "vibration_of_fit",
     "with_axes",
+    "with_tone_parameters",
+    "with_tones",
     "with_unknown_errors",
 ]
 
@@ -54,9 +51,6 @@ MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are 
 # Roll of 2.5e-3 to 0.03 rad in 40 parts of 2 to 4 frames: with 0.1, 0.3, 1 and 30 px, 59, 62, 66 and 63 axes were right
 # and 2, 1, 2 and 2 wrong; with 30 px, a nearly blind roll of 0.2 px in two frames was 2.7 px and reliable
 LARGEST = (30.0, 30.0, 1.0, 1.0)
-
-Result = TypeVar("Result", bound="DataclassInstance")
-
 
 # --- Model ---
 
@@ -160,16 +154,6 @@ def model_displacements(measurements: Measurements, fit: ToneFit) -> Array:
 def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
     """Residual displacements (B, N, G, 2) in px of a fit."""
     return measurements.relative(measurements.displacements - model_displacements(measurements, fit))
-
-
-def select_stacks(where: Array, one: Result, other: Result) -> Result:
-    """Dataclass of batched arrays with the stacks of ``one`` where ``where`` (B,) is true, else those of ``other``."""
-    chosen = {}
-    for field in fields(one):
-        first, second = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(first, np.ndarray):
-            chosen[field.name] = np.where(where.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
-    return replace(one, **chosen)
 
 
 # --- Weighted least squares ---
@@ -622,6 +606,28 @@ def strongest_only(fit: ToneFit) -> ToneFit:
         return np.take_along_axis(split_axis(values, -1, -1, harmonics), family, 2)[:, :, 0]
 
     return replace(fit, coefficients=pick(fit.coefficients), frequencies=pick(fit.frequencies), active=pick(fit.active))
+
+
+def with_tones(fit: ToneFit, count: int) -> ToneFit:
+    """The fit with room for ``count`` tones on each axis; the further ones do not exist."""
+    axes, tones = fit.active.shape[1:]
+    further = ((0, 0), (0, 0), (0, count - tones))
+    covariance = split_axis(split_axis(fit.covariance, 2, axes, -1), 1, axes, -1)
+    covariance = with_tone_parameters(with_tone_parameters(covariance, 2, tones, count), 4, tones, count)
+    return replace(
+        fit,
+        coefficients=np.pad(fit.coefficients, further),
+        frequencies=np.pad(fit.frequencies, further),
+        active=np.pad(fit.active, further),
+        covariance=covariance.reshape(len(covariance), axes * covariance.shape[2], -1),
+    )
+
+
+def with_tone_parameters(values: Array, axis: int, tones: int, count: int) -> Array:
+    """Values with the parameters of an axis, of ``tones`` tones and the drift, as those of ``count`` tones; 0 there."""
+    of_tones, of_drift = np.split(values, [3 * tones], axis)
+    further = np.zeros((*values.shape[:axis], 3 * (count - tones), *values.shape[axis + 1 :]))
+    return np.concatenate([of_tones, further, of_drift], axis)
 
 
 def with_axes(fit: ToneFit, axes: int) -> ToneFit:

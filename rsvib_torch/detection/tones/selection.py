@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, median, quantile, split_axis, without_nan
+from rsvib_torch.core.tables import Array, median, quantile, select_stacks, split_axis, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import (
     LARGEST,
@@ -14,7 +14,6 @@ from rsvib_torch.detection.tones.fit import (
     fit_tones,
     offset_gain,
     residual_of,
-    select_stacks,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
 
