@@ -13,6 +13,7 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
+from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.detection.attempts import FieldOptions, detect_tones, detect_windows, windows_of
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
@@ -241,11 +242,12 @@ def detect_vibration(
         stacks = stacks.narrowed(columns)
 
     # 2. One result from all frames, or one from each window.
-    if window is None:
-        result = detect_tones(stacks, timing, options, field)
-    else:
-        windows = windows_of(stacks.images.shape[1], window, window_step, timing)
-        result = detect_windows(stacks, windows, options, field)
+    with threads_for(stacks.images):
+        if window is None:
+            result = detect_tones(stacks, timing, options, field)
+        else:
+            windows = windows_of(stacks.images.shape[1], window, window_step, timing)
+            result = detect_windows(stacks, windows, options, field)
     result = replace(result, timing=timing)  # of the stack, not of a window
     return result if stacks.batched else result[0]
 

@@ -24,6 +24,7 @@ from rsvib_torch.core.arguments import as_numbers, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.option_types import DetectionMethod
+from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.tables import Array, table, tables, tensor
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
@@ -269,7 +270,8 @@ class VibrationTracker:
         # 2. Predict the motion of a late frame, measure that of any other; detect the vibration if it is not known, or
         # if the rows contradict it.
         predicted = None if measure else self._predicted(state)
-        state = self._detected(self._measured(state)) if predicted is None else predicted
+        with threads_for(latest.images):
+            state = self._detected(self._measured(state)) if predicted is None else predicted
 
         # 3. The result, moved to where the steady image is.
         tracked = self._result(prepared, state)

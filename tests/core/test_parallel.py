@@ -1,9 +1,10 @@
 import threading
+import time
 
 import pytest
 import torch
 
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.core.parallel import in_parallel, threads_for
 
 CPU = torch.device("cpu")
 
@@ -69,3 +70,14 @@ def test_errors_are_raised_and_no_further_item_begins(two_threads):
         in_parallel(fail, range(9), CPU)
     assert sorted(begun) == [0, 1]
     assert torch.get_num_threads() == 2
+
+
+def test_operations_on_small_images_use_one_thread_and_independent_work_uses_all(two_threads):
+    small, large = torch.zeros(2, 64, 64), torch.zeros(1, 1, 1).expand(1, 1201, 1201)
+    with threads_for(small):
+        assert torch.get_num_threads() == 1
+        assert len(set(in_parallel(lambda _: (time.sleep(0.05), threading.get_ident())[1], range(2), CPU))) == 2
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+    with threads_for(large):
+        assert torch.get_num_threads() == 2

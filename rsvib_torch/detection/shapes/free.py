@@ -20,6 +20,7 @@ from torch.nn import functional
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.core.reason import Reason
@@ -218,7 +219,10 @@ def detect_motion(
     height, width = stacks.images.shape[-2:]
     camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
     scale = FieldScale(axes, width, height, camera)
-    results = [_detect(stacks.one(i), timing, bands, knot_rows, iterations, scale) for i in range(len(stacks.images))]
+    with threads_for(stacks.images):
+        results = [
+            _detect(stacks.one(i), timing, bands, knot_rows, iterations, scale) for i in range(len(stacks.images))
+        ]
     return MotionDetection.stacked(results) if stacks.batched else results[0]
 
 
