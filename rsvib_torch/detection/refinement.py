@@ -135,7 +135,7 @@ def _rounds(
     may_abandon: bool,
     has_pattern: bool | None,
 ) -> FittedRows:
-    """All rounds of a ``Refinement``."""
+    """All rounds from a start: parts of the batch that are finished leave it, or begin again by themselves."""
     running = [Refinement(frames, intervals, start, tones, may_abandon=may_abandon, has_pattern=has_pattern)]
     finished: list[Refinement] = []
     while running:
