@@ -187,7 +187,10 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
         ("module = importlib.import_module('rsvib_torch.config')", "rsvib_torch.evaluation.quality"),
-        ("FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.output', 'Output')", "rsvib_torch.io.formats"),
+        (
+            "FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.run_folder', 'RunFolder')",
+            "rsvib_torch.io.formats",
+        ),
         ("from rsvib_torch.detection.rows import displacements", "rsvib_torch.detection.tones.fit"),
         ("from rsvib_torch.restoration.exact.exact import restore_exact", "rsvib_torch.restoration.dewarp"),
     ],

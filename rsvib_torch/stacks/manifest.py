@@ -70,6 +70,7 @@ class StackManifest(Summarised, Section):
         units: Units of the numbers.
         bad_frames: Index of each frame that could not be used, with the reason.
         not_kept: Metadata of the input that the output does not contain.
+        margins: px that were cut off the sides of the frames of a video.
         windows: Result of every window.
     """
 
@@ -82,6 +83,7 @@ class StackManifest(Summarised, Section):
     units: dict[str, str]
     bad_frames: dict[str, str]
     not_kept: list[str] = Field(default_factory=list)
+    margins: dict[str, int] | None = None
     windows: list[WindowRecord]
 
     def header(self) -> dict[str, Any]:
@@ -237,7 +239,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
 
 
 def write_manifest(
-    path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = ()
+    path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
 ) -> None:
     """Write a manifest with one line per key and window; records are not kept in memory.
 
@@ -246,6 +248,7 @@ def write_manifest(
         header: As made by ``manifest_header``.
         records: Contents of ``WindowRecord``.
         not_kept: Metadata of the input that the output does not contain.
+        **results: Further keys of ``StackManifest``.
     """
     units = {
         "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
@@ -267,7 +270,10 @@ def write_manifest(
             bad.update(record["bad_frames"])
             file.write(",\n    " if number else "\n    ")
             file.write(json.dumps(record, allow_nan=False))
-        file.write(f'\n  ],\n  "bad_frames": {json.dumps(bad)},\n  "not_kept": {json.dumps(list(not_kept))}\n}}\n')
+        file.write("\n  ]")
+        for key, value in {"bad_frames": bad, "not_kept": list(not_kept), **results}.items():
+            file.write(f",\n  {json.dumps(key)}: {json.dumps(value)}")
+        file.write("\n}\n")
 
 
 @checks_arguments
