@@ -1,6 +1,8 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
+import errno
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -122,8 +124,12 @@ def open_hdf5(path: Path) -> ArrayReader | ContiguousReader:
 
 def write_hdf5(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
     """Write a file with a contiguous dataset, frame by frame; arguments as in ``StackFormat.write``."""
-    with _h5py().File(path, "w", locking=False, libver="v110") as file:
-        dataset = file.create_dataset(_DATASET, info.stored_shape, np.dtype(info.dtype).newbyteorder("<"))
-        dataset.attrs.update(attributes_of(info))
-        for index, frame in enumerate(frames):
-            dataset[index] = info.to_stored(frame)
+    try:
+        with _h5py().File(path, "w", locking=False, libver="v110") as file:
+            dataset = file.create_dataset(_DATASET, info.stored_shape, np.dtype(info.dtype).newbyteorder("<"))
+            dataset.attrs.update(attributes_of(info))
+            for index, frame in enumerate(frames):
+                dataset[index] = info.to_stored(frame)
+    except RuntimeError as error:  # of a file that cannot be closed, as on a full disk
+        number = re.search(r"errno = (\d+)", str(error))
+        raise OSError(int(number[1]) if number else errno.EIO, "the HDF5 file cannot be written", str(path)) from error

@@ -142,7 +142,7 @@ def run_to_file(
             raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
         for path in (sink, manifest):
             remove_abandoned(path)
-        return report((record.model_dump() for record in complete.windows), windows, complete.not_kept)
+        return report(map(vars, complete.windows), windows, complete.not_kept)
     folder = RunFolder(sink, header, resume=resume)
     try:
         resumed = folder.count
