@@ -323,6 +323,7 @@ def disk_errors_named(folder: RunFolder) -> Iterator[None]:
         yield
     except OSError as error:
         kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
-        # the words of the system: libraries add long descriptions
-        reason = os.strerror(error.errno) if error.errno else " ".join(str(error).split())
-        raise OSError(error.errno, f"{reason}{kept}", str(folder.sink)) from error
+        # the words of the system: libraries add long descriptions; NumPy does not state why an array is cut off
+        number = errno.ENOSPC if "requested and" in str(error) else error.errno
+        reason = os.strerror(number) if number else " ".join(str(error).split())
+        raise OSError(number, f"{reason}{kept}", str(folder.sink)) from error
