@@ -5,7 +5,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from rsvib_torch.io.video import CONTAINERS
 from rsvib_torch.io.video_parts import PartWriter, PlaneReader, join_parts, planes_of
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.restore import check_method_options
+from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, plan_job
 from rsvib_torch.stacks.manifest import manifest_header
@@ -304,11 +305,21 @@ def _restore_parts(
     known = [record["detection"] is not None for record in folder.records()]
     before: Planes | None = None
     done = -1
+
+    def missing() -> Iterator[tuple[FrameTrack, Frame | str]]:
+        """Frames of the parts that are not in the folder."""
+        for track, frame in followed_frames:
+            if track.index // PART_FRAMES not in folder:
+                yield track, frame
+            else:
+                progress()
+
+    def restore(track: FrameTrack, frame: Frame | str) -> tuple[FrameTrack, Frame | str, RestoredFrame]:
+        return track, frame, video.restorer.restored(frame, track)
+
+    frames = results_in_order(missing(), lambda item: pool.submit(restore, *item), lambda: at_once + 2, deque())
     try:
-        with (
-            closing(followed_frames),
-            closing(_in_order(video, followed_frames, pool, at_once, folder, progress)) as frames,
-        ):
+        with closing(followed_frames), closing(frames):
             for track, frame, restored in frames:
                 part = track.index // PART_FRAMES
                 if track.index != done + 1 or before is None:
@@ -332,32 +343,6 @@ def _restore_parts(
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         torch.set_num_threads(default_threads)
-
-
-def _in_order(
-    video: VideoPasses,
-    tracks: Iterator[tuple[FrameTrack, Frame | str]],
-    pool: ThreadPoolExecutor,
-    at_once: int,
-    folder: RunFolder,
-    progress: Callable[[], None],
-) -> Generator[tuple[FrameTrack, Frame | str, RestoredFrame], None, None]:
-    """Frames of the parts that are not in the folder, in order; some more are restored ahead."""
-    waiting: deque[tuple[FrameTrack, Frame | str, Future[RestoredFrame]]] = deque()
-
-    def first() -> tuple[FrameTrack, Frame | str, RestoredFrame]:
-        track, frame, future = waiting.popleft()
-        return track, frame, future.result()
-
-    for track, frame in tracks:
-        if track.index // PART_FRAMES in folder:
-            progress()
-            continue
-        waiting.append((track, frame, pool.submit(video.restorer.restored, frame, track)))
-        if len(waiting) > at_once + 1:
-            yield first()
-    while waiting:
-        yield first()
 
 
 def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:
