@@ -3,8 +3,15 @@
 import torch
 
 from rsvib_torch import VibrationStd
-from rsvib_torch.core.reason import read_findings
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+
+
+def findings_of(texts):
+    """Reasons with the given texts, in the same nested sequences."""
+    if isinstance(texts, str):
+        return Reason("unspecified", details={"text": texts})
+    return tuple(map(findings_of, texts))
 
 
 def detection_of(vibration, relative=1e-3, *, phase=1e-3, reliable=(True, True), reasons=((), ())):
@@ -23,6 +30,6 @@ def detection_of(vibration, relative=1e-3, *, phase=1e-3, reliable=(True, True),
         gain=torch.ones_like(vibration.amplitude),
         residual=drift,
         reliable=torch.tensor(reliable),
-        findings=read_findings(reasons),
+        findings=findings_of(reasons),
         assumptions=((),) * len(vibration.amplitude) if vibration.batch_shape else (),
     )

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 
 import typer
 
@@ -78,15 +78,15 @@ def live_session(
         float,
         typer.Option(
             metavar="SECONDS",
-            help="Stabilise the image to the moving average of its path over this time (of a file), or to a straight "
-            "line through the last part of its path (of a camera).",
+            help="Stabilise the image to a straight line through the last part of its path (a camera; a file with "
+            "--realtime).",
         ),
     ] = 0.0,
     border: Annotated[
         BorderName,
         typer.Option(
-            help="Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop, cut "
-            "off by constant margins (files only, which are read twice)."
+            help="Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is "
+            "available for videos (rsvib run --video)."
         ),
     ] = "mirror",
     waiting: Annotated[int, typer.Option(help="Frames that wait before the oldest ones are dropped.", min=1)] = 64,
@@ -100,8 +100,8 @@ def live_session(
     counted. Ctrl-C ends the session, and the video is complete.
     """
     is_camera, is_file = source.isdecimal() or "://" in source, file_of_source(source) is not None
-    _check_options(source, out, size, realtime, border, is_file=is_file)
     check_number("steady", steady, at_least=0.0)
+    _check_options(source, out, size, realtime, border, steady, is_file=is_file)
     pipe_out = out is not None and str(out) == "-"
     written = [] if out is None or pipe_out else [out]
     if spectrogram is not None:
@@ -129,17 +129,13 @@ def live_session(
             window=window,
             columns=columns,
             method=name,
-            steady=steady if drops else 0.0,
+            steady=steady,
             wobble=steady > 0,
             full_scale=full_scale if full_scale is not None and not is_file else scale,
             channels="first",
             **options,
         )
 
-    around = 0.0 if drops else steady
-    margins = None
-    if border == "crop":
-        margins = _margins(opened(), tracker, around, num_frames)
     frames_of = opened()
     with _frames_on_standard_output(enabled=pipe_out) as stream:
         try:
@@ -153,8 +149,7 @@ def live_session(
             frames_of,
             tracker(frames_of.full_scale),
             outputs,
-            border=tracking.VideoBorder(border, margins),
-            steady=around,
+            border=tracking.VideoBorder(border),
             drops=drops,
             waiting=waiting,
             max_frames=num_frames,
@@ -172,7 +167,7 @@ def live_session(
 
 
 def _check_options(
-    source: str, out: Path | None, size: str | None, realtime: bool, border: str, *, is_file: bool
+    source: str, out: Path | None, size: str | None, realtime: bool, border: str, steady: float, *, is_file: bool
 ) -> None:
     """Refuse options that do not go with the source."""
     if source == "-" and size is None:
@@ -183,11 +178,10 @@ def _check_options(
         raise ValueError(f"--size goes with frames on standard input (-), not with {source}")
     if realtime and not is_file:
         raise ValueError(f"--realtime goes with a file, not with {source}: a camera has its own rate")
-    if border == "crop" and (not is_file or realtime):
-        raise ValueError(
-            "--border crop reads a file twice, to know the margins of all frames; it cannot be used with "
-            f"{'--realtime' if realtime else source}: use --border hold"
-        )
+    if border == "crop" or (steady > 0 and is_file and not realtime):
+        option = "--border crop" if border == "crop" else "--steady of a file"
+        remedy = f"rsvib run FRAMES OUT --video --steady {steady:g} --border {border}"
+        raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
 
 
 def _outputs(
@@ -219,20 +213,6 @@ def _size(text: str) -> tuple[int, int]:
     if match is None:
         raise ValueError(f"--size must be WIDTHxHEIGHT in px such as 1024x768, got {text!r}")
     return int(match[2]), int(match[1])
-
-
-def _margins(source: FrameSource, tracker: Any, steady: float, num_frames: int | None) -> tracking.Margins:
-    """Widest margins of all frames of a file, from a first pass without restoration."""
-    widest = tracking.Margins()
-
-    def widen(tracked: TrackedFrame, _: LiveReport) -> None:
-        nonlocal widest
-        widest = widest.widest(tracking.Margins.of(tracked.visible))
-
-    live.run_live(
-        source, tracker(source.full_scale), [], steady=steady, drops=False, max_frames=num_frames, progress=widen
-    )
-    return widest
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from rsvib_torch.commands.terminal import (
     show_answer,
     warnings_in_one_line,
 )
-from rsvib_torch.core.unexpected import in_one_line, system_error
+from rsvib_torch.commands.unexpected_errors import in_one_line, system_error
 from rsvib_torch.core.validation import MistakesError
 
 __all__ = ["main", "run_command"]

@@ -54,7 +54,6 @@ from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames, BorderName
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import number_of, printable
-from rsvib_torch.core.validation import validate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -444,10 +443,12 @@ def _restore_windows(
     full_scale: float | None,
 ) -> Answer:
     """Restore a stack with the detections of its windows."""
-    from rsvib_torch.io.schema import TimingRecord, check_same_timing  # noqa: PLC0415
+    from rsvib_torch.core.result_files import decode  # noqa: PLC0415
+    from rsvib_torch.motion.timing import SensorTiming  # noqa: PLC0415
+    from rsvib_torch.report.results import check_same_timing  # noqa: PLC0415
 
     manifest = stacks.read_manifest(vibration)
-    stored = validate(TimingRecord, manifest.settings.get("sensor", {}), f"{vibration}: settings.sensor")
+    stored = decode(SensorTiming, manifest.settings.get("sensor"), f"{vibration}: settings.sensor")
     timing = config.timing
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
         timing = replace(timing, frame_start_times=stored.frame_start_times)

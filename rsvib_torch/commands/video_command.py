@@ -114,7 +114,7 @@ def followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest
         scale = manifest.settings["full_scale"] if path == frames else reader.info.full_scale
         images.append(counts_to_frames(pixels, scale, str(path))[0].nan_to_num(0.0))
         reader.close()
-    margins = manifest.settings["video"]["margins"]
+    margins = manifest.margins
     if margins is not None:
         images[0] = Margins(**margins).cut(images[0])
     return reports.comparison_figure(*images)

@@ -1,23 +1,20 @@
 """Atomic, durable writes: files and folders get their names when they are complete and on the disk."""
 
 import errno
+import fcntl
 import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
-
-try:
-    import fcntl
-except ImportError:  # without it temporary folders of killed processes are not removed
-    fcntl = None  # type: ignore[assignment]
 
 from rsvib_torch.core.text import json_text
 
 __all__ = [
+    "PART",
     "check_kind",
     "check_name",
     "check_not_special",
@@ -25,6 +22,7 @@ __all__ = [
     "make_folder",
     "move_into_place",
     "nearest_folder",
+    "remove_abandoned",
     "sync",
     "sync_tree",
     "temporary_folder",
@@ -33,7 +31,7 @@ __all__ = [
     "write_json",
 ]
 
-_SUFFIX = ".part"
+PART = ".part"  # ending of temporary folders: .NAME.########.part
 _ADDED = len("..12345678.part")  # bytes that names of temporary files have in addition
 
 
@@ -84,41 +82,26 @@ def make_folder(path: Path) -> None:
         folder = folder.parent
 
 
-def _remove_abandoned(parent: Path, name: str) -> None:
+def remove_abandoned(path: Path) -> None:
     """Remove temporary folders of killed processes: the operating system has released their locks."""
-    random_part = "?" * 8  # as made by ``tempfile``
-    for folder in parent.glob(f".{glob.escape(name)}.{random_part}{_SUFFIX}"):
-        try:
-            file = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
-        except OSError:
-            continue
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    for folder in nearest_folder(path).glob(f".{glob.escape(path.name)}.{'?' * 8}{PART}"):
+        with suppress(OSError), _locked(folder) as file:
             if os.fstat(file).st_uid == os.geteuid():
                 shutil.rmtree(folder, ignore_errors=True)
-        except OSError:
-            pass  # in use
-        finally:
-            os.close(file)
 
 
-def _make_locked_folder(parent: Path, name: str) -> tuple[Path, int | None]:
-    """A new temporary folder, and its lock if the file system supports locks."""
-    while True:
-        folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=_SUFFIX, dir=parent))
-        if fcntl is None:
-            return folder, None
-        try:
-            file = os.open(folder, os.O_RDONLY)
-        except FileNotFoundError:
-            continue  # another process removed it before it was locked
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX)
-        except OSError:
-            os.close(file)
-            return folder, None
-        if folder.is_dir():
-            return folder, file
+@contextmanager
+def _locked(folder: Path, *, wait: bool = False) -> Iterator[int]:
+    """Open and lock a folder; ``wait`` until another process releases its lock.
+
+    Raises:
+        OSError: If it is a link or not a folder, another process has locked it, or the file system has no locks.
+    """
+    file = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield file
+    finally:
         os.close(file)
 
 
@@ -126,18 +109,18 @@ def _make_locked_folder(parent: Path, name: str) -> tuple[Path, int | None]:
 def temporary_folder(path: Path) -> Iterator[Path]:
     """A temporary folder on the file system of ``path``; those that killed processes left for it are removed."""
     parent = nearest_folder(path)
-    if fcntl is not None:
-        _remove_abandoned(parent, path.name)
-    try:
-        folder, lock = _make_locked_folder(parent, path.name)
-    except OSError as error:
-        raise OSError(f"cannot write {path}: folder {parent} is not writable ({error.strerror})") from error
-    try:
+    remove_abandoned(path)
+    with ExitStack() as opened:
+        folder = None
+        while folder is None or not folder.is_dir():  # another process may remove it before it is locked
+            try:
+                folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=parent))
+            except OSError as error:
+                raise OSError(f"cannot write {path}: folder {parent} is not writable ({error.strerror})") from error
+            with suppress(OSError):  # file systems without locks
+                opened.enter_context(_locked(folder, wait=True))
+        opened.callback(shutil.rmtree, folder, ignore_errors=True)
         yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
 
 
 def check_name(path: Path) -> None:

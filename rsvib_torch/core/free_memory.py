@@ -1,16 +1,11 @@
 """Memory that this process can still use: of the machine, and of its control groups (containers, batch systems)."""
 
-import os
 import re
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 __all__ = ["check_fits", "free_memory", "size_text"]
 
@@ -65,8 +60,6 @@ def check_fits(what: str, needed: int, remedy: str) -> None:
 
 def _free_addresses() -> list[int]:
     """Free parts of address space and data segment, if they are limited (``ulimit -v``, ``-d``, some batch systems)."""
-    if resource is None:
-        return []
     limits = {"vms": resource.getrlimit(resource.RLIMIT_AS)[0], "data": resource.getrlimit(resource.RLIMIT_DATA)[0]}
     limits = {name: limit for name, limit in limits.items() if limit != resource.RLIM_INFINITY}
     if not limits:
@@ -75,42 +68,30 @@ def _free_addresses() -> list[int]:
     return [limit - int(getattr(used, name, 0)) for name, limit in limits.items()]
 
 
+# Folder of the groups, and names of limits, usage, and files in the page cache (https://docs.kernel.org/admin-guide:
+# cgroup-v2.html, cgroup-v1/memory.html)
+_GROUPS = (
+    ("sys/fs/cgroup", ("memory.max", "memory.high"), "memory.current", "inactive_file"),
+    ("sys/fs/cgroup/memory", ("memory.limit_in_bytes",), "memory.usage_in_bytes", "total_inactive_file"),
+)
+
+
 def _free_in_groups(root: Path) -> Iterator[int]:
-    """Free memory of each control group of this process and of those above it, if they have a limit.
-
-    Version 2 (https://docs.kernel.org/admin-guide/cgroup-v2.html) and version 1 (.../cgroup-v1/memory.html).
-    """
-    names = {
-        "cgroup2": (("memory.max", "memory.high"), "memory.current", "inactive_file"),
-        "cgroup": (("memory.limit_in_bytes",), "memory.usage_in_bytes", "total_inactive_file"),
-    }
-    for kind, own, top in _groups(root):
-        limits, usage, cache = names[kind]
-        for group in (own, *own.parents):
-            cached = re.search(rf"^{cache} (\d+)$", _text(group / "memory.stat"), re.MULTILINE)
-            for used in _number(group / usage):
-                for limit in (number for name in limits for number in _number(group / name)):
-                    yield limit - used + (int(cached[1]) if cached else 0)
-            if group == top:
-                break
-
-
-def _groups(root: Path) -> Iterator[tuple[str, Path, Path]]:
-    """Type of the file system, folder of the group of this process, and the folder where they are mounted."""
-    own = {}
-    for line in _text(root / "proc/self/cgroup").splitlines():
-        _, controllers, path = line.split(":", 2)
-        if controllers == "" or "memory" in controllers.split(","):
-            own["cgroup2" if controllers == "" else "cgroup"] = path
-    for line in _text(root / "proc/self/mountinfo").splitlines():
-        before, _, after = line.partition(" - ")
-        mounted, place = before.split()[3:5]
-        kind, _, options = after.split(maxsplit=2)
-        if kind in own and (kind == "cgroup2" or "memory" in options.split(",")):
-            top = root / place.lstrip("/")
-            inside = os.path.relpath(own[kind], mounted)
-            group = top if inside.startswith("..") else top / inside  # another namespace: only the top is visible
-            yield kind, group if group.is_dir() else top, top
+    """Free memory of each control group of this process and of those above it, if they have a limit."""
+    for folder, limits, usage, cache in _GROUPS:
+        top = root / folder
+        version_1 = top.name == "memory"
+        pattern = r"^\d+:(?:[^:]*,)?memory(?:,[^:]*)?:/(.*)$" if version_1 else r"^0::/(.*)$"
+        named = re.search(pattern, _text(root / "proc/self/cgroup"), re.MULTILINE)
+        group = top / named[1] if named else top
+        if not group.is_dir():  # of another namespace: only the top is visible
+            group = top
+        for place in (group, *(above for above in group.parents if above.is_relative_to(top))):
+            cached = re.search(rf"^{cache} (\d+)$", _text(place / "memory.stat"), re.MULTILINE)
+            used = _text(place / usage).strip()
+            for limit in (_text(place / name).strip() for name in limits):
+                if used.isdecimal() and limit.isdecimal():  # not "max"
+                    yield int(limit) - int(used) + (int(cached[1]) if cached else 0)
 
 
 def _text(path: Path) -> str:
@@ -118,9 +99,3 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
-
-
-def _number(path: Path) -> list[int]:
-    """The number in a file, or nothing: the file does not exist, or contains ``max``."""
-    text = _text(path).strip()
-    return [int(text)] if text.isdecimal() else []

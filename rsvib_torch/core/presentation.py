@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
+from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reason import texts
 from rsvib_torch.core.text import text_table, wrapped
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AXIS_NAMES",
     "AXIS_UNITS",
-    "FIGURES",
     "JudgedResult",
     "Result",
     "Summarised",
@@ -40,16 +39,6 @@ __all__ = [
     "verdict_lines",
     "verdict_table",
 ]
-
-# Figures of results: the function that draws a result of this type with this number of leading dimensions (0: not a
-# batch). The module _PLOTS fills the table; it is imported when the first figure is drawn.
-FIGURES: dict[tuple[type, int], Callable[[Any], "Figure"]] = {}
-_PLOTS = "rsvib_torch.report.plots"
-
-# Files of results: ``save_result``, ``load_result`` and ``save_figure`` of this module, imported at the first call. An
-# algorithm that returns a result imports neither atomic writes nor the checks of files.
-_FILES = "rsvib_torch.core.result_files"
-
 
 # Text
 
@@ -258,7 +247,9 @@ class Result(Summarised):
         Raises:
             OSError: If the file cannot be written.
         """
-        import_module(_FILES).save_result(self, Path(path))
+        from rsvib_torch.core.result_files import save_result  # noqa: PLC0415 - algorithms do not write files
+
+        save_result(self, Path(path))
 
     @classmethod
     @checks_arguments
@@ -272,7 +263,9 @@ class Result(Summarised):
             OSError: If the file cannot be opened.
             ValueError: If it does not contain a result of this class.
         """
-        result: Self = import_module(_FILES).load_result(cls, Path(path))
+        from rsvib_torch.core.result_files import load_result  # noqa: PLC0415
+
+        result: Self = load_result(cls, Path(path))
         return result
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
@@ -310,8 +303,7 @@ class Result(Summarised):
             TypeError: If there is no figure of this kind of result.
             ValueError: If it is a batch that has no figure.
         """
-        import_module(_PLOTS)
-        draw = FIGURES.get((type(self), len(self.batch_shape)))
+        draw = figure_of(type(self), len(self.batch_shape))
         if draw is None:
             drawn = sorted({kind.__name__ for kind, _ in FIGURES})
             if type(self).__name__ in drawn:
@@ -321,13 +313,14 @@ class Result(Summarised):
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
-            import_module(_FILES).save_figure(figure, Path(path))
+            from rsvib_torch.core.result_files import save_figure  # noqa: PLC0415
+
+            save_figure(figure, Path(path))
         return figure
 
     def _repr_html_(self) -> str:
-        import_module(_PLOTS)
         text = super()._repr_html_()
-        if (type(self), len(self.batch_shape)) not in FIGURES:
+        if figure_of(type(self), len(self.batch_shape)) is None:
             return text
         picture = io.BytesIO()
         self.plot().savefig(picture, format="png", dpi=70, facecolor="white")

@@ -133,16 +133,12 @@ def texts(findings: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def read_findings(values: Any) -> Any:
-    """Reasons in nested lists as JSON files have them: tables, or texts in files of earlier versions.
+    """Reasons in nested lists as JSON files have them.
 
     Example:
-        >>> texts(read_findings([[], ["blind"]]))
+        >>> texts(read_findings([[], [{"code": "of a later version", "text": "blind"}]]))
         ((), ('blind',))
     """
-    if isinstance(values, Reason):
-        return values
-    if isinstance(values, str):
-        return Reason("unspecified", details={"text": values})
     if isinstance(values, Mapping):
         return Reason.from_dict(values)
     if not isinstance(values, (list, tuple)):
@@ -447,6 +443,6 @@ GROUPS = {
     "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,
     "Restoration (`restore`, `judge_restoration`)": _RESTORATION,
-    "Files of earlier versions": {"unspecified": ReasonKind("{text}")},
+    "Files of later versions": {"unspecified": ReasonKind("{text}")},
 }
 REASONS = {code: kind for kinds in GROUPS.values() for code, kind in kinds.items()}

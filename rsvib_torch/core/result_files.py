@@ -4,7 +4,7 @@ import math
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from rsvib_torch.core.validation import read_json
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["load_result", "save_figure", "save_result"]
+__all__ = ["decode", "load_result", "save_figure", "save_result"]
 
 
 def save_result(result: Any, path: Path) -> None:
@@ -33,8 +33,8 @@ def load_result(kind: type[Any], path: Path) -> Any:
             f"{data.get('format')!r} of version {data.get('version')!r}"
         )
     try:
-        return _dataclass(kind, data)
-    except (TypeError, ValueError) as error:
+        return decode(kind, data, "")
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
@@ -44,39 +44,62 @@ def save_figure(figure: "Figure", path: Path) -> None:
         figure.savefig(part, dpi=150, facecolor="white")
 
 
-def _restored(kind: Any, value: Any, path: str, missing: float) -> Any:
-    """Inverse of ``plain_values`` for an annotated type; ``missing`` takes the place of None in a tensor."""
+def decode(kind: Any, value: Any, path: str, missing: float = math.nan) -> Any:
+    """A value of an annotated type from what ``plain_values`` made of it.
+
+    Args:
+        kind: The type: a dataclass, a tensor, numbers and texts, or tuples and tables of these.
+        value: What a JSON file contains.
+        path: Its place in the file, for messages.
+        missing: What None stands for in a tensor.
+
+    Raises:
+        ValueError: If the value does not have the type, with its place.
+    """
     if get_origin(kind) in (Union, types.UnionType):
         if value is None:
             return None
         kind = next(member for member in get_args(kind) if member is not types.NoneType)
     if kind is Tensor:
         return _tensor(value, path, missing)
-    if get_origin(kind) is dict:
-        if not isinstance(value, dict):
-            raise ValueError(f"{path}: expected a table, got {value!r}")
-        return {key: _restored(get_args(kind)[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
     if is_dataclass(kind) and isinstance(kind, type):
         return _dataclass(kind, value, path)
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise ValueError(f"{path}: expected a table, got {value!r}")
+        return {key: decode(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
+    if origin is tuple and is_dataclass(parts[0]):
+        if not isinstance(value, list):
+            raise ValueError(f"{path}: expected a list of tables, got {value!r}")
+        return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
+    if origin is Literal and value not in parts:
+        raise ValueError(f"{path}: expected {' or '.join(map(repr, parts))}, got {value!r}")
     if kind in (float, int, str, bool) and not isinstance(value, (float, int) if kind is float else kind):
         raise ValueError(f"{path}: expected {kind.__name__}, got {value!r}")
-    return _tuples(value)
+    return value if kind is Any else _tuples(value)
 
 
-def _dataclass(kind: type[Any], value: Any, path: str = "") -> Any:
+def _dataclass(kind: type[Any], value: Any, path: str) -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{path}: expected a table, got {value!r}")
     # SensorTiming does not import torch, whose Tensor its annotations name
     hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
-    if "findings" in hints:  # files of earlier versions have texts of reasons
-        value = {**value, "findings": read_findings(value.get("findings", value.get("reasons", ())))}
-    # files of earlier versions lack fields that were added later with a default
-    needed = [field.name for field in fields(kind) if field.default is MISSING and field.default_factory is MISSING]
-    if absent := [name for name in needed if name not in value]:
-        raise ValueError(f"{start}{absent[0]}: missing key")
-    names = [field.name for field in fields(kind) if field.name in value]
     missing = getattr(kind, "_MISSING", math.nan)
-    return kind(**{name: _restored(hints[name], value[name], start + name, missing) for name in names})
+    values: dict[str, Any] = {}
+    for field in fields(kind):
+        if field.name in value:
+            stated = value[field.name]
+            if field.name in ("findings", "left_alone"):
+                values[field.name] = read_findings(stated)
+            else:
+                values[field.name] = decode(hints[field.name], stated, start + field.name, missing)
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise ValueError(f"{start}{field.name}: missing key")
+    try:
+        return kind(**values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}" if path else str(error)) from error
 
 
 def _tensor(value: Any, path: str, missing: float) -> Tensor:

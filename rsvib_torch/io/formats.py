@@ -32,8 +32,7 @@ def packaged_format(
     module: str,
     open: str,
     *,
-    create: str | None = None,
-    write_all: str | None = None,
+    write: str | None = None,
     check: str | None = None,
     **stated: Any,
 ) -> StackFormat:
@@ -46,12 +45,11 @@ def packaged_format(
         endings: As in ``StackFormat``.
         module: Full name of the module that has the functions.
         open: Name of the function ``StackFormat.open``.
-        create: Name of the function ``StackFormat.create``, if there is one.
-        write_all: Name of the function ``StackFormat.write_all``, if there is one.
+        write: Name of the function ``StackFormat.write``, if there is one.
         check: Name of the function ``StackFormat.check``, if there is one.
         **stated: Further attributes of ``StackFormat``.
     """
-    functions = {"open": open, "create": create, "write_all": write_all, "check": check}
+    functions = {"open": open, "write": write, "check": check}
     loaded: dict[str, Any] = {
         use: _InModule(module, function) for use, function in functions.items() if function is not None
     }
@@ -65,37 +63,37 @@ _READ_ONLY_VIDEO = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
-    packaged_format("npy", (".npy",), "rsvib_torch.io.npy", "open_npy", create="create_npy", check="check_npy"),
+    packaged_format("npy", (".npy",), "rsvib_torch.io.npy", "open_npy", write="write_npy", check="check_npy"),
     packaged_format(
-        "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", create="create_hdf5", keeps=_KEPT
+        "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", write="write_hdf5", keeps=_KEPT
     ),
     packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.image_folder", "ImagesReader"),
     packaged_format(
-        "png", (".png",), "rsvib_torch.io.image_folder", "ImagesReader", create="create_image", check="check_image",
+        "png", (".png",), "rsvib_torch.io.image_folder", "ImagesReader", write="write_image", check="check_image",
         dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
-        "image folder", ("",), "rsvib_torch.io.image_folder", "ImagesReader", create="create_folder",
+        "image folder", ("",), "rsvib_torch.io.image_folder", "ImagesReader", write="write_folder",
         check="check_folder", kind="folder", keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
-        "raw", (".raw",), "rsvib_torch.io.raw", "open_raw", create="create_raw", companions=(".json",), keeps=_KEPT
+        "raw", (".raw",), "rsvib_torch.io.raw", "open_raw", write="write_raw", companions=(".json",), keeps=_KEPT
     ),
     packaged_format(
-        "tiff", (".tif", ".tiff"), "rsvib_torch.io.tiff", "open_tiff", create="create_tiff", write_all="write_tiff",
+        "tiff", (".tif", ".tiff"), "rsvib_torch.io.tiff", "open_tiff", write="write_tiff",
         compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata"),
     ),
     packaged_format(
-        "FFV1 video", (".mkv", ".avi"), "rsvib_torch.io.video", "VideoReader", write_all="write_video",
+        "FFV1 video", (".mkv", ".avi"), "rsvib_torch.io.video", "VideoReader", write="write_video",
         check="check_video", dtypes=("uint8", "uint16"), keeps=_KEPT_BY_VIDEO,
     ),
     packaged_format(
-        "H.264 video", (".mp4", ".mov", ".m4v"), "rsvib_torch.io.video", "VideoReader", write_all="write_video",
+        "H.264 video", (".mp4", ".mov", ".m4v"), "rsvib_torch.io.video", "VideoReader", write="write_video",
         check="check_video", keeps=_KEPT_BY_VIDEO,
     ),
     packaged_format("webm, mpeg, 3gp and wmv", _READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
     packaged_format(
-        "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", create="create_zarr", kind="tree",
+        "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", write="write_zarr", kind="tree",
         marker="zarr.json", keeps=_KEPT,
     ),
 )  # fmt: skip

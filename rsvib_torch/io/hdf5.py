@@ -1,21 +1,23 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
-from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
+from rsvib_torch.io.contiguous import ContiguousReader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 
-__all__ = ["create_hdf5", "open_hdf5"]
+__all__ = ["open_hdf5", "write_hdf5"]
 
 _DATASET = "frames"  # name of the dataset that is written
 _MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms
@@ -118,20 +120,24 @@ def open_hdf5(path: Path) -> ArrayReader | ContiguousReader:
                 file.close()
 
 
-def create_hdf5(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
-    """Create a file whose dataset is contiguous, or open one; h5py's high-level interface cannot allocate it early."""
+def write_hdf5(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write a file with a contiguous dataset, frame by frame; arguments as in ``StackFormat.write``.
+
+    HDF5 writes the header only: it ends the process if the disk is full when a file with pixels is closed.
+    """
     h5py = _h5py()
-    if fresh:
-        with h5py.File(path, "w", locking=False, libver="v110") as file:
-            layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-            layout.set_layout(h5py.h5d.CONTIGUOUS)
-            layout.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-            layout.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-            layout.set_obj_track_times(False)
-            space = h5py.h5s.create_simple(info.stored_shape)
-            kind = h5py.h5t.py_create(np.dtype(info.dtype).newbyteorder("<"))
-            dataset = h5py.h5d.create(file.id, _DATASET.encode(), kind, space, layout)
-            h5py.Dataset(dataset).attrs.update(attributes_of(info))
-    with h5py.File(path, "r", locking=False) as file:
-        offset = int(file[_DATASET].id.get_offset())
-    return ContiguousWriter(path, info, offset, fresh=fresh)
+    with h5py.File(path, "w", locking=False, libver="v110") as file:
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_layout(h5py.h5d.CONTIGUOUS)
+        layout.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+        layout.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        layout.set_obj_track_times(False)
+        space = h5py.h5s.create_simple(info.stored_shape)
+        kind = h5py.h5t.py_create(np.dtype(info.dtype).newbyteorder("<"))
+        dataset = h5py.Dataset(h5py.h5d.create(file.id, _DATASET.encode(), kind, space, layout))
+        dataset.attrs.update(attributes_of(info))
+        offset = int(dataset.id.get_offset())
+    with path.open("r+b") as pixels:
+        pixels.seek(offset)
+        for frame in frames:
+            pixels.write(info.to_stored(frame).data)

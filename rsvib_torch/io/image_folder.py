@@ -1,6 +1,5 @@
 """Stacks with one file per frame: folders of PNG, TIFF or JPEG files in natural order, or one PNG or JPEG file."""
 
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,15 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.atomic import sync
 from rsvib_torch.io.jpeg import decode_jpeg, jpeg_info
 from rsvib_torch.io.png import decode_png, encode_png, png_info
-from rsvib_torch.io.stack_format import FrameReader, FrameWriter
+from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.time_metadata import merged_times
 
-__all__ = ["ImagesReader", "check_folder", "check_image", "create_folder", "create_image"]
+__all__ = ["ImagesReader", "check_folder", "check_image", "write_folder", "write_image"]
 
 _PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
 _KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
@@ -145,43 +143,25 @@ def _frame_names(info: StackInfo) -> list[str]:
     return [f"frame_{index:0{digits}d}{_ending(info)}" for index in range(info.shape[0])]
 
 
-class _ImagesWriter(FrameWriter):
-    """One file per frame, each written atomically."""
-
-    def __init__(self, files: list[Path], info: StackInfo) -> None:
-        self._files, self._info = files, info
-
-    def write(self, index: int, frame: NDArray[Any]) -> None:
-        """Write the file of a frame."""
-        file = self._files[index]
-        one = replace(self._info.with_frames(1), frame_times=None, frame_rate=None, metadata={})
-        part = file.with_name(f".{file.name}.part{file.suffix}")
-        if file.suffix.lower() in _PNG:
-            encode_png(part, np.asarray(frame, dtype=self._info.dtype), one)
-        else:
-            write_tiff(part, one, iter([frame]), None)
-        sync(part)
-        os.replace(part, file)
-
-    def sync(self) -> None:
-        """Return when the names of the files are on the disk."""
-        sync(self._files[0].parent)
-
-    def stored(self, index: int | None) -> Iterator[bytes]:
-        """Content of the file of a frame; there are no other files."""
-        if index is not None:
-            yield self._files[index].read_bytes()
+def _write_file(file: Path, info: StackInfo, frame: NDArray[Any]) -> None:
+    """Write one frame of a stack."""
+    one = replace(info.with_frames(1), frame_times=None, frame_rate=None, metadata={})
+    if file.suffix.lower() in _PNG:
+        encode_png(file, np.asarray(frame, dtype=info.dtype), one)
+    else:
+        write_tiff(file, one, iter([frame]), None)
 
 
-def create_image(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
-    """Create a PNG file of one frame; arguments as in ``StackFormat.create``."""
-    return _ImagesWriter([path], info)
+def write_image(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write a PNG file of one frame; arguments as in ``StackFormat.write``."""
+    _write_file(path, info, next(frames))
 
 
-def create_folder(path: Path, info: StackInfo, fresh: bool) -> _ImagesWriter:
-    """Create a folder for one file per frame, or continue it."""
-    path.mkdir(exist_ok=True)
-    return _ImagesWriter([path / name for name in _frame_names(info)], info)
+def write_folder(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write a folder with one file per frame; arguments as in ``StackFormat.write``."""
+    path.mkdir()
+    for name, frame in zip(_frame_names(info), frames, strict=True):
+        _write_file(path / name, info, frame)
 
 
 def _check_channels(path: Path, info: StackInfo) -> None:

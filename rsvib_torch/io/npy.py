@@ -1,17 +1,18 @@
 """Stacks in NumPy ``.npy`` files; the file has no room for the full scale."""
 
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rsvib_torch.core.arrays import channels_appear_last
-from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, InterleavedReader
+from rsvib_torch.io.contiguous import ContiguousReader, InterleavedReader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["check_npy", "create_npy", "open_npy"]
+__all__ = ["check_npy", "open_npy", "write_npy"]
 
 _MAX_HEADER_BYTES = 10_000  # as in numpy, which reads the header before it compares
 
@@ -51,16 +52,13 @@ def open_npy(path: Path) -> ContiguousReader | InterleavedReader:
         return ContiguousReader(path, info, offset, dtype)
 
 
-def create_npy(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
-    """Create a file of full size, or open one to continue it."""
-    if fresh:
-        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False}
-        with path.open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, {**header, "shape": info.shape})
-    with path.open("rb") as file:
-        offset = _read_header(file)[3]
-    # channels are always stored second, whatever the input was
-    return ContiguousWriter(path, replace(info, channels_last=False), offset, fresh=fresh)
+def write_npy(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write a file frame by frame, channels second; arguments as in ``StackFormat.write``."""
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False, "shape": info.shape}
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        for frame in frames:
+            file.write(np.ascontiguousarray(frame).data)
 
 
 def check_npy(path: Path, info: StackInfo) -> None:

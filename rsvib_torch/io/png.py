@@ -86,33 +86,13 @@ def png_info(path: Path) -> StackInfo:
     return replace(_info(chunks, path.stat().st_size, path), **exif_fields(chunks.get(b"eXIf", b"")))
 
 
-def _needed_for_pixels(data: bytes, chunks: dict[bytes, bytes]) -> bytes:
-    """The file with the chunks that decoding needs: animations and colour profiles do not change the pixels."""
-    kept: list[tuple[bytes, bytes]] = [(kind, chunks[kind]) for kind in (b"IHDR", b"PLTE", b"tRNS") if kind in chunks]
-    kept += [(b"IDAT", _bodies(data, b"IDAT")), (b"IEND", b"")]
-    return data[:8] + b"".join(_chunk(kind, body) for kind, body in kept)
-
-
-def _bodies(data: bytes, kind: bytes) -> bytes:
-    """The bodies of all chunks of a type in a file whose chunks were verified."""
-    bodies, start = [], 8
-    while start < len(data):
-        length = struct.unpack(">I", data[start : start + 4])[0]
-        if data[start + 4 : start + 8] == kind:
-            bodies.append(data[start + 8 : start + 8 + length])
-        start += 12 + length
-        if data[start - 8 - length : start - 4 - length] == b"IEND":
-            break
-    return b"".join(bodies)
-
-
 def decode_png(path: Path) -> NDArray[Any]:
     """Pixels of a PNG file, (H, W) or (C, H, W) with channels RGB or RGBA."""
     data = path.read_bytes()
     chunks = _chunks(data, path, b"IEND")
     _info(chunks, len(data), path)
     try:
-        pixels = cv2.imdecode(np.frombuffer(_needed_for_pixels(data, chunks), np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(f"{path}: the PNG file cannot be decoded ({error.err})") from error
     if pixels is None:

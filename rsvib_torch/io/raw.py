@@ -1,19 +1,20 @@
 """Stacks of raw frames, described by a JSON file with ``.json`` appended to the name (the sidecar)."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import info_from_attributes
-from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter
+from rsvib_torch.io.contiguous import ContiguousReader
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["create_raw", "open_raw"]
+__all__ = ["open_raw", "write_raw"]
 
 
 class _Sidecar(Section):
@@ -52,24 +53,23 @@ def open_raw(path: Path) -> ContiguousReader:
         return ContiguousReader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
 
 
-def create_raw(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
-    """Create a file of full size with its sidecar, or open one to continue it."""
-    if fresh:
-        content = {
-            "format": "rsvib raw",
-            "version": 1,
-            "shape": info.stored_shape,
-            "axes": info.stored_axes,
-            "dtype": info.dtype,
-            "byte_order": "little",
-            "offset": 0,
-            "full_scale": info.full_scale,
-            "frame_times": info.frame_times,
-            "frame_rate": info.frame_rate,
-            "orientation": info.orientation,
-            "resolution": info.resolution,
-        }
-        _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        sync(_sidecar_path(path))
-        path.write_bytes(b"")
-    return ContiguousWriter(path, info, 0, fresh=fresh, beside=[_sidecar_path(path)])
+def write_raw(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write a file frame by frame, and its sidecar; arguments as in ``StackFormat.write``."""
+    content = {
+        "format": "rsvib raw",
+        "version": 1,
+        "shape": info.stored_shape,
+        "axes": info.stored_axes,
+        "dtype": info.dtype,
+        "byte_order": "little",
+        "offset": 0,
+        "full_scale": info.full_scale,
+        "frame_times": info.frame_times,
+        "frame_rate": info.frame_rate,
+        "orientation": info.orientation,
+        "resolution": info.resolution,
+    }
+    _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    with path.open("wb") as file:
+        for frame in frames:
+            file.write(info.to_stored(frame).data)

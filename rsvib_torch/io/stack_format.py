@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.io.stack_info import StackInfo
 
-__all__ = ["FrameReader", "FrameWriter", "StackFormat", "needed_package"]
+__all__ = ["FrameReader", "StackFormat", "needed_package"]
 
 Frame = NDArray[Any]
 
@@ -28,29 +28,8 @@ class FrameReader(Protocol):
         return
 
 
-class FrameWriter(Protocol):
-    """A stack being written; any frame may be written at any time, and again."""
-
-    def write(self, index: int, frame: Frame) -> None:
-        """Write a frame, (H, W) or (C, H, W)."""
-
-    def sync(self) -> None:
-        """Return when all written frames, and the names of their files, are on the disk (``core.atomic.sync``)."""
-        return
-
-    def stored(self, index: int | None) -> Iterator[bytes]:
-        """Bytes on the disk that hold a frame, or everything else (headers) for None; fewer if the file is damaged.
-
-        An interrupted run is resumed with the frames for which they are unchanged. Without this method it starts again.
-        """
-
-    def close(self) -> None:
-        """Finish the file, if it is open between frames."""
-        return
-
-
-# Contract of a format. All functions are called with the path of the stack; ``create`` and ``write_all`` with that of a
-# temporary file or folder, which the caller renames when it is complete (``rsvib_torch/core/atomic.py``).
+# Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
+# folder, which the caller renames when it is complete (``rsvib_torch/core/atomic.py``).
 #
 # Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
 #              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
@@ -67,9 +46,7 @@ class FrameWriter(Protocol):
 #              raises ``FrameError`` for a damaged frame (``readable_frame``); opening fails if more than half of the
 #              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
 #              ``info.decoding_bytes`` is the memory that this needs.
-# Writing:     a format defines ``create``, ``write_all``, or neither (it is then only read).
-#              After ``create(path, info, False)`` on an unfinished stack all frames that were synced are still there,
-#              also after a loss of power; it must not change the files of a damaged stack before a frame is written.
+# Writing:     ``write`` takes the frames one after another; the caller synchronises the files with the disk.
 @dataclass(frozen=True)
 class StackFormat:
     """How stacks are stored in files with certain endings.
@@ -78,11 +55,8 @@ class StackFormat:
         name: Name in messages.
         endings: File endings, lower case with the dot; ``""`` is a name without an ending.
         open: Opens a stack for reading.
-        create: ``create(path, info, fresh)`` makes a file of full size whose frames are then written in any order
-            (``fresh=True``), or opens an unfinished one to continue it (``fresh=False``); None if frames can only be
-            written one after another.
-        write_all: ``write_all(path, info, frames, compression)`` writes a stack from an iterator of its frames; None if
-            ``create`` writes every stack.
+        write: ``write(path, info, frames, compression)`` writes a stack from an iterator of its frames; None for
+            formats that are only read.
         dtypes: NumPy names of the data types that can be written.
         check: Raises an error if a stack cannot be written to a path.
         kind: ``"file"``; ``"folder"``, which may contain other files; or ``"tree"``, a folder that is replaced as one.
@@ -96,8 +70,7 @@ class StackFormat:
     name: str
     endings: tuple[str, ...]
     open: Callable[[Path], FrameReader]
-    create: Callable[[Path, StackInfo, bool], FrameWriter] | None = None
-    write_all: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
+    write: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
     dtypes: tuple[str, ...] = (
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
@@ -107,11 +80,6 @@ class StackFormat:
     companions: tuple[str, ...] = ()
     compressions: tuple[str, ...] = ()
     keeps: tuple[str, ...] = ()
-
-    @property
-    def writable(self) -> bool:
-        """Whether stacks of this format can be written."""
-        return self.create is not None or self.write_all is not None
 
 
 def needed_package(name: str, purpose: str, extra: str) -> Any:

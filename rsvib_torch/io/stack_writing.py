@@ -66,7 +66,7 @@ def check_info_target(
     check_name(path)
     check_not_special(path)
     form = target_format(path)
-    if not form.writable:
+    if form.write is None:
         raise ValueError(
             f"{path}: {form.name} files can only be read; write .tif, .png, .npy, .mkv or a folder of PNG files"
         )
@@ -169,27 +169,22 @@ def metadata_not_kept(
 def write_frames(
     form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
 ) -> None:
-    """Write a complete stack, which is on the disk when the function returns.
+    """Write a stack; it gets its name when it is complete and on the disk.
 
     Args:
         form: Its format.
-        path: Temporary name of the file or folder.
+        path: The file or folder.
         info: Its content.
         frames: Pixels as stored, one frame at a time.
         compression: As in ``write_stack``.
     """
-    if form.write_all is not None and (compression is not None or form.create is None):
-        form.write_all(path, info, frames, compression)
-        sync_tree(path)
-        return
-    assert form.create is not None
-    writer = form.create(path, info, True)
-    try:
-        for index, frame in enumerate(frames):
-            writer.write(index, frame)
-        writer.sync()
-    finally:
-        writer.close()
+    assert form.write is not None
+    with temporary_folder(path) as folder:
+        part = folder / path.name
+        form.write(part, info, frames, compression)
+        sync_tree(folder)
+        make_folder(path.parent)
+        move_into_place(part, path, form.kind, form.companions)
 
 
 def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
@@ -265,9 +260,4 @@ def write_stack(
     pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale, nodata)
     info = _info_to_write(StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale), like)
     form = check_info_target(path, info, compression)
-    with temporary_folder(path) as folder:
-        part = folder / path.name
-        write_frames(form, part, info, _counted(pixels), compression)
-        if form.kind == "folder":
-            make_folder(path.parent)
-        move_into_place(part, path, form.kind, form.companions)
+    write_frames(form, path, info, _counted(pixels), compression)

@@ -12,14 +12,14 @@ import tifffile
 from numpy.typing import NDArray
 
 from rsvib_torch.io.blocks import BlockReader
-from rsvib_torch.io.contiguous import ContiguousReader, ContiguousWriter, InterleavedReader
+from rsvib_torch.io.contiguous import ContiguousReader, InterleavedReader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
-__all__ = ["create_tiff", "open_tiff", "write_tiff"]
+__all__ = ["open_tiff", "write_tiff"]
 
 
 # Tags on which the decoded pixels of a page depend, besides their position: subfile type, width, length, bits,
@@ -464,18 +464,8 @@ def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     return stored, {"shape": stored.stored_shape, "dtype": info.dtype, **options}
 
 
-def create_tiff(path: Path, info: StackInfo, fresh: bool) -> ContiguousWriter:
-    """Create a file of full size, or open one to continue it."""
-    stored, options = _layout(info)
-    if fresh:
-        tifffile.imwrite(path, data=None, **options)
-    with tifffile.TiffFile(path) as tif:
-        offset = int(tif.pages.first.dataoffsets[0])
-    return ContiguousWriter(path, stored, offset, fresh=fresh)
-
-
 def write_tiff(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
-    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write_all``."""
+    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``."""
     stored, options = _layout(info)
     pages = (stored.to_stored(frame) for frame in frames)
     if stored.stored_axes == "TCHW":

@@ -13,7 +13,7 @@ from functools import lru_cache
 from io import BytesIO
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,12 +69,12 @@ def _av() -> Any:
     return needed_package("av", "reading and writing video", "video")
 
 
-def open_container(path: Path) -> Any:
+def open_container(video: Path | BinaryIO) -> Any:
     """Open a video for decoding; formats that refer to other files (playlists) are refused."""
     formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
     av = _av()
     before = {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}  # later: always
-    return av.open(str(path), options={"format_whitelist": formats}, **before)
+    return av.open(str(video) if isinstance(video, Path) else video, options={"format_whitelist": formats}, **before)
 
 
 def _orientation(frame: Any) -> int:
@@ -422,7 +422,7 @@ def open_output(path: Path, opened: ExitStack) -> Any:
 
 
 def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
-    """Write a video frame by frame; arguments as in ``StackFormat.write_all``."""
+    """Write a video frame by frame; arguments as in ``StackFormat.write``."""
     unit, ticks, start = presentation_times(path, info)
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)

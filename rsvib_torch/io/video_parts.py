@@ -3,10 +3,10 @@
 Frames of 4:2:0 videos are neither converted to RGB nor back: colours keep their counts, and chroma its resolution.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,19 +82,20 @@ class PartWriter:
     """A file with consecutive frames of a video; only ``join_parts`` gives them their times.
 
     Args:
-        path: The file.
+        file: The new file.
         video: Name of the video, whose ending selects container and codec.
         info: Content of the video.
         planes: The source, if frames are its planes; None for pixels (H, W) or (C, H, W).
     """
 
-    def __init__(self, path: Path, video: Path, info: StackInfo, planes: PlaneReader | None) -> None:
+    def __init__(self, file: BinaryIO, video: Path, info: StackInfo, planes: PlaneReader | None) -> None:
         av, ending = needed_package("av", "writing video", "video"), video.suffix.lower()
         self._video, self._info, self._planes = video, info, planes is not None
         self._from_planes = av.VideoFrame.from_ndarray
         self._opened = ExitStack()
+        self._opened.enter_context(file)
         source = open_source(info, self._opened)
-        self._output = self._opened.enter_context(av.open(str(path), "w", format=CONTAINERS[ending]))
+        self._output = self._opened.enter_context(av.open(file, "w", format=CONTAINERS[ending]))
         self._stream = add_video(self._output, video, info, source, **(_PART_OPTIONS if ending in H264 else {}))
         if planes is not None:
             planes.prepare_encoder(self._stream)
@@ -123,19 +124,21 @@ class PartWriter:
         self._opened.close()
 
 
-def join_parts(path: Path, info: StackInfo, parts: Sequence[Path]) -> None:
+def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
     """Write the video whose frames are in ``parts``, with the times, the metadata and the sound of its source."""
     unit, ticks, start = presentation_times(path, info)
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)
-        with open_container(parts[0]) as first:
-            video = output.add_stream_from_template(first.streams.video[0])
-        video.time_base = unit
         if source is not None:
             output.metadata.update(source.metadata)
-        sound, index = Sound(output, source, start), 0
+        video: Any = None
+        index = 0
         for part in parts:
-            with open_container(part) as container:
+            with part, open_container(part) as container:
+                if video is None:  # of the first part; streams of sound follow that of the frames
+                    video = output.add_stream_from_template(container.streams.video[0])
+                    video.time_base = unit
+                    sound = Sound(output, source, start)
                 for packet in container.demux(container.streams.video[0]):
                     if packet.size == 0:  # the last packet of a stream
                         continue

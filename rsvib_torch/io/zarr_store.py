@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_format import FrameWriter, needed_package
+from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["create_zarr", "open_zarr"]
+__all__ = ["open_zarr", "write_zarr"]
 
 _HEADER = "zarr.json"
 _MAX_CHUNKS = 1 << 14  # per frame; each takes about 0.3 ms
@@ -97,46 +96,9 @@ def open_zarr(path: Path) -> ArrayReader:
         return ArrayReader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
 
 
-class _ZarrWriter(FrameWriter):
-    """Frames of a Zarr array, one chunk each."""
-
-    def __init__(self, path: Path, array: Any, info: StackInfo) -> None:
-        self._path, self._array, self._info = path, array, info
-        self._written = [path / _HEADER]
-
-    def _chunk(self, index: int) -> Path:
-        """The file of a frame."""
-        position = (index, *(0 for _ in self._info.stored_shape[1:]))
-        return self._path / str(self._array.metadata.encode_chunk_key(position))
-
-    def write(self, index: int, frame: NDArray[Any]) -> None:
-        """Write the chunk of a frame."""
-        self._array[index] = self._info.to_stored(frame)
-        self._written.append(self._chunk(index))
-
-    def sync(self) -> None:
-        """Return when all chunks, and the names of their files and folders, are on the disk."""
-        folders: dict[Path, None] = {}
-        for file in self._written:
-            sync(file)
-            folders |= dict.fromkeys(folder for folder in file.parents if folder.is_relative_to(self._path))
-        for folder in sorted(folders, key=lambda folder: -len(folder.parts)):
-            sync(folder)
-        self._written.clear()
-
-    def stored(self, index: int | None) -> Iterator[bytes]:
-        """Content of the file of a frame; for None that of the header."""
-        yield (self._path / _HEADER if index is None else self._chunk(index)).read_bytes()
-
-
-def create_zarr(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
-    """Create an array with one chunk per frame, or open one to continue it."""
-    zarr = _zarr()
-    if not fresh:
-        for incomplete in path.rglob("*.partial"):  # chunks that a killed process did not complete
-            incomplete.unlink()
-        return _ZarrWriter(path, zarr.open_array(store=str(path), mode="r+", zarr_format=3), info)
-    array = zarr.create_array(
+def write_zarr(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+    """Write an array with one chunk per frame; arguments as in ``StackFormat.write``."""
+    array = _zarr().create_array(
         store=str(path),
         shape=info.stored_shape,
         chunks=(1, *info.stored_shape[1:]),
@@ -147,4 +109,5 @@ def create_zarr(path: Path, info: StackInfo, fresh: bool) -> _ZarrWriter:
         attributes=attributes_of(info),
         dimension_names=list(info.stored_axes),
     )
-    return _ZarrWriter(path, array, info)
+    for index, frame in enumerate(frames):
+        array[index] = info.to_stored(frame)

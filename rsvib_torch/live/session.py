@@ -17,7 +17,6 @@ from rsvib_torch.live.frame_outputs import FrameOutput
 from rsvib_torch.live.sources import FrameReader, FrameSource
 from rsvib_torch.live.spectrogram import Spectrogram
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker, VideoBorder
-from rsvib_torch.tracking.steadying import steadied
 
 __all__ = ["LiveReport", "run_live", "to_counts"]
 
@@ -67,7 +66,6 @@ def run_live(
     outputs: Sequence[FrameOutput],
     *,
     border: VideoBorder | None = None,
-    steady: float = 0.0,
     drops: bool = True,
     waiting: int = 64,
     max_frames: int | None = None,
@@ -81,8 +79,6 @@ def run_live(
         tracker: The tracker.
         outputs: They get frames of 8 bits, (H, W) or (H, W, 3), and are closed at the end.
         border: Treatment of pixels that the sensor did not record.
-        steady: s; frames are moved to the mean of the path in the interval of this length around them, and written half
-            as much later. For files; a tracker with ``steady`` does not look ahead.
         drops: Whether the source must not wait. If processing is too slow, the motion of late frames is then predicted
             instead of measured, and beyond ``waiting`` frames the oldest are dropped.
         waiting: Largest number of frames that wait.
@@ -103,7 +99,7 @@ def run_live(
     writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
     try:
         try:
-            for tracked, arrived in steadied(_tracked(reader, tracker, report, drops, max_frames), steady):
+            for tracked, arrived in _tracked(reader, tracker, report, drops, max_frames):
                 if spectrogram is not None:
                     spectrogram.add(tracked)
                 if progress is not None:

@@ -1,6 +1,6 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 from torch import Tensor
@@ -43,6 +43,11 @@ class DetectedVibration(
     reliable: Tensor
     findings: tuple[Any, ...]
     assumptions: tuple[Any, ...]
+
+    @classmethod
+    def of(cls, detection: "DetectedVibration") -> "DetectedVibration":
+        """A detection without what derived classes add to it."""
+        return DetectedVibration(*(getattr(detection, field.name) for field in fields(DetectedVibration)))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,7 +21,8 @@ from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES, Result
+from rsvib_torch.core.figures import FIGURES
+from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, Result
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import (
     ClockAlignment,

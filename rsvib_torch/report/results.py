@@ -1,38 +1,32 @@
 """Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and ``windows.csv``."""
 
 import csv
+import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
-from rsvib_torch.core.validation import read_json, validate
+from rsvib_torch.core.validation import read_json
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.io.schema import DetectionRecord, TimingRecord, check_same_timing
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks import RestoredFrames, StackManifest
 
-__all__ = ["VibrationFile", "read_vibration", "write_offsets", "write_restoration", "write_vibration", "write_windows"]
-
-
-class VibrationFile(DetectionRecord):
-    """Content of ``vibration.json``."""
-
-    format: Literal["rsvib vibration"]
-    version: Literal[1]
-    timing: TimingRecord
-    period: list[list[float | None]]
-    units: dict[str, str]
-    offsets: Any = None  # the offset curve and its fit, which restoration does not need
-    fitted: Any = None
-    sensitivity: Any = None
+__all__ = [
+    "check_same_timing",
+    "read_vibration",
+    "write_offsets",
+    "write_restoration",
+    "write_vibration",
+    "write_windows",
+]
 
 
 @checks_arguments
@@ -99,20 +93,46 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
     """
     path = Path(path)
     data = read_json(path, "vibration.json")
-    if data.get("format") not in (None, DetectionResult.file_format):
+    if data.get("format") != DetectionResult.file_format:
         raise ValueError(
-            f"{path}: not a vibration.json, but a file of the format {data['format']!r}; give the vibration.json, or "
-            "the manifest.json of windows, that rsvib detect or run wrote"
+            f"{path}: not a vibration.json, but a file of the format {data.get('format')!r}; give the vibration.json, "
+            "or the manifest.json of windows, that rsvib detect or run wrote"
         )
-    if isinstance(data.get("reliable"), list) and any(isinstance(entry, list) for entry in data["reliable"]):
+    result = DetectionResult.load(path)
+    if result.batch_shape:
         raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
-    record = validate(VibrationFile, data, str(path))
-    if timing is not None:
-        check_same_timing(str(path), record.timing, timing)
-    try:
-        return record.to_detection()
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    if timing is not None and result.timing is not None:
+        check_same_timing(str(path), result.timing, timing)
+    return DetectedVibration.of(result)
+
+
+def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -> None:
+    """Check that a stored detection was made with the timing of the frames that are to be restored.
+
+    Args:
+        source: File of the detection, for the message.
+        stored: Timing in that file.
+        timing: Timing of the frames.
+
+    Raises:
+        ValueError: If they differ by more than rounding.
+    """
+    theirs, ours = stored.to_dict(), timing.to_dict()
+    different = [name for name in ours if not _equal(theirs[name], ours[name])]
+    if different:
+        values = ", ".join(f"{name}={theirs[name]!r} (here {ours[name]!r})" for name in different)
+        raise ValueError(
+            f"{source}: the vibration was detected with another timing: {values}; detect it again, or correct [sensor]"
+        )
+
+
+def _equal(first: Any, second: Any) -> bool:
+    """Whether two values of a timing are equal up to rounding."""
+    if isinstance(first, list) and isinstance(second, list):
+        return len(first) == len(second) and all(map(_equal, first, second))
+    if isinstance(first, float) and isinstance(second, float):
+        return math.isclose(first, second, rel_tol=1e-9)
+    return bool(first == second)
 
 
 @checks_arguments
@@ -230,8 +250,8 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
                 continue
             vibration, std = detection.vibration, detection.std
             for name in quantities:
-                line += [getattr(vibration, name)[number][0], getattr(std, name)[number][0]]
-            line += [vibration.image_motion[number], detection.reliable[number]]
+                line += plain_values([getattr(vibration, name)[number, 0], getattr(std, name)[number, 0]])
+            line += [float(vibration.image_motion[number]), bool(detection.reliable[number])]
         note = record.error or "; ".join(map(str, record.left_alone))
         lines.append([*line, record.frames, record.outcome, len(record.bad_frames), note])
     _write_csv(path, [*head, "frames", "outcome", "bad_frames", "note"], lines)

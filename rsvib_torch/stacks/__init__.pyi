@@ -1,7 +1,8 @@
 from .job import WindowResult
 from .manifest import StackManifest, read_manifest
-from .process import StackReport, detect_stack, iterate_stack, process_stack
+from .process import detect_stack, iterate_stack, process_stack
 from .process_video import process_video
+from .resumable_run import StackReport
 from .window_restoration import RestoredFrames, restore_block, restore_trusted, without_data
 from .windows import Window, cut_windows
 

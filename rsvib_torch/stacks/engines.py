@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -17,8 +17,9 @@ from rsvib_torch.stacks.heap import keep_freed_memory, share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
 from rsvib_torch.stacks.windows import Window
 
-__all__ = ["compute_here", "compute_with_dask"]
+__all__ = ["compute_here", "compute_with_dask", "results_in_order"]
 
+_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
 
@@ -31,14 +32,21 @@ def _one_thread_each(windows: Sequence[Window]) -> bool:
     return not all(window.alone for window in windows)
 
 
-def _results_in_order(
-    windows: Sequence[Window], submit: Callable[[Window], Any], capacity: Callable[[], int], waiting: deque[Any]
+def results_in_order(
+    items: Iterable[_Item], submit: Callable[[_Item], Any], capacity: Callable[[], int], waiting: deque[Any]
 ) -> Generator[Any, None, None]:
-    """Results in the order of the windows; up to ``capacity()`` windows are submitted ahead, into ``waiting``."""
-    remaining = iter(windows)
+    """Results of items in their order.
+
+    Args:
+        items: Windows or frames.
+        submit: Starts the computation of one; returns an object with ``result()``.
+        capacity: Number of items that are computed or wait at the same time.
+        waiting: They are put there.
+    """
+    remaining = iter(items)
     while True:
-        while len(waiting) < capacity() and (window := next(remaining, None)) is not None:
-            waiting.append(submit(window))
+        while len(waiting) < capacity() and (item := next(remaining, None)) is not None:
+            waiting.append(submit(item))
         if not waiting:
             return
         yield waiting.popleft().result()
@@ -80,7 +88,7 @@ def compute_here(
         return computing.submit(compute, window, reading.submit(reader.read, window))
 
     try:
-        yield from _results_in_order(windows, submit, lambda: at_once + 1, deque())
+        yield from results_in_order(windows, submit, lambda: at_once + 1, deque())
     finally:
         stopped.set()
         reading.shutdown(wait=True, cancel_futures=True)
@@ -208,7 +216,7 @@ def compute_with_dask(
 
         waiting: deque[Any] = deque()
         try:
-            yield from _results_in_order(windows, submit, two_per_worker, waiting)
+            yield from results_in_order(windows, submit, two_per_worker, waiting)
         finally:
             with suppress(Exception):
                 client.cancel([result.future for result in waiting])

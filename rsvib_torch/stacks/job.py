@@ -19,7 +19,6 @@ from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.io.frame_times import timing_of_stack
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, required_full_scale
-from rsvib_torch.io.schema import detection_to_json
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
@@ -251,7 +250,7 @@ class StackJob:
             "start_time": float(self.timing.frame_starts(window.first + 1)[-1]),
             "written": written,
             "frames": "restored" if result.restored else "as taken",
-            "detection": detection_to_json(result.detection),
+            "detection": plain_values(result.detection and DetectedVibration.of(result.detection)),
             "left_alone": [] if restoration is None else plain_values(restoration.left_alone),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,

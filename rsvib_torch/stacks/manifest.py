@@ -5,25 +5,25 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import Field
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.presentation import AXIS_NAMES, Summarised
+from rsvib_torch.core.presentation import AXIS_NAMES, Result, plain_values
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
-from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.io.schema import DetectionRecord, ReasonRecord, TimingRecord, detection_to_json
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.stacks.job import StackJob
 
 __all__ = ["StackManifest", "WindowRecord", "fingerprint", "manifest_header", "read_manifest", "write_manifest"]
 
 
-class WindowRecord(Section):
+@dataclass(frozen=True, eq=False)
+class WindowRecord:
     """Result of one window.
 
     Attributes:
@@ -46,47 +46,50 @@ class WindowRecord(Section):
     first: int
     last: int
     start_time: float
-    written: int = Field(ge=0)
+    written: int
     frames: Literal["restored", "as taken"]
-    detection: DetectionRecord | None
-    left_alone: list[ReasonRecord]
+    detection: DetectedVibration | None
+    left_alone: tuple[Reason, ...]
     outcome: str | None
     summary: str | None
-    predicted_gain: float | None = None
+    predicted_gain: float | None
     error: str | None
     bad_frames: dict[str, str]
 
 
-class StackManifest(Summarised, Section):
+@dataclass(frozen=True, eq=False, repr=False)
+class StackManifest(Result, file_format="rsvib stack"):
     """Content of ``manifest.json``.
 
     Attributes:
-        format: ``"rsvib stack"``.
-        version: Version of the format.
         input: Name, size and hash of the stack.
         settings: Sensor and options.
         versions: Versions of the packages that computed it.
         output: Name of the output; None for detection only.
-        units: Units of the numbers.
         bad_frames: Index of each frame that could not be used, with the reason.
         not_kept: Metadata of the input that the output does not contain.
+        margins: px that were cut off the sides of the frames of a video.
         windows: Result of every window.
     """
 
-    format: Literal["rsvib stack"]
-    version: Literal[1]
     input: dict[str, Any]
     settings: dict[str, Any]
     versions: dict[str, Any]
     output: dict[str, Any] | None
-    units: dict[str, str]
     bad_frames: dict[str, str]
-    not_kept: list[str] = Field(default_factory=list)
-    windows: list[WindowRecord]
+    windows: tuple[WindowRecord, ...]
+    not_kept: tuple[str, ...] = ()
+    margins: dict[str, int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for number, record in enumerate(self.windows):
+            if record.window != number:
+                raise ValueError(f"windows[{number}].window: expected {number}, got {record.window}")
 
     def header(self) -> dict[str, Any]:
         """Everything that was determined before the first window, as made by ``manifest_header``."""
-        return self.model_dump(include={"input", "settings", "versions", "output"})
+        return {name: getattr(self, name) for name in ("input", "settings", "versions", "output")}
 
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
@@ -155,7 +158,7 @@ class StackManifest(Summarised, Section):
 
     def detections(self) -> list[DetectedVibration | None]:
         """The detection of every window; None where it failed."""
-        return [None if record.detection is None else record.detection.to_detection() for record in self.windows]
+        return [record.detection for record in self.windows]
 
 
 def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
@@ -214,12 +217,12 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
     given = None
     if job.given is not None:
-        records = [detection_to_json(detected) for detected in job.given.values()]
+        records = plain_values([detected and DetectedVibration.of(detected) for detected in job.given.values()])
         given = hashlib.sha256(json.dumps(records).encode()).hexdigest()
     header = {
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
         "settings": {
-            "sensor": TimingRecord.from_timing(job.timing).model_dump(),
+            "sensor": job.timing.to_dict(),
             "full_scale": job.full_scale,
             "window": job.window,
             "detection": dict(job.detection),
@@ -237,7 +240,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
 
 
 def write_manifest(
-    path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = ()
+    path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
 ) -> None:
     """Write a manifest with one line per key and window; records are not kept in memory.
 
@@ -246,6 +249,7 @@ def write_manifest(
         header: As made by ``manifest_header``.
         records: Contents of ``WindowRecord``.
         not_kept: Metadata of the input that the output does not contain.
+        **results: Further keys of ``StackManifest``.
     """
     units = {
         "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
@@ -267,7 +271,10 @@ def write_manifest(
             bad.update(record["bad_frames"])
             file.write(",\n    " if number else "\n    ")
             file.write(json.dumps(record, allow_nan=False))
-        file.write(f'\n  ],\n  "bad_frames": {json.dumps(bad)},\n  "not_kept": {json.dumps(list(not_kept))}\n}}\n')
+        file.write("\n  ]")
+        for key, value in {"bad_frames": bad, "not_kept": list(not_kept), **results}.items():
+            file.write(f",\n  {json.dumps(key)}: {json.dumps(value)}")
+        file.write("\n}\n")
 
 
 @checks_arguments
@@ -302,9 +309,4 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
         >>> manifest.detections()[0].vibration.frequency[:, 0].round().tolist()  # Hz, first window
         [155.0, 145.0]
     """
-    path = Path(path)
-    manifest = validate(StackManifest, read_json(path, "manifest.json"), str(path))
-    for number, record in enumerate(manifest.windows):
-        if record.window != number:
-            raise ValueError(f"{path}: windows[{number}].window: expected {number}, got {record.window}")
-    return manifest
+    return StackManifest.load(path)

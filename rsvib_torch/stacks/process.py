@@ -1,109 +1,43 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
-from rsvib_torch.core.arguments import check_fields, checks_arguments
-from rsvib_torch.core.atomic import make_folder, sync, whole_file
+import numpy as np
+from numpy.typing import NDArray
+
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.presentation import Summarised
-from rsvib_torch.core.text import number_of
-from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_reading import PathLike
-from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
+from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
     DetectOptions,
     RestoreOptions,
-    StackJob,
     StoredWindow,
     WindowFrames,
     WindowResult,
     plan_job,
 )
-from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
-from rsvib_torch.stacks.output import Journal, Sink, describe_difference, disk_errors_named, work_folder
+from rsvib_torch.stacks.manifest import manifest_header, write_manifest
+from rsvib_torch.stacks.resumable_run import StackReport, run_to_file
+from rsvib_torch.stacks.run_folder import RunFolder, check_space, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
 
-__all__ = ["StackReport", "detect_stack", "iterate_stack", "process_stack", "totals"]
+__all__ = ["detect_stack", "iterate_stack", "process_stack"]
 
+_UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class StackReport(Summarised):
-    """Summary of a run.
-
-    Attributes:
-        frames: Number of frames written, including those of an interrupted run that was resumed.
-        windows: Number of windows of the stack.
-        restored: Number of windows whose frames were restored.
-        failed: Number of windows in which detection or restoration failed.
-        bad_frames: Number of frames that could not be used.
-        resumed: Number of windows that were complete before.
-        seconds: Duration of the run.
-        first: Result of the first window, if it was computed in this process.
-        manifest: Path of the manifest.
-        not_kept: Metadata of the input that the output does not contain.
-
-    Example:
-        >>> import tempfile
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
-        >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
-        >>> report.frames, report.windows, report.restored, report.failed
-        (4, 2, 2, 0)
-    """
-
-    frames: int
-    windows: int
-    restored: int
-    failed: int
-    bad_frames: int
-    resumed: int
-    seconds: float
-    first: WindowResult | None
-    manifest: Path
-    not_kept: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-    def summary(self) -> str:
-        """Numbers of frames and windows, and the time."""
-        lines = [f"{number_of(self.frames, 'frame')} in {number_of(self.windows, 'window')}, {self.restored} restored"]
-        if self.frames and not self.resumed:
-            lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
-        if self.resumed:
-            lines.append(f"windows complete before this run: {self.resumed}")
-        if self.failed:
-            lines.append(
-                f"detection or restoration failed in {number_of(self.failed, 'window')}: see {self.manifest.name}"
-            )
-        if self.bad_frames:
-            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
-        return "\n".join(lines)
 
 
 @checks_arguments
@@ -198,7 +132,6 @@ def detect_stack(
         write_manifest(part, manifest_header(job, None, None), records())
 
 
-@unexpected_errors_in_one_line()
 @checks_arguments
 def process_stack(
     source: PathLike,
@@ -294,7 +227,6 @@ def process_stack(
     form = check_info_target(sink, out, compression, check_folder=False)
     target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
     check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))
-    header = manifest_header(job, sink.name, compression)
     first: WindowResult | None = None
 
     def finish(result: WindowResult, pixels: WindowFrames) -> StoredWindow:
@@ -303,59 +235,33 @@ def process_stack(
             first = result
         return job.stored(result, pixels)
 
-    def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Sequence[str]) -> StackReport:
-        return StackReport(
-            **totals(records),
-            windows=len(windows),
-            resumed=resumed,
-            seconds=time.perf_counter() - start,
-            first=first,
-            manifest=target,
-            not_kept=tuple(not_kept),
-        )
+    def compute(folder: RunFolder) -> dict[str, Any]:
+        remaining = [window for window in windows if window.index not in folder]
+        frames = len(remaining) if job.joined else sum(window.kept for window in remaining)
+        # the finished windows and the output are on the disk together, until the output is complete
+        frames += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
+        check_space(sink, frames * out.frame_bytes)
+        if scheduler is None:
+            results = compute_here(job, remaining, finish, at_once=at_once)
+        else:
+            results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
+        _store_windows(windows, results, folder, progress)
+        return {}
 
-    journal = Journal(sink, form.companions)
-    try:
-        if resume and not journal.has_lines and sink.exists() and target.exists():
-            complete = read_manifest(target)
-            difference = describe_difference(complete.header(), header)
-            if difference:
-                raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
-            return report((record.model_dump() for record in complete.windows), len(windows), complete.not_kept)
-        writer = Sink(sink, journal.folder, form, out, staged=bad_frames == "skip", compression=compression)
-        try:
-            remaining = _begin_or_resume(windows, writer, journal, header, resume)
-            resumed = journal.count
-            if scheduler is None:
-                results = compute_here(job, remaining, finish, at_once=at_once)
-            else:
-                results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
-            _store_windows(job, windows, remaining, results, writer, journal, progress)
-            not_kept = metadata_not_kept(job.info, sink, (journal.written, *out.shape[1:]))
-            with disk_errors_named(journal):
-                make_folder(target.parent)
-                with whole_file(target) as part:
-                    write_manifest(part, header, journal.records(), not_kept)
-                    writer.finish(journal.written)
-                sync(target.absolute().parent)  # the temporary folder is gone as well
-        finally:
-            writer.close()
-        summary = report(journal.records(), resumed, not_kept)
-        journal.remove()
-        return summary
-    finally:
-        journal.close()
+    def write(folder: RunFolder) -> None:
+        write_frames(form, sink, out.with_frames(folder.written), _stored_frames(folder), compression)
 
-
-def totals(records: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Numbers of frames and windows of a run, from the records of its windows."""
-    counts = dict.fromkeys(("frames", "restored", "failed", "bad_frames"), 0)
-    for record in records:
-        counts["frames"] += record["written"]
-        counts["restored"] += record["frames"] == "restored"
-        counts["failed"] += record["error"] is not None
-        counts["bad_frames"] += len(record["bad_frames"])
-    return counts
+    report = run_to_file(
+        sink,
+        target,
+        manifest_header(job, sink.name, compression),
+        windows=len(windows),
+        resume=resume,
+        compute=compute,
+        write=write,
+        not_kept=lambda count: metadata_not_kept(job.info, sink, (count, *out.shape[1:])),
+    )
+    return replace(report, first=first, seconds=time.perf_counter() - start)
 
 
 def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window]) -> None:
@@ -364,37 +270,26 @@ def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window
         raise ValueError(errors[0])
 
 
-def _begin_or_resume(
-    windows: Sequence[Window], sink: Sink, journal: Journal, header: dict[str, Any], resume: bool
-) -> list[Window]:
-    """Begin a run, or continue an interrupted one; returns the windows that are not on the disk."""
-    resumes = journal.open(header, resume=resume)
-    with disk_errors_named(journal):
-        if resumes:
-            journal.drop(sink.resume(journal.entries(), complete=journal.count == len(windows)))
-        else:
-            sink.begin()
-    return [window for window in windows if window.index not in journal]
-
-
 def _store_windows(
-    job: StackJob,
     windows: Sequence[Window],
-    remaining: Sequence[Window],
     results: Generator[StoredWindow, None, None],
-    sink: Sink,
-    journal: Journal,
+    folder: RunFolder,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Store the results of the remaining windows, while later ones are computed."""
-    errors = [record["error"] for record in journal.records()]
+    """Store the results of the windows that are not in the folder, while later ones are computed."""
+    errors = [record["error"] for record in folder.records()]
+    remaining = [window for window in windows if window.index not in folder]
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
 
-    def store(window: Window, stored: StoredWindow) -> None:
-        with disk_errors_named(journal):
-            where = sink.put(window.index, window.index if job.joined else window.first, stored.frames)
-            journal.add(stored.record, where)
+    def store(stored: StoredWindow) -> None:
+        names = [f"{stored.record['window']:06d}.npy"] if stored.frames else []
+        for name in names:
+            stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
+            with folder.create(name) as file:
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
+                file.write(stack.data)  # errors of np.save do not contain the reason
+        folder.add(stored.record, names)
 
     if progress is not None:
         progress(done, total)
@@ -403,15 +298,24 @@ def _store_windows(
         for window, stored in zip(remaining, results, strict=True):
             errors.append(stored.record["error"])
             if previous is not None:
-                previous.result()
+                with disk_errors_named(folder):
+                    previous.result()
             try:
                 _check_not_all_failed(errors, windows)
             except ValueError:
-                journal.clear()
+                folder.remove()
                 raise
-            previous = writing.submit(store, window, stored)
+            previous = writing.submit(store, stored)
             if progress is not None:
                 done += window.kept
                 progress(done, total)
         if previous is not None:
-            previous.result()
+            with disk_errors_named(folder):
+                previous.result()
+
+
+def _stored_frames(folder: RunFolder) -> Iterator[NDArray[Any]]:
+    """The frames of all windows in order."""
+    for name in folder.files():
+        with folder.open(name) as file:
+            yield from np.load(file, allow_pickle=False)

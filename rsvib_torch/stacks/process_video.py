@@ -4,8 +4,8 @@ import math
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,27 +16,26 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.atomic import make_folder, sync, whole_file
+from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.unexpected import unexpected_errors_in_one_line
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS
-from rsvib_torch.io.video_parts import planes_of
+from rsvib_torch.io.video_parts import PartWriter, PlaneReader, join_parts, planes_of
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration.restore import check_method_options
+from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, plan_job
-from rsvib_torch.stacks.manifest import manifest_header, read_manifest, write_manifest
-from rsvib_torch.stacks.output import Journal, describe_difference, disk_errors_named, work_folder
-from rsvib_torch.stacks.process import StackReport, totals
+from rsvib_torch.stacks.manifest import manifest_header
+from rsvib_torch.stacks.resumable_run import StackReport, run_to_file
+from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
 from rsvib_torch.stacks.video_frames import FrameLayout, RestoredFrame, VideoRestorer
-from rsvib_torch.stacks.video_output import PartSink
 from rsvib_torch.stacks.video_passes import PART_FRAMES, VideoPasses
 from rsvib_torch.stacks.video_tracks import FrameTrack
 from rsvib_torch.tracking import Margins
@@ -49,7 +48,6 @@ Frame = NDArray[Any]
 Planes = list[Frame]
 
 
-@unexpected_errors_in_one_line()
 @checks_arguments
 def process_video(
     source: PathLike,
@@ -140,64 +138,74 @@ def process_video(
     waiting = math.ceil(0.5 * steady / timing.frame_period) * 2 * content.frame_bytes
     check_fits(f"{source}: the frames of half of steady={steady:g} s", waiting, "choose a shorter time")
 
-    def report(records: Iterable[Mapping[str, Any]], resumed: int, not_kept: Iterable[str]) -> StackReport:
-        return StackReport(
-            **totals(records),
-            windows=video.parts,
-            resumed=resumed,
-            seconds=time.perf_counter() - begin,
-            first=None,
-            manifest=target,
-            not_kept=tuple(not_kept),
-        )
-
-    with closing(Journal(sink)) as journal, tempfile.TemporaryFile() as tracks:
-        if resume and not journal.has_lines and sink.exists() and target.exists():
-            complete = read_manifest(target)
-            _check_complete(sink, complete.header(), header)
-            return report((one.model_dump() for one in complete.windows), video.parts, complete.not_kept)
-        resumes = journal.open(header, resume=resume)
+    def compute(folder: RunFolder) -> dict[str, Any]:
+        nonlocal content
         shown = _Progress(progress, len(video.starts), 2 if border == "crop" else 1)
-        margins = video.margins(tracks, shown) if border == "crop" else None
-        content = _cut_content(content, margins)
-        check_info_target(sink, content, check_folder=False)
-        reader = open_stack(source)
-        parts = PartSink(sink, journal.folder, content, planes_of(reader) if video.layout.planar else None)
-        try:
-            with disk_errors_named(journal):
-                journal.drop(parts.resume(journal.entries() if resumes else ()))
-            resumed = journal.count
-            followed_frames = video.tracked(None if margins is None else tracks)
-            _restore_parts(video, followed_frames, parts, journal, border, margins, at_once, shown)
-            not_kept = metadata_not_kept(job.info, sink, tuple(content.shape))
-            header["settings"]["video"]["margins"] = None if margins is None else asdict(margins)
-            _finish(parts, video.parts, journal, target, header, not_kept)
-        finally:
-            parts.close()
-            reader.close()
-        summary = report(journal.records(), resumed, not_kept)
-        journal.remove()
-        return summary
+        with tempfile.TemporaryFile() as tracks, closing(open_stack(source)) as reader:
+            margins = video.margins(tracks, shown) if border == "crop" else None
+            content = _cut_content(content, margins)
+            check_info_target(sink, content, check_folder=False)
+            planes = planes_of(reader) if video.layout.planar else None
+            with closing(_Encoder(folder, sink, content, planes)) as encoder:
+                followed_frames = video.tracked(None if margins is None else tracks)
+                _restore_parts(video, followed_frames, folder, encoder, border, margins, at_once, shown)
+        return {"margins": None if margins is None else asdict(margins)}
+
+    def write(folder: RunFolder) -> None:
+        with whole_file(sink) as part:
+            join_parts(part, content, (folder.open(name) for name in folder.files() if not name.endswith(".npy")))
+
+    report = run_to_file(
+        sink,
+        target,
+        header,
+        windows=video.parts,
+        resume=resume,
+        compute=compute,
+        write=write,
+        not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
+    )
+    return replace(report, seconds=time.perf_counter() - begin)
 
 
-def _finish(
-    sink: PartSink, parts: int, journal: Journal, manifest: Path, header: dict[str, Any], not_kept: Sequence[str]
-) -> None:
-    """Write the manifest, and join the parts to the video."""
-    with disk_errors_named(journal):
-        make_folder(manifest.parent)
-        with whole_file(manifest) as part:
-            write_manifest(part, header, journal.records(), not_kept)
-            sink.finish(range(parts))
-        sync(manifest.absolute().parent)
+class _Encoder:
+    """Encodes the parts of a video into files of a run, and keeps the last frame of each part before it is cut."""
 
+    def __init__(self, folder: RunFolder, video: Path, info: StackInfo, planes: PlaneReader | None) -> None:
+        self._folder, self._video, self._info, self._planes = folder, video, info, planes
+        self._writer: PartWriter | None = None
 
-def _check_complete(sink: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
-    """Raise a ``ValueError`` if a complete video has other settings than a run that is to be resumed."""
-    old["settings"].get("video", {}).pop("margins", None)  # a result
-    difference = describe_difference(old, new)
-    if difference:
-        raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+    def _names(self, part: int) -> tuple[str, str]:
+        return f"{part:06d}{self._video.suffix.lower()}", f"{part:06d}.npy"
+
+    def write(self, part: int, frame: Frame) -> None:
+        """Encode the next frame of a part."""
+        if self._writer is None:
+            self._writer = PartWriter(self._folder.create(self._names(part)[0]), self._video, self._info, self._planes)
+        self._writer.write(frame)
+
+    def finish_part(self, record: Mapping[str, Any], last: Frame) -> None:
+        """Finish a part with its ``WindowRecord`` and its last frame."""
+        assert self._writer is not None
+        self._writer.close()
+        self._writer = None
+        names = self._names(record["window"])
+        with self._folder.create(names[1]) as file:
+            np.save(file, last)
+        self._folder.add(record, names)
+
+    def last_frame(self, part: int) -> Frame | None:
+        """The frame that a part ends with; None for the part before the first one."""
+        if part < 0:
+            return None
+        with self._folder.open(self._names(part)[1]) as file:
+            frame: Frame = np.load(file, allow_pickle=False)
+        return frame
+
+    def close(self) -> None:
+        """Close the file of an unfinished part."""
+        if self._writer is not None:
+            self._writer.abandon()
 
 
 def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
@@ -208,10 +216,10 @@ def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
     return replace(content, shape=(*content.shape[:-2], *kept))
 
 
-def _check_known(known: list[bool], parts: int, journal: Journal) -> None:
+def _check_known(known: list[bool], parts: int, folder: RunFolder) -> None:
     """Raise a ``ValueError`` if the motion is known in none of the parts so far."""
     if len(known) >= min(_MAX_INITIAL_FAILURES, parts) and not any(known):
-        journal.clear()
+        folder.remove()
         raise ValueError(
             "no vibration was found that the rows of the frames have in common; detect it in windows, which states the "
             "reasons (process_stack; rsvib run with --output restored.mp4 instead of --video)"
@@ -280,76 +288,61 @@ def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
 def _restore_parts(
     video: VideoPasses,
     followed_frames: Generator[tuple[FrameTrack, Frame | str], None, None],
-    sink: PartSink,
-    journal: Journal,
+    folder: RunFolder,
+    encoder: _Encoder,
     border: str,
     margins: Margins | None,
     at_once: int,
     progress: Callable[[], None],
 ) -> None:
-    """Restore and encode all parts that are not in the journal."""
+    """Restore and encode all parts that are not in the folder."""
     share_one_heap()
     default_threads = torch.get_num_threads()
     threads = 1 if video.job.device == "cpu" else default_threads
     pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
     tracks: list[FrameTrack] = []  # of the part
     pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames of known motion
-    known = [record["detection"] is not None for record in journal.records()]
+    known = [record["detection"] is not None for record in folder.records()]
     before: Planes | None = None
     done = -1
+
+    def missing() -> Iterator[tuple[FrameTrack, Frame | str]]:
+        """Frames of the parts that are not in the folder."""
+        for track, frame in followed_frames:
+            if track.index // PART_FRAMES not in folder:
+                yield track, frame
+            else:
+                progress()
+
+    def restore(track: FrameTrack, frame: Frame | str) -> tuple[FrameTrack, Frame | str, RestoredFrame]:
+        return track, frame, video.restorer.restored(frame, track)
+
+    frames = results_in_order(missing(), lambda item: pool.submit(restore, *item), lambda: at_once + 2, deque())
     try:
-        with (
-            closing(followed_frames),
-            closing(_in_order(video, followed_frames, pool, at_once, journal, progress)) as frames,
-        ):
+        with closing(followed_frames), closing(frames):
             for track, frame, restored in frames:
                 part = track.index // PART_FRAMES
                 if track.index != done + 1 or before is None:
-                    ended = sink.last_frame(part - 1)
+                    ended = encoder.last_frame(part - 1)
                     before = None if ended is None else video.layout.planes(ended)
                 before, done = _without_gaps(restored, before, video.layout, border), track.index
-                sink.write(part, video.layout.frame(_cut(before, margins)))
+                with disk_errors_named(folder):
+                    encoder.write(part, video.layout.frame(_cut(before, margins)))
                 tracks.append(track)
                 if len(pair) < 2 and track.known and not isinstance(frame, str):
                     pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
                 if video.ends_part(done):
                     verdict = video.verdict(pair) if len(pair) == 2 else None
                     record = video.record(part, tracks, verdict)
-                    with disk_errors_named(journal):
-                        journal.add(record, sink.finish_part(part, video.layout.frame(before)))
                     known.append(any(track.known for track in tracks))
-                    _check_known(known, video.parts, journal)
+                    _check_known(known, video.parts, folder)
+                    with disk_errors_named(folder):
+                        encoder.finish_part(record, video.layout.frame(before))
                     tracks, pair = [], []
                 progress()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         torch.set_num_threads(default_threads)
-
-
-def _in_order(
-    video: VideoPasses,
-    tracks: Iterator[tuple[FrameTrack, Frame | str]],
-    pool: ThreadPoolExecutor,
-    at_once: int,
-    journal: Journal,
-    progress: Callable[[], None],
-) -> Generator[tuple[FrameTrack, Frame | str, RestoredFrame], None, None]:
-    """Frames of the parts that are not in the journal, in order; some more are restored ahead."""
-    waiting: deque[tuple[FrameTrack, Frame | str, Future[RestoredFrame]]] = deque()
-
-    def first() -> tuple[FrameTrack, Frame | str, RestoredFrame]:
-        track, frame, future = waiting.popleft()
-        return track, frame, future.result()
-
-    for track, frame in tracks:
-        if track.index // PART_FRAMES in journal:
-            progress()
-            continue
-        waiting.append((track, frame, pool.submit(video.restorer.restored, frame, track)))
-        if len(waiting) > at_once + 1:
-            yield first()
-    while waiting:
-        yield first()
 
 
 def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:

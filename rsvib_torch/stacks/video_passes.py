@@ -18,10 +18,10 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.schema import detection_to_json
 from rsvib_torch.io.stack_info import FrameError
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import planes_of
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.judge import judge_prepared
@@ -159,6 +159,7 @@ class VideoPasses:
     def record(self, part: int, tracks: list[FrameTrack], verdict: RestorationVerdict | None) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a part of the video."""
         reported = next((track for track in reversed(tracks) if track.detection is not None), None)
+        found = None if reported is None else reported.detection
         known = [track for track in tracks if track.known and track.fault is None]
         faults = {str(track.index): track.fault for track in tracks if track.fault is not None}
         unknown = len(tracks) - len(known) - len(faults)
@@ -169,8 +170,8 @@ class VideoPasses:
             "start_time": (reported or tracks[0]).time,
             "written": len(tracks),
             "frames": "restored" if any(track.motion.moving_axes().any() for track in known) else "as taken",
-            "detection": None if reported is None else detection_to_json(reported.detection),
-            "left_alone": plain_values(_left_alone(known, None if reported is None else reported.detection)),
+            "detection": plain_values(found and DetectedVibration.of(found)),
+            "left_alone": plain_values(_left_alone(known, found)),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,
             "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),

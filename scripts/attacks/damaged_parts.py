@@ -55,8 +55,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         files: list[Path] = []
         while not files:
             kill_run(reference, place, kind, choice, windows=2)
-            parts = [work / name, work / f"{name}.json", work / "windows"]
-            files = sorted(file for part in parts for file in [part, *part.rglob("*")] if file.is_file())
+            files = sorted(file for file in work.iterdir() if file.suffix not in (".json", ".done", ".part"))
         file = choice.choice(files)
         where = _damage(file, [other for other in files if other != file], damage, choice)
         title = f"{kind}: {file.relative_to(work)} {damage}{where}"

@@ -1,4 +1,4 @@
-"""Damaged journals and headers of interrupted runs: a one-line refusal without any change, or the right result."""
+"""Damaged markers and headers of interrupted runs: a one-line refusal without any change, or the right result."""
 
 import json
 import os
@@ -13,6 +13,7 @@ from attacks.trial import Trial
 
 __all__ = ["trials"]
 
+_MARKER = "000000.done"
 _VALUES: dict[str, str] = {
     "null": "null", "true": "true", "text": '"text"', "empty text": '""', "negative": "-1", "fraction": "0.5",
     "huge": "9" * 400, "very huge": "9" * 5000, "infinite": "1e999", "NaN": "NaN", "Infinity": "-Infinity",
@@ -28,21 +29,27 @@ def _with_value(line: bytes, key: str, text: str) -> bytes:
     return json.dumps({**table, key: mark}).replace(json.dumps(mark), text).encode() + b"\n"
 
 
-def _with_keys(line: bytes, change: Callable[[dict[str, Any]], Any]) -> bytes:
-    table = json.loads(line)
-    change(table)
-    return json.dumps(table).encode() + b"\n"
-
-
 def _of_values(work: Path, name: str, key: str, text: str) -> None:
-    lines = (work / name).read_bytes().splitlines(keepends=True)
-    lines[0] = _with_value(lines[0], key, text)
-    (work / name).write_bytes(b"".join(lines))
+    """Replace a value in the first line of a file, which is JSON."""
+    first, *rest = (work / name).read_bytes().splitlines(keepends=True)
+    (work / name).write_bytes(_with_value(first, key, text) + b"".join(rest))
 
 
-def _of_lines(work: Path, change: Callable[[list[bytes]], list[bytes]]) -> None:
-    path = work / "journal.jsonl"
-    path.write_bytes(b"".join(change(path.read_bytes().splitlines(keepends=True))))
+def _of_record(work: Path, key: str, text: str) -> None:
+    """Replace a value of the record of the first window."""
+    body, checksum = (work / _MARKER).read_bytes().splitlines()
+    entry = json.loads(body)
+    mark = "\0value\0"
+    changed = json.dumps({**entry, "record": {**entry["record"], key: mark}}).replace(json.dumps(mark), text)
+    (work / _MARKER).write_bytes(changed.encode() + b"\n" + checksum)
+
+
+def _of_marker(work: Path, change: Callable[[bytes], bytes]) -> None:
+    (work / _MARKER).write_bytes(change((work / _MARKER).read_bytes()))
+
+
+def _copied(work: Path, source: str, target: str) -> None:
+    shutil.copyfile(work / source, work / target)
 
 
 def _as(work: Path, name: str, make: Callable[[Path], Any]) -> None:
@@ -57,41 +64,31 @@ def _attacks() -> dict[str, Callable[[Path], None]]:
     def add(title: str, function: Callable[..., None], *arguments: Any) -> None:
         found[title] = lambda work: function(work, *arguments)
 
-    for key in ("window", "first", "written", "digests", "position", "detection", "bad_frames", "checksum"):
-        for value, text in _VALUES.items():
-            add(f"{key} of a line: {value}", _of_values, "journal.jsonl", key, text)
-    for key in ("settings", "input"):
-        for value, text in _VALUES.items():
+    for value, text in _VALUES.items():
+        for key in ("window", "first", "written", "detection", "bad_frames"):
+            add(f"{key} of a record: {value}", _of_record, key, text)
+        for key in ("record", "files"):
+            add(f"{key} of a marker: {value}", _of_values, _MARKER, key, text)
+        for key in ("settings", "input"):
             add(f"{key} of the header: {value}", _of_values, "run.json", key, text)
-    changes: dict[str, Callable[[list[bytes]], list[bytes]]] = {
-        "first line twice": lambda lines: [lines[0], *lines],
-        "last line twice": lambda lines: [*lines, lines[-1]],
-        "window 0 as window 1": lambda lines: [lines[0], _with_value(lines[0], "window", "1"), *lines[2:]],
-        "overlapping windows": lambda lines: [lines[0], _with_value(lines[1], "first", "1"), *lines[2:]],
-        "window without frames": lambda lines: [
-            _with_keys(lines[0], lambda table: table.update(written=0)),
-            *lines[1:],
-        ],
-        "unknown key": lambda lines: [_with_keys(lines[0], lambda table: table.update(more=1)), *lines[1:]],
-        "empty line": lambda lines: [b"\n", *lines],
-        "line of text": lambda lines: [b"window 0\n", *lines],
-        "bytes": lambda lines: [bytes(range(256)) + b"\n", *lines],
-        "zeros before": lambda lines: [bytes(4096) + b"\n", *lines],
-        "list": lambda lines: [b"[1, 2]\n", *lines],
-        "number": lambda lines: [b"1\n", *lines],
-        "without digests": lambda lines: [_with_keys(lines[0], lambda table: table.pop("digests")), *lines[1:]],
-        "without checksum": lambda lines: [_with_keys(lines[0], lambda table: table.pop("checksum")), *lines[1:]],
-        "without window": lambda lines: [_with_keys(lines[0], lambda table: table.pop("window")), *lines[1:]],
-        "nested line": lambda lines: [b"[" * 100_000 + b"\n", *lines],
-        "lines reversed": lambda lines: lines[::-1],
-        "first line missing": lambda lines: lines[1:],
-        "last line incomplete": lambda lines: [*lines[:-1], lines[-1][: len(lines[-1]) // 2]],
-        "zeros after": lambda lines: [*lines, bytes(4096)],
-        "a very long line": lambda lines: [b"9" * 20_000_000 + b"\n", *lines],
+    changes: dict[str, Callable[[bytes], bytes]] = {
+        "marker is empty": lambda data: b"",
+        "marker is incomplete": lambda data: data[: len(data) // 2],
+        "marker without checksum": lambda data: data.splitlines()[0],
+        "marker with another checksum": lambda data: data.splitlines()[0] + b"\n" + b"0" * 32,
+        "marker twice": lambda data: data + b"\n" + data,
+        "zeros after the marker": lambda data: data + bytes(4096),
+        "zeros before the marker": lambda data: bytes(4096) + data,
+        "marker is text": lambda data: b"window 0\n",
+        "marker is nested": lambda data: b"[" * 100_000 + b"\n",
+        "a very long marker": lambda data: b"9" * 20_000_000 + b"\n",
     }
     for title, change in changes.items():
-        add(title, _of_lines, change)
-    for name in ("journal.jsonl", "run.json", "lock"):
+        add(title, _of_marker, change)
+    add("window 0 as window 1", _copied, _MARKER, "000001.done")
+    add("window 0 as a window that does not exist", _copied, _MARKER, "000099.done")
+    add("a file of another name", _copied, _MARKER, "more.txt")
+    for name in (_MARKER, "run.json", "000000.npy"):
         add(f"{name} is a folder", _as, name, lambda path: path.mkdir())
         add(f"{name} is a pipe", _as, name, os.mkfifo)
         add(f"{name} is a link to a device", _as, name, lambda path: path.symlink_to("/dev/zero"))
@@ -133,7 +130,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 
 def _listing(folder: Path) -> dict[str, Any]:
     """Names, kinds and content of everything in a folder."""
-    files = {str(path.relative_to(folder)): path.lstat().st_mode for path in folder.rglob("*") if path.name != "lock"}
+    files = {str(path.relative_to(folder)): path.lstat().st_mode for path in folder.rglob("*")}
     regular = {
         name: mode for name, mode in files.items() if (folder / name).is_file() and not (folder / name).is_symlink()
     }

@@ -11,8 +11,8 @@ from attacks.small_runs import (
     calls_of,
     content,
     counted_run,
+    finished_windows,
     fork,
-    lines_of,
     resume,
 )
 from attacks.trial import Trial
@@ -48,7 +48,7 @@ def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
     name, options = FORMATS[kind]
     if kind != "PNG folder" and (place / name).exists() and content(place / name) != content(reference.whole / name):
         return Trial(title, "wrong", "an incomplete output has its name")
-    entered = lines_of(place, name)
+    entered = finished_windows(place, name)
     code, result = fork(resume, reference.source, place / name, options)
     if code is None:
         return Trial(title, "hang")

@@ -13,21 +13,16 @@ from attacks.trial import Trial
 
 __all__ = ["trials"]
 
-_TARGETS = {
-    "TIFF": ("run.json", "journal.jsonl", "lock", "out.tif"),
-    "npy, frames skipped": ("windows", "windows/000000.npy", "skipped.npy"),
-    "raw": ("out.raw", "out.raw.json"),
-    "HDF5": ("out.h5",),
-    "Zarr": ("out.zarr", "out.zarr/zarr.json", "out.zarr/c", "out.zarr/c/0", "out.zarr/c/0/0/0"),
-    "PNG folder": ("frames", "frames/frame_0000.png", "frames/.frame_0004.png.part.png"),
-    "video": ("windows", "out.mkv"),
-}
+_TARGETS = dict.fromkeys(
+    ("TIFF", "npy, frames skipped", "video"),
+    ("run.json", "000000.done", "000000.npy", "000004.npy", "000004.done.part", "out.tif"),
+)
 
 
 def _victim(folder: Path) -> Path:
     """A folder of the user, with files of the names that a run uses."""
     shutil.rmtree(folder, ignore_errors=True)
-    for name in ("precious.txt", "lock", "journal.jsonl", "run.json", "out.tif", "out/zarr.json", "windows/000000.npy"):
+    for name in ("precious.txt", "run.json", "out.tif", "out/zarr.json", "000000.npy", "000000.done"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(b"precious\n")
     return folder

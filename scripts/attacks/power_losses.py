@@ -16,7 +16,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import FORMATS, WINDOWS, Reference, calls_of, count_file_calls, fork, lines_of, process, resume
+from attacks.small_runs import (
+    FORMATS,
+    WINDOWS,
+    Reference,
+    calls_of,
+    count_file_calls,
+    finished_windows,
+    fork,
+    process,
+    resume,
+)
 from attacks.trial import Trial
 
 __all__ = ["trials"]
@@ -129,7 +139,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 
 def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
     name, options = FORMATS[kind]
-    entered = lines_of(place, name)
+    entered = finished_windows(place, name)
     code, result = fork(resume, reference.source, place / name, options)
     if code is None:
         return Trial(title, "hang")

@@ -20,7 +20,17 @@ from typing import Any
 import numpy as np
 import tifffile
 
-__all__ = ["FORMATS", "Reference", "content", "count_file_calls", "fork", "kill_run", "lines_of", "process", "server"]
+__all__ = [
+    "FORMATS",
+    "Reference",
+    "content",
+    "count_file_calls",
+    "finished_windows",
+    "fork",
+    "kill_run",
+    "process",
+    "server",
+]
 
 FRAMES, SIZE, WINDOW = 13, 64, 3
 WINDOWS = 6
@@ -231,11 +241,9 @@ def calls_of(reference: Reference, kind: str) -> int:
     return int(calls)
 
 
-def lines_of(folder: Path, name: str) -> int:
-    """Complete lines of the journal of an interrupted run."""
-    journal = folder / f".{name}.rsvib" / "journal.jsonl"
-    lines = journal.read_bytes().splitlines(keepends=True) if journal.is_file() else []
-    return sum(line.endswith(b"\n") and b"\0" not in line for line in lines)
+def finished_windows(folder: Path, name: str) -> int:
+    """Number of windows of an interrupted run that have a marker."""
+    return len(list((folder / f".{name}.rsvib").glob("*.done")))
 
 
 def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Random, *, windows: int) -> None:
@@ -246,5 +254,5 @@ def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Rando
         folder.mkdir()
         die_at = choice.randint(1, calls_of(reference, kind))
         fork(counted_run, reference.source, folder / name, options, die_at)
-        if lines_of(folder, name) >= windows:
+        if finished_windows(folder, name) >= windows:
             return

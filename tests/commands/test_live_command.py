@@ -45,16 +45,6 @@ def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
     assert "results exist already" in capsys.readouterr().err
 
 
-def test_crop_and_steady_of_a_file(clip, tmp_path, capsys):
-    assert (
-        rsvib("live", clip, *CAMERA, "--out", tmp_path / "a.mp4", "--border", "crop", "--steady", "0.2", "--quiet") == 0
-    )
-    assert capsys.readouterr().out == ""
-    height, width = read_stack(tmp_path / "a.mp4").shape[-2:]
-    assert SIZE - 14 <= height < SIZE
-    assert SIZE - 14 <= width < SIZE
-
-
 def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
     with clip.with_suffix(".raw8").open("rb") as source:
         monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=source))
@@ -80,13 +70,13 @@ def test_a_file_at_its_own_rate(clip, capsys):
         (("-", "--size", "12"), "--size must be WIDTHxHEIGHT in px such as 1024x768, got '12'"),
         (("0", "--size", "4x4"), "--size goes with frames on standard input (-), not with 0"),
         (("0", "--realtime"), "--realtime goes with a file, not with 0"),
-        (("0", "--border", "crop"), "it cannot be used with 0: use --border hold"),
-        (("CLIP", "--border", "crop", "--realtime"), "it cannot be used with --realtime: use --border hold"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),
         (("CLIP", "--preview"), "use --page 8080 and a browser"),
         (("CLIP", "--out", "CLIP", "--overwrite"), "it is the same file as the input"),
         (("CLIP", "--steady", "-1"), "steady must be at least 0, got -1"),
+        (("CLIP", "--steady", "1"), "rsvib run FRAMES OUT --video --steady 1 --border mirror"),
+        (("0", "--border", "crop"), "--border crop needs frames that come later"),
         (("CLIP", "--method", "sharpen"), "sharpen"),
     ],
 )

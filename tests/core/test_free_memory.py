@@ -35,39 +35,35 @@ def version_2(root, group, limit, used, cached=0, high="max"):
     write(root, {f"{folder}/{name}": value for name, value in values.items()})
 
 
-def mounted(root, own, mount):
-    write(root, {"proc/self/cgroup": own, "proc/self/mountinfo": mount})
-
-
-V1 = "35 31 0:32 / /sys/fs/cgroup/memory rw,relatime shared:7 - cgroup cgroup rw,memory"
-V2 = "31 23 0:28 / /sys/fs/cgroup rw,relatime - cgroup2 cgroup2 rw"
+def grouped(root, own):
+    write(root, {"proc/self/cgroup": own})
 
 
 def test_machine_without_control_groups(tmp_path):
     assert free_memory(tmp_path) == 100 * GB
-    mounted(tmp_path, "0::/", V2)
+    grouped(tmp_path, "0::/")
     assert free_memory(tmp_path) == 100 * GB
 
 
 def test_version_1_with_its_cached_files(tmp_path):
-    mounted(tmp_path, "5:cpu:/job\n4:memory:/job\n0::/", V1)
+    grouped(tmp_path, "5:cpu:/job\n4:memory:/job\n0::/")
     version_1(tmp_path, "/job", 8 * GB, 5 * GB, 1 * GB)
     assert free_memory(tmp_path) == 4 * GB
 
 
 def test_group_above_has_the_smaller_limit(tmp_path):
-    mounted(tmp_path, "4:memory:/user/job", V1)
+    grouped(tmp_path, "4:memory:/user/job")
     version_1(tmp_path, "/user/job", 8 * GB, 1 * GB)
     version_1(tmp_path, "/user", 6 * GB, 4 * GB)
     assert free_memory(tmp_path) == 2 * GB
-    mounted(tmp_path, "0::/a/b/c", V2)
+    grouped(tmp_path, "0::/a/b/c")
     version_2(tmp_path, "/a/b/c", "max", GB)
     version_2(tmp_path, "/a", 5 * GB, 2 * GB, GB)
     assert free_memory(tmp_path) == 4 * GB
 
 
 def test_version_2_throttles_before_its_limit(tmp_path):
-    mounted(tmp_path, "0::/job", V2)
+    grouped(tmp_path, "0::/job")
     version_2(tmp_path, "/job", 8 * GB, GB, high=3 * GB)
     assert free_memory(tmp_path) == 2 * GB
 
@@ -75,13 +71,13 @@ def test_version_2_throttles_before_its_limit(tmp_path):
 @pytest.mark.parametrize("own", ["0::/", "0::/../other", "0::/docker/abc", "0::/docker/abc/not-visible"])
 def test_container_shows_its_group_at_the_mount(tmp_path, own):
     """With and without a namespace of its own, /proc names the group of the host, but only its part is mounted."""
-    mounted(tmp_path, own, "31 23 0:28 /docker/abc /sys/fs/cgroup rw - cgroup2 cgroup2 rw")
+    grouped(tmp_path, own)
     version_2(tmp_path, "", 3 * GB, 2 * GB)
     assert free_memory(tmp_path) == GB
 
 
 def test_limit_that_is_already_exceeded(tmp_path):
-    mounted(tmp_path, "0::/job", V2)
+    grouped(tmp_path, "0::/job")
     version_2(tmp_path, "/job", GB, 2 * GB)
     assert free_memory(tmp_path) == 0
 

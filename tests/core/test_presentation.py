@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import cv2
 import pytest
 import torch
+from detections import findings_of
 from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.core.presentation import Result
-from rsvib_torch.core.reason import read_findings
 from rsvib_torch.core.text import measured_text, text_table
-from rsvib_torch.report.results import VibrationFile
 
 TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=300)
 MOTION = Motion((1.6, 1.1), (71.0, 113.0), (0.6, -1.2))
@@ -125,7 +124,7 @@ def test_reasons_tones_and_image_motion_are_printed(detection):
         vibration=vibration,
         std=replace(std, image_motion=torch.tensor([0.1, 0.1])),
         reliable=torch.tensor([True, False]),
-        findings=read_findings([[], ["no significant tone " * 8, "blind"]]),
+        findings=findings_of([[], ["no significant tone " * 8, "blind"]]),
     )
     lines = changed.summary().splitlines()
     assert [line.split()[0] for line in lines[1:4]] == ["x", "x", "y"]
@@ -256,7 +255,6 @@ def test_figures_of_batches_are_refused(windows):
 def test_a_saved_detection_is_a_vibration_json(detection, windows, frames, tmp_path):
     path = tmp_path / "vibration.json"
     detection.save(path)
-    VibrationFile.model_validate(json.loads(path.read_text()))
     given = rsv.read_vibration(path, TIMING)
     assert given.summary() == detection.summary()
     torch.testing.assert_close(rsv.restore(frames, TIMING, given), rsv.restore(frames, TIMING, detection))
@@ -319,17 +317,3 @@ def test_other_result_types_print_their_shapes():
         name: str
 
     assert str(Other(torch.zeros(2, 3), "one")) == "Other\n  values: tensor (2, 3)\n  name: one"
-
-
-def test_files_of_earlier_versions_lack_fields_with_a_default(tmp_path):
-    found = rsv.RowTimeCalibration(
-        1.5e-5, 1e-8, 66.0, 0.4, 1000.0, None, None, None, None, ("a note",), candidates=(1.5e-5,)
-    )
-    path = tmp_path / "calibration.json"
-    found.save(path)
-    content = json.loads(path.read_text())
-    for name in ("candidates", "reliable", "findings"):
-        del content[name]
-    path.write_text(json.dumps(content))
-    again = rsv.RowTimeCalibration.load(path)
-    assert (again.row_time, again.candidates, again.reliable) == (1.5e-5, (), True)

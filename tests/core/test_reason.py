@@ -72,7 +72,6 @@ def test_texts_of_an_axis_omit_its_name():
 @pytest.mark.parametrize(
     ("stored", "code"),
     [
-        ("blind", "unspecified"),
         ({"code": "of a later version", "axis": "x", "text": "blind"}, "unspecified"),
         ({"code": "no_tone", "axis": "y", "value": None, "limit": None, "details": {}, "text": "?"}, "no_tone"),
     ],

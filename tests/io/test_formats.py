@@ -157,28 +157,13 @@ class ToyReader:
         pass
 
 
-class ToyWriter:
-    def __init__(self, path, info, fresh):
-        self.path = path
-        self.pixels = np.zeros(info.shape, np.uint8) if fresh else ToyReader(path).pixels
-
-    def write(self, index, frame):
-        self.pixels[index] = frame
-
-    def sync(self):
-        self.path.write_text(json.dumps(self.pixels.tolist()))
-
-    close = sync
-
-
 def write_toy(path, info, frames, compression):
     path.write_text(json.dumps([frame.tolist() for frame in frames]))
 
 
-@pytest.mark.parametrize("writing", [{"create": ToyWriter}, {"write_all": write_toy}])
-def test_format_can_be_added_and_removed(tmp_path, monkeypatch, writing):
+def test_format_can_be_added_and_removed(tmp_path, monkeypatch):
     monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
-    register_format(StackFormat("toy", (".toy",), ToyReader, dtypes=("uint8",), **writing))
+    register_format(StackFormat("toy", (".toy",), ToyReader, dtypes=("uint8",), write=write_toy))
     frames = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(1))
     write_stack(tmp_path / "a.toy", frames, dtype="uint8")
     torch.testing.assert_close(read_stack(tmp_path / "a.toy"), frames, atol=0.002, rtol=0)
@@ -200,7 +185,7 @@ def test_format_checks_the_full_scale_before_frames_are_computed(tmp_path):
         if info.full_scale != 255:
             raise ValueError(f"{path}: full scale {info.full_scale}")
 
-    register_format(StackFormat("toy", (".toy",), ToyReader, create=lambda *_: None, check=refuse))
+    register_format(StackFormat("toy", (".toy",), ToyReader, write=lambda *_: None, check=refuse))
     try:
         assert check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint8") == 255
         with pytest.raises(ValueError, match=r"a\.toy: full scale 4095"):

@@ -159,12 +159,12 @@ def test_gopro_times_follow_the_clock_of_the_camera(tmp_path):
             lambda path: path.write_text("t,x_dps,y_dps,z_dps\n" + "1,0,0,0\n" * 5),
             "times must increase, but sample 1 at 1 s",
         ),
-        (lambda path: mp4(path, packets_of(), kind=b"tmcd"), "a video without a GPMF track"),
+        (lambda path: mp4(path, [b"\0\0\0\1"] * 3, kind=b"tmcd"), "a video without a GPMF track"),
         (lambda path: mp4(path, packets_of(), count=2**31), "damaged MP4 file"),
-        (lambda path: mp4(path, packets_of(), offsets=[2**31] * 3), "beyond the end of the file"),
+        (lambda path: mp4(path, packets_of(), offsets=[2**31] * 3), "a video without a GPMF track"),
         (lambda path: mp4(path, [packets_of()[0][:-40]] * 3), "damaged MP4 file: a GPMF entry"),
-        (lambda path: path.write_bytes(box(b"ftyp", b"mp41") + b"\xff\xff\xff\xffmdat"), "the file is truncated"),
-        (lambda path: path.write_bytes(box(b"ftyp", b"mp41")), "without index"),
+        (lambda path: path.write_bytes(box(b"ftyp", b"mp41") + b"\xff\xff\xff\xffmdat"), "damaged MP4 file"),
+        (lambda path: path.write_bytes(box(b"ftyp", b"mp41")), "damaged MP4 file"),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(tmp_path, write, message):

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
-from rsvib_torch.io.schema import VibrationRecord
 
 LENS = rsv.Camera(574.0, (6.5, 9.5), (-0.12, 0.05, 1e-3, -2e-3, 0.01))
 
@@ -124,9 +123,6 @@ def test_files_keep_the_camera(tmp_path):
     for motion in (vibration, free):
         motion.save(tmp_path / "motion.json")
         assert type(motion).load(tmp_path / "motion.json").camera == LENS
-    record = VibrationRecord.from_vibration(vibration)
-    assert VibrationRecord.model_validate_json(record.model_dump_json()).to_vibration().camera == LENS
-    assert VibrationRecord.from_vibration(rsv.Vibration(3.0, 50.0)).camera is None
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from detections import findings_of
 from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
 
 from rsvib_torch.commands.main import run_command
-from rsvib_torch.core.reason import Reason, read_findings
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.evaluation import resolution_chart
@@ -55,7 +56,7 @@ def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
         gain,
         torch.zeros(2).double(),
         torch.tensor(reliable),
-        read_findings(reasons),
+        findings_of(reasons),
         (),
         curve,
         offsets,

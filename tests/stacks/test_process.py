@@ -49,10 +49,10 @@ def test_every_frame_of_a_long_stack_is_restored(place):
     manifest = read_manifest(place / "restored.tif.manifest.json")
     for record in manifest.windows:
         found = record.detection.vibration
-        assert found.amplitude[0][0] == pytest.approx(MOTION.amplitude[0], rel=0.06)
-        assert found.frequency[1][0] == pytest.approx(MOTION.frequency[1], rel=0.03)
+        assert float(found.amplitude[0, 0]) == pytest.approx(MOTION.amplitude[0], rel=0.06)
+        assert float(found.frequency[1, 0]) == pytest.approx(MOTION.frequency[1], rel=0.03)
         # the phase refers to the time origin of the window
-        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - found.phase[0][0]
+        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - float(found.phase[0, 0])
         assert abs(np.angle(np.exp(1j * turn))) < 0.2
     assert sorted(path.name for path in place.iterdir()) == ["frames.tif", "restored.tif", "restored.tif.manifest.json"]
 
@@ -71,7 +71,7 @@ def test_result_does_not_depend_on_workers_memory_or_staging(place, tmp_path, op
     process_small(place / "frames.tif", tmp_path / "restored.tif", **options)
     assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
     old, new = (read_manifest(folder / "restored.tif.manifest.json") for folder in (place, tmp_path))
-    assert new.windows == old.windows
+    assert new.to_dict()["windows"] == old.to_dict()["windows"]
     assert torch.get_num_threads() == threads
 
 
@@ -215,9 +215,9 @@ def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
     assert sorted(decibel(frame, STILL, 12) for frame in restored)[1] > 38  # also next to the gaps
     for record in records:
         found = record.detection.vibration
-        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - found.phase[0][0]
+        turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - float(found.phase[0, 0])
         assert abs(np.angle(np.exp(1j * turn))) < 0.2
-        assert found.amplitude[0][0] == pytest.approx(MOTION.amplitude[0], rel=0.1)
+        assert float(found.amplitude[0, 0]) == pytest.approx(MOTION.amplitude[0], rel=0.1)
 
 
 @pytest.mark.parametrize(

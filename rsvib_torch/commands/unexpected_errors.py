@@ -1,10 +1,8 @@
 """One line about unforeseen errors: exhausted memory and threads, and defects of the package or a library."""
 
 import errno
-from collections.abc import Iterator
-from contextlib import contextmanager
 
-__all__ = ["in_one_line", "system_error", "unexpected_errors_in_one_line"]
+__all__ = ["in_one_line", "system_error"]
 
 
 def system_error(error: BaseException) -> OSError | None:
@@ -33,12 +31,3 @@ def in_one_line(error: BaseException) -> str:
     if isinstance(error, RecursionError):
         return "the input is nested too deeply"
     return f"unexpected {type(error).__name__}: {' '.join(str(error).split())[:500]}"
-
-
-@contextmanager
-def unexpected_errors_in_one_line() -> Iterator[None]:
-    """Turn errors that no check foresaw into a ``ValueError``, or an ``OSError`` for memory and threads."""
-    try:
-        yield
-    except (ArithmeticError, LookupError, MemoryError, RuntimeError) as error:
-        raise (system_error(error) or ValueError(in_one_line(error))) from error

@@ -1,0 +1,161 @@
+"""A run that writes an output from windows: it is resumed if it was interrupted, and ends with the manifest."""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsvib_torch.core.arguments import check_fields
+from rsvib_torch.core.atomic import make_folder, remove_abandoned, sync, whole_file
+from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.text import number_of
+from rsvib_torch.stacks.job import WindowResult
+from rsvib_torch.stacks.manifest import read_manifest, write_manifest
+from rsvib_torch.stacks.run_folder import RunFolder, describe_difference, disk_errors_named, work_folder
+
+__all__ = ["StackReport", "run_to_file"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StackReport(Summarised):
+    """Summary of a run.
+
+    Attributes:
+        frames: Number of frames written, including those of an interrupted run that was resumed.
+        windows: Number of windows of the stack.
+        restored: Number of windows whose frames were restored.
+        failed: Number of windows in which detection or restoration failed.
+        bad_frames: Number of frames that could not be used.
+        resumed: Number of windows that were complete before.
+        seconds: Duration of the run.
+        first: Result of the first window, if it was computed in this process.
+        manifest: Path of the manifest.
+        not_kept: Metadata of the input that the output does not contain.
+
+    Example:
+        >>> import tempfile
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
+        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> folder = tempfile.mkdtemp()
+        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
+        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
+        >>> report = rsv.process_stack(
+        ...     f"{folder}/frames.tif",
+        ...     f"{folder}/restored.tif",
+        ...     timing,
+        ...     window=3,
+        ...     detection={"tones": 1},
+        ...     restoration={"method": "dewarp"},
+        ... )
+        >>> report.frames, report.windows, report.restored, report.failed
+        (4, 2, 2, 0)
+    """
+
+    frames: int
+    windows: int
+    restored: int
+    failed: int
+    bad_frames: int
+    resumed: int
+    seconds: float
+    first: WindowResult | None
+    manifest: Path
+    not_kept: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def summary(self) -> str:
+        """Numbers of frames and windows, and the time."""
+        lines = [f"{number_of(self.frames, 'frame')} in {number_of(self.windows, 'window')}, {self.restored} restored"]
+        if self.frames and not self.resumed:
+            lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
+        if self.resumed:
+            lines.append(f"windows complete before this run: {self.resumed}")
+        if self.failed:
+            lines.append(
+                f"detection or restoration failed in {number_of(self.failed, 'window')}: see {self.manifest.name}"
+            )
+        if self.bad_frames:
+            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
+        return "\n".join(lines)
+
+
+def run_to_file(
+    sink: Path,
+    manifest: Path,
+    header: dict[str, Any],
+    *,
+    windows: int,
+    resume: bool,
+    compute: Callable[[RunFolder], dict[str, Any]],
+    write: Callable[[RunFolder], None],
+    not_kept: Callable[[int], Sequence[str]],
+) -> StackReport:
+    """Compute the windows of a run that are not finished, and write the output and its manifest.
+
+    Args:
+        sink: The output.
+        manifest: Path of the manifest.
+        header: As from ``manifest_header``.
+        windows: Number of windows.
+        resume: Whether to continue an interrupted run; a complete output is not changed.
+        compute: Adds the missing windows to the folder, and returns results of the whole run for the manifest.
+        write: Writes the output from the folder.
+        not_kept: Metadata that the output does not contain, for its number of frames.
+
+    Returns:
+        Summary of the run.
+
+    Raises:
+        FileExistsError: If there is an interrupted run and ``resume`` is False.
+        OSError: If a file cannot be written; the run can then be resumed.
+        ValueError: If a run cannot be resumed.
+    """
+    start = time.perf_counter()
+
+    def report(records: Iterable[Mapping[str, Any]], resumed: int, lost: Sequence[str]) -> StackReport:
+        counts = dict.fromkeys(("frames", "restored", "failed", "bad_frames"), 0)
+        for record in records:
+            counts["frames"] += record["written"]
+            counts["restored"] += record["frames"] == "restored"
+            counts["failed"] += record["error"] is not None
+            counts["bad_frames"] += len(record["bad_frames"])
+        seconds = time.perf_counter() - start
+        return StackReport(
+            **counts,
+            windows=windows,
+            resumed=resumed,
+            seconds=seconds,
+            first=None,
+            manifest=manifest,
+            not_kept=tuple(lost),
+        )
+
+    if resume and not work_folder(sink).exists() and sink.exists() and manifest.exists():
+        complete = read_manifest(manifest)
+        difference = describe_difference(complete.header(), header)
+        if difference:
+            raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+        for path in (sink, manifest):
+            remove_abandoned(path)
+        return report(map(vars, complete.windows), windows, complete.not_kept)
+    folder = RunFolder(sink, header, resume=resume)
+    try:
+        resumed = folder.count
+        results = compute(folder)
+        lost = not_kept(folder.written)
+        with disk_errors_named(folder):
+            make_folder(manifest.parent)
+            with whole_file(manifest) as part:
+                write_manifest(part, header, folder.records(), lost, **results)
+                write(folder)
+            sync(manifest.absolute().parent)  # the temporary folder is gone as well
+        summary = report(folder.records(), resumed, lost)
+        folder.remove()
+        return summary
+    finally:
+        folder.close()

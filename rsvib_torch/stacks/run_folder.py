@@ -1,0 +1,329 @@
+"""The finished windows of a run, in a folder beside its output, from which an interrupted run is resumed.
+
+A window consists of files of pixels and a marker: a file with the record of the window and the hashes of its files. The
+marker gets its name after all of them are on the disk, so that a window with a marker is finished. Files are opened
+relative to the open folder, and only new files are written: a link in the place of the folder or of a file is never
+followed, and nothing that others made is changed.
+"""
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import re
+import secrets
+import shutil
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from rsvib_torch.core.atomic import PART, make_folder, nearest_folder, sync, sync_tree, temporary_folder
+from rsvib_torch.core.free_memory import size_text
+
+__all__ = ["RunFolder", "check_space", "describe_difference", "disk_errors_named", "work_folder"]
+
+_HEADER = "run.json"
+_NAMES = re.compile(r"run\.json|\d{6,}\.(done|done\.part|npy|mkv|avi|mp4|mov|m4v)")  # of the files that a run makes
+_SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
+
+
+def work_folder(sink: Path) -> Path:
+    """Work folder of a run that writes ``sink``."""
+    return sink.with_name(f".{sink.name}.rsvib")
+
+
+def describe_difference(old: Any, new: Any, path: str = "") -> str | None:
+    """The first key in which two tables differ, with both values; None if they are equal."""
+
+    def shortened(value: Any) -> str:
+        text = json.dumps(value)
+        return text if len(text) <= 60 else f"{text[:57]}..."
+
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in dict.fromkeys([*new, *old]):
+            difference = describe_difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+            if difference:
+                return difference
+        return None
+    return None if old == new else f"{path} was {shortened(old)}, now it is {shortened(new)}"
+
+
+def check_space(path: Path, needed: int) -> None:
+    """Raise an ``OSError`` if the disk of a file to be written has less than ``needed`` free bytes."""
+    free = shutil.disk_usage(nearest_folder(path)).free
+    if needed > free:
+        reason = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
+        raise OSError(errno.ENOSPC, reason, str(path))
+
+
+def _digest(file: BinaryIO) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+class RunFolder:
+    """The work folder of a run, locked until it is closed.
+
+    Args:
+        sink: The output of the run.
+        header: Input, settings and versions of the run: it is resumed only if they are unchanged.
+        resume: Whether to continue an interrupted run.
+
+    Raises:
+        BlockingIOError: If another run writes the same output.
+        FileExistsError: If there is an interrupted run and ``resume`` is False, or the folder was not made by a run.
+        OSError: If the folder cannot be created.
+        ValueError: If the header differs from that of the run to resume, or a marker was changed.
+    """
+
+    def __init__(self, sink: Path, header: Mapping[str, Any], *, resume: bool) -> None:
+        self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
+        self._header = json.dumps(header).encode()
+        self._key = hashlib.blake2b(self._header, digest_size=32).digest()
+        self._written: dict[int, int] = {}  # number of frames of each finished window
+        while True:
+            if not self._open():
+                self._create()
+                continue
+            try:
+                self._check_names()
+                windows = self._windows()
+                if windows and not resume:
+                    raise FileExistsError(
+                        f"{sink}: a run was interrupted here after {len(windows)} windows; resume it (--resume), or "
+                        f"delete {self.path} to start over"
+                    )
+                difference = self._difference()
+                if windows and difference:
+                    raise ValueError(f"{difference}; delete {self.path} to start over")
+                self._find_finished(windows)
+            except BaseException:
+                os.close(self._folder)
+                raise
+            if not difference:
+                return
+            self.remove()  # nothing is lost
+            os.close(self._folder)
+
+    def _create(self) -> None:
+        """Create the folder with its header: it gets its name when it is complete."""
+        make_folder(self.path.parent)
+        with temporary_folder(self.sink) as folder:
+            new = folder / "new"
+            new.mkdir(0o700)
+            (new / _HEADER).write_bytes(self._header)
+            sync_tree(new)
+            try:
+                new.rename(self.path)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # another process has created it
+                    raise
+        sync(self.path.parent)
+
+    def _open(self) -> bool:
+        """Open and lock the folder; False if there is none."""
+        try:
+            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            if stat.S_ISDIR(os.lstat(self.path).st_mode):
+                raise
+            raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
+        try:
+            if os.fstat(self._folder).st_uid != os.geteuid():
+                raise self._refusal("it belongs to another user")
+            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if self._has_its_name():
+                return True
+        except BlockingIOError as error:
+            os.close(self._folder)
+            raise BlockingIOError(f"cannot write {self.sink}: another run is writing it") from error
+        except BaseException:
+            os.close(self._folder)
+            raise
+        os.close(self._folder)  # a process that has ended meanwhile removed it
+        return self._open()
+
+    def _has_its_name(self) -> bool:
+        with suppress(FileNotFoundError):
+            return os.path.samestat(os.lstat(self.path), os.fstat(self._folder))
+        return False
+
+    def _refusal(self, reason: str, name: str = "") -> FileExistsError:
+        return FileExistsError(
+            f"cannot write {self.sink}: {self.path / name} was not made by a run, {reason}; move it elsewhere, or "
+            f"delete {self.path} to start over"
+        )
+
+    def _check_names(self) -> None:
+        """Raise a ``FileExistsError`` if there is anything in the folder that no run has made."""
+        names = sorted(os.listdir(self._folder))
+        if _HEADER not in names:
+            raise self._refusal(f"it has no {_HEADER}")
+        for name in names:
+            status = os.stat(name, dir_fd=self._folder, follow_symlinks=False)
+            if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_uid != os.geteuid():
+                raise self._refusal("it is not a regular file of one name and of this user", name)
+            if not _NAMES.fullmatch(name):
+                raise self._refusal("it has another name than files of a run", name)
+
+    def _difference(self) -> str | None:
+        """How the header differs from that of this run; None if it does not."""
+        with self.open(_HEADER) as file:
+            stored = file.read()
+        if stored == self._header:
+            return None
+        try:
+            difference = describe_difference(json.loads(stored), json.loads(self._header))
+        except (ValueError, RecursionError):
+            difference = None
+        damaged = f"{self.path / _HEADER} is damaged"
+        return damaged if difference is None else f"{self.sink}: cannot resume: {difference}"
+
+    def _windows(self) -> list[int]:
+        """Numbers of the windows that have a marker."""
+        return sorted(int(name[:-5]) for name in os.listdir(self._folder) if name.endswith(".done"))
+
+    def _find_finished(self, windows: Iterable[int]) -> None:
+        """Find the windows whose files are as they were written, and remove the markers of the others."""
+        entries = [(self._entry(window)["record"]["written"], window) for window in windows]  # before any change
+        for written, window in entries:
+            if self._is_whole(window):
+                self._written[window] = written
+            else:
+                self._delete(_marker(window))
+
+    def _is_whole(self, window: int) -> bool:
+        """Whether the files of a window are those that were written."""
+        try:
+            for name, digest in self._entry(window)["files"].items():
+                with self.open(name) as file:
+                    if _digest(file) != digest:
+                        return False
+        except OSError:
+            return False
+        return True
+
+    def _entry(self, window: int) -> dict[str, Any]:
+        """Content of the marker of a window.
+
+        Raises:
+            ValueError: If it is not what this run wrote.
+        """
+        with self.open(_marker(window)) as file:
+            body, _, checksum = file.read().rpartition(b"\n")
+        if checksum == self._checksum(body):
+            entry: dict[str, Any] = json.loads(body)
+            if entry["record"]["window"] == window:
+                return entry
+        raise ValueError(f"{self.path / _marker(window)} is damaged; delete {self.path} to start over")
+
+    def _checksum(self, body: bytes) -> bytes:
+        return hashlib.blake2b(body, key=self._key, digest_size=16).hexdigest().encode()
+
+    def _delete(self, name: str) -> None:
+        with suppress(FileNotFoundError):
+            os.unlink(name, dir_fd=self._folder)
+
+    def create(self, name: str) -> BinaryIO:
+        """A new file of a window, whose name begins with the number of the window in six digits."""
+        self._delete(name)
+        return os.fdopen(os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | _SAFELY, 0o600, dir_fd=self._folder), "w+b")
+
+    def open(self, name: str) -> BinaryIO:
+        """A file of the folder for reading."""
+        return os.fdopen(os.open(name, os.O_RDONLY | _SAFELY, dir_fd=self._folder), "rb")
+
+    def add(self, record: Mapping[str, Any], names: Iterable[str]) -> None:
+        """Enter a finished window; it is on the disk when the function returns.
+
+        Args:
+            record: Content of its ``WindowRecord``.
+            names: Its files, which are closed.
+        """
+        digests = {}
+        for name in names:
+            with self.open(name) as file:
+                os.fsync(file.fileno())
+                digests[name] = _digest(file)
+        os.fsync(self._folder)  # their names
+        body = json.dumps({"record": record, "files": digests}, allow_nan=False).encode()
+        marker = _marker(record["window"])
+        with self.create(f"{marker}.part") as file:
+            file.write(body + b"\n" + self._checksum(body))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(f"{marker}.part", marker, src_dir_fd=self._folder, dst_dir_fd=self._folder)
+        os.fsync(self._folder)
+        self._written[record["window"]] = record["written"]
+
+    def __contains__(self, window: int) -> bool:
+        return window in self._written
+
+    @property
+    def count(self) -> int:
+        """Number of finished windows."""
+        return len(self._written)
+
+    @property
+    def written(self) -> int:
+        """Number of their frames."""
+        return sum(self._written.values())
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Records of the finished windows in order."""
+        for window in sorted(self._written):
+            yield self._entry(window)["record"]
+
+    def files(self) -> Iterator[str]:
+        """Names of the files of the finished windows in order."""
+        for window in sorted(self._written):
+            yield from self._entry(window)["files"]
+
+    def remove(self) -> None:
+        """Remove the folder, and the empty folders above it that were created for it.
+
+        It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
+        """
+        hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{PART}")
+        self._written.clear()
+        if self._has_its_name():
+            self.path.rename(hidden)
+            sync(hidden.parent)
+            shutil.rmtree(hidden, ignore_errors=True)
+        with suppress(OSError):  # folders that others use
+            folder = self.path.absolute().parent
+            while folder != self._above:
+                folder.rmdir()
+                folder = folder.parent
+
+    def close(self) -> None:
+        """Release the folder; it is removed if it contains no finished window."""
+        try:
+            if not self._written:
+                self.remove()
+        finally:
+            os.close(self._folder)
+
+
+def _marker(window: int) -> str:
+    return f"{window:06d}.done"
+
+
+@contextmanager
+def disk_errors_named(folder: RunFolder) -> Iterator[None]:
+    """Add the name of the output and the number of finished windows to errors of the disk."""
+    try:
+        yield
+    except OSError as error:
+        kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
+        # the words of the system: libraries add long descriptions; NumPy does not state why an array is cut off
+        number = errno.ENOSPC if "requested and" in str(error) else error.errno
+        reason = os.strerror(number) if number else " ".join(str(error).split())
+        raise OSError(number, f"{reason}{kept}", str(folder.sink)) from error

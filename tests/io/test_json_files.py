@@ -1,0 +1,103 @@
+"""JSON files of results: values are read back exactly, and files that do not fit are refused."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from detections import detection_of
+
+from rsvib_torch.core.presentation import plain_values
+from rsvib_torch.core.result_files import decode
+from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.report.results import check_same_timing
+from rsvib_torch.stacks import read_manifest
+
+TIMING = SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
+VIBRATION = Vibration(
+    [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.1], [1 / 3, 0.0]], 0.3, [20.0, 0.0], [0.0, -3.0], [1.5, 0.0]
+)
+WINDOW = {
+    "window": 0,
+    "first": 0,
+    "last": 3,
+    "start_time": 0.0,
+    "written": 4,
+    "frames": "as taken",
+    "detection": None,
+    "left_alone": [],
+    "outcome": None,
+    "summary": None,
+    "predicted_gain": None,
+    "error": "all pixels of frame 2 are equal",
+    "bad_frames": {"2": "all pixels are equal"},
+}
+MANIFEST = {
+    "format": "rsvib stack",
+    "version": 1,
+    "input": {},
+    "settings": {},
+    "versions": {},
+    "output": None,
+    "bad_frames": {},
+    "windows": [WINDOW, WINDOW | {"window": 1}],
+}
+
+
+def stored(value):
+    return json.loads(json.dumps(plain_values(value)))
+
+
+@pytest.mark.parametrize("starts", [None, (0.0, 0.011, 0.03)])
+@pytest.mark.parametrize(("axis", "direction"), [("y", "forward"), ("x", "reverse")])
+def test_timing_is_read_back_exactly(axis, direction, starts):
+    timing = SensorTiming(2e-5, 20, 512.25, axis, direction, starts)
+    assert decode(SensorTiming, stored(timing), "timing") == timing
+
+
+def test_detection_is_read_back_exactly():
+    detection = detection_of(VIBRATION, reasons=(("blind",), ()))
+    detection.std.frequency[1, 1] = torch.inf
+    back = decode(DetectedVibration, stored(detection), "detection")
+    for name, values in vars(VIBRATION).items():
+        if isinstance(values, torch.Tensor):
+            torch.testing.assert_close(getattr(back.vibration, name), values, rtol=0, atol=0)
+    torch.testing.assert_close(back.std.frequency, detection.std.frequency, rtol=0, atol=0)
+    assert (back.reliable.tolist(), back.reasons) == ([True, True], (("blind",), ()))
+
+
+def test_different_numbers_of_tones_are_refused():
+    data = stored(detection_of(VIBRATION))
+    data["std"]["phase"] = [[0.1], [0.1]]
+    with pytest.raises(ValueError, match=r"^detection\.std: phase must have shape .* K = 2, got \(2, 1\)"):
+        decode(DetectedVibration, data, "detection")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"windows": [WINDOW, WINDOW]}, r"windows\[1\]\.window: expected 1, got 0"),
+        ({"windows": [WINDOW | {"first": "0"}]}, r"windows\[0\]\.first: expected int, got '0'"),
+        ({"windows": [WINDOW | {"frames": "lost"}]}, r"windows\[0\]\.frames: expected 'restored' or 'as taken', got"),
+        ({"windows": [{}]}, r"windows\[0\]\.window: missing key"),
+        ({"windows": [WINDOW | {"detection": {}}]}, r"windows\[0\]\.detection\.vibration: missing key"),
+        ({"windows": {}}, r"windows: expected a list of tables, got \{\}"),
+        ({"settings": None}, "settings: expected a table, got None"),
+        ({"version": 2}, "expected format 'rsvib stack' of version 1"),
+    ],
+)
+def test_manifests_that_do_not_fit_are_refused(tmp_path, change, message):
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps(MANIFEST))
+    assert [record.error for record in read_manifest(path).windows] == [WINDOW["error"]] * 2
+    path.write_text(json.dumps(MANIFEST | change))
+    with pytest.raises(ValueError, match=message):
+        read_manifest(path)
+
+
+def test_timings_are_compared_up_to_rounding():
+    check_same_timing("vibration.json", TIMING, replace(TIMING, row_time=1e-4 * (1 + 1e-12)))
+    with pytest.raises(ValueError, match=r"^v\.json: .* another timing: row_time=0\.0001 \(here 0\.000101\); detect"):
+        check_same_timing("v.json", TIMING, replace(TIMING, row_time=1.01e-4))
