@@ -11,6 +11,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.core.reason import Reason
@@ -192,9 +193,10 @@ def detect_swept_tone(
     stacks = grey_frames(frames, timing, full_scale, ignore, channels)
     timing = stacks.timing
     bands = RegistrationOptions(registration, band_rows, band_step, search)
-    fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
+    with threads_for(stacks.images):
+        fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots
-    tones = [_report(one, timing, step) for one in fitted]
+    tones = [_report(one, timing, step).to(stacks.images.device) for one in fitted]
     return SweptTone.stacked(tones) if stacks.batched else tones[0]
 
 
