@@ -15,7 +15,7 @@ from pathlib import Path
 import benchmarks.needed
 import harness
 import torch
-from benchmarks.sections import SECTIONS, module_of
+from benchmarks.sections import EARLIER_NAMES, SECTIONS, module_of
 
 __all__ = ["benchmarks", "main"]
 
@@ -34,7 +34,14 @@ def parsed(arguments: list[str] | None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False
     )
     default = [name for name, section in SECTIONS.items() if section.by_default]
-    parser.add_argument("--only", choices=SECTIONS, nargs="+", default=default, help=f"default: {' '.join(default)}")
+    parser.add_argument(
+        "--only",
+        choices=SECTIONS,
+        type=lambda name: EARLIER_NAMES.get(name, name),
+        nargs="+",
+        default=default,
+        help=f"default: {' '.join(default)}",
+    )
     chosen = parser.parse_known_args(arguments)[0].only
     parser.add_argument("-h", "--help", action="help", help="print this text")
     parser.add_argument(
@@ -68,7 +75,10 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.only:
         section, begin = module_of(name), time.perf_counter()
-        rows = section.rows(options)
+        try:
+            rows = section.rows(options)
+        except ModuleNotFoundError as error:
+            raise SystemExit(f"benchmark: section {name} needs the package {error.name}") from error
         seconds = time.perf_counter() - begin
         for folder in (options.out, harness.RESULTS) if options.store else (options.out,):
             harness.write_result(name, rows, options, seconds, folder)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-__all__ = ["SECTIONS", "Section"]
+__all__ = ["EARLIER_NAMES", "SECTIONS", "Section", "module_of"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,9 @@ SECTIONS: dict[str, Section] = {
     "row_time": Section("Row time from motion", by_default=False),
     "error_bars": Section("Standard deviations", by_default=False),
 }
+
+
+EARLIER_NAMES = {"roofline": "gpu"}  # of sections that have become part of others
 
 
 def module_of(name: str) -> Any:
