@@ -4,8 +4,8 @@
 import argparse
 from pathlib import Path
 
-from benchmarks.sections import SECTIONS, machine_line
-from benchmarks.store import RESULTS, StoredResult, read_result
+from benchmarks.sections import SECTIONS, module_of
+from harness import RESULTS, StoredResult, machine_line, read_result
 
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 HEAD = """# Benchmarks
@@ -19,14 +19,13 @@ is measured again with `python scripts/benchmark.py --only NAME --store`.
 
 def section_text(result: StoredResult) -> str:
     """Heading, origin and tables of one result."""
-    section = SECTIONS[result.section]
     commit = "" if result.commit is None else f", commit {result.commit}"
     origin = (
         f"Measured by `python scripts/benchmark.py --only {result.section} --store` with rsvib_torch {result.version}"
         f"{commit}, on {result.date} in {result.seconds:.0f} s. {machine_line(result.machine)}"
     )
-    tables = "\n".join(section.lines(result.rows, result.options)).strip()
-    return f"## {section.title}\n\n{origin}\n\n{tables}\n"
+    tables = "\n".join(module_of(result.section).lines(result.rows, result.options)).strip()
+    return f"## {SECTIONS[result.section].title}\n\n{origin}\n\n{tables}\n"
 
 
 def page_text(folder: Path) -> str:

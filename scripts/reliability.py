@@ -7,7 +7,6 @@ of the same attacks and seeds in scripts/attacks/results.json, and the table of 
 """
 
 import argparse
-import datetime
 import importlib
 import itertools
 import json
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from attacks.trial import FAILURES, OUTCOMES, Trial
+from harness import machine, table, today
 
 import rsvib_torch as rsv
 
@@ -54,7 +54,7 @@ ATTACKS: dict[str, Attack] = {
     "concurrent": Attack("several runs with one output", 45),
     "disks": Attack("full and read-only disks", 69),
     "memory": Attack("`--memory` in different layouts", 17),
-    "crafted": Attack("crafted files", 500),
+    "crafted": Attack("crafted files", 200),
     "workers": Attack("killed and missing Dask workers", 9),
     "api": Attack("hostile arguments of Python functions", 4000),
     "mutated": Attack("randomly damaged files", 2400),
@@ -64,19 +64,18 @@ ATTACKS: dict[str, Attack] = {
 def summary(trials: list[Trial]) -> dict[str, Any]:
     """What is stored of the trials of one attack and seed."""
     counts = Counter(trial.outcome for trial in trials)
-    date = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
-    return {"date": date, "version": rsv.__version__, "counts": {outcome: counts[outcome] for outcome in OUTCOMES}}
+    of_outcomes = {outcome: counts[outcome] for outcome in OUTCOMES}
+    return {"date": today(), "version": rsv.__version__, "machine": machine()["processor"], "counts": of_outcomes}
 
 
-def table(results: dict[str, dict[str, Any]]) -> list[str]:
+def counted(results: dict[str, dict[str, Any]]) -> list[str]:
     """Markdown table of the summaries by attack and seed: one row per attack, one column per outcome."""
-    lines = ["| attack | date | trials | " + " | ".join(OUTCOMES) + " |", "|---" * (3 + len(OUTCOMES)) + "|"]
+    lines = []
     for name, seeds in results.items():
         counts = [sum(one["counts"][outcome] for one in seeds.values()) for outcome in OUTCOMES]
         oldest = min(one["date"] for one in seeds.values())
-        cells = [f"{ATTACKS[name].title} (`{name}`)", oldest, str(sum(counts)), *map(str, counts)]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+        lines.append((f"{ATTACKS[name].title} (`{name}`)", oldest, sum(counts), *counts))
+    return table(("attack", "date", "trials", *OUTCOMES), lines)[:-1]
 
 
 def store(results: dict[str, dict[str, Any]]) -> None:
@@ -85,7 +84,7 @@ def store(results: dict[str, dict[str, Any]]) -> None:
     after = rest.split(END)[1]
     origin = f"Measured by `python scripts/reliability.py --store` with rsvib_torch {rsv.__version__}."
     RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text("\n".join([before + BEGIN, origin, "", *table(results), END + after]), encoding="utf-8")
+    PAGE.write_text("\n".join([before + BEGIN, origin, "", *counted(results), END + after]), encoding="utf-8")
 
 
 def main() -> int:
@@ -115,7 +114,7 @@ def main() -> int:
         if options.store:  # after each attack: an interrupted run keeps the finished ones
             stored[name] = stored.get(name, {}) | latest[name]
             store({one: stored[one] for one in ATTACKS if one in stored})
-    print("\n".join(table(latest)))
+    print("\n".join(counted(latest)))
     return int(failed)
 
 

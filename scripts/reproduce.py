@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Reproduce Tables 2, 3 and 4, the figures and two claims of Liu et al. 2023 (Sensors 23, 5953).
+"""Reproduce Tables 2, 3 and 4 and two claims of Liu et al. 2023 (Sensors 23, 5953).
 
 The values of the paper are compared with those of its methods and of the default methods, over trials with random
-phases and noise. Writes reproduction.md, reproduction.json, a self-contained HTML page, and the figures as PNG files.
+phases and noise. Writes reproduction.md, reproduction.json and two figures.
 """
 
 import argparse
@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from reproduction.claims import SPEEDS
 from reproduction.document import markdown, record
-from reproduction.page import write_reproduction_page
-from reproduction.pictures import gallery
-from reproduction.work import Plan, run
+from reproduction.pictures import errors_figure, sampling_figure
+from reproduction.trials import SPEEDS, Plan, run
 
 from rsvib_torch.core.atomic import whole_folder
+from rsvib_torch.report.plots import save_figure
 
 PLANS = {
     "whole": Plan(size=(2048, 1024), seeds=10, noises=(0.005, 0.002, 0.0), edges=3, speeds=SPEEDS, processes=2),
@@ -43,17 +42,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{time.perf_counter() - begin:5.0f} s  {what}", flush=True)
 
     found = run(plan, report)
-    report("drawing")
-    pictures = gallery(found, plan)
     with whole_folder(options.out) as folder:
         (folder / "reproduction.md").write_text(markdown(found, plan), encoding="utf-8")
         text = json.dumps(record(found, plan), indent=1, ensure_ascii=False, allow_nan=False)
         (folder / "reproduction.json").write_text(text + "\n", encoding="utf-8")
-        for drawings in pictures.figures.values():
-            for drawn in drawings:
-                (folder / f"{drawn.name}.png").write_bytes(drawn.png)
-        write_reproduction_page(folder / "reproduction.html", found, plan, pictures)
-    report(f"{options.out}: reproduction.md, .json, .html and figures")
+        save_figure(errors_figure(found, plan), folder / "detection_errors.png")
+        save_figure(sampling_figure(found), folder / "global_shutter.png")
+    report(f"{options.out}: reproduction.md, .json and figures")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Frames of a camera that aliases, for tests of the finer grid, and a check of gradients by differences.
 
-The camera is that of ``scripts/benchmarks/finer_camera.py``, which shares no code with the package.
+The camera is that of ``scripts/benchmarks/independent_camera.py``, which shares no code with the package.
 """
 
 from collections.abc import Callable
@@ -8,8 +8,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from benchmarks.finer_camera import BETWEEN, FINER, after_optics, mosaic_of, still_image
-from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from benchmarks.independent_camera import (
+    ALIASING,
+    Array,
+    Shake,
+    after_optics,
+    closed,
+    mosaic_of,
+    still_image,
+    take_frames,
+)
+from benchmarks.independent_camera import POINTS_PER_PX as FINER
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -36,17 +45,7 @@ TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=571)
 
 def taken(scene: Array, count: int, size: int, shake: Shake = SHAKE) -> Array:
     """Noise-free frames (T, size, size) of a scene on the grid of the camera."""
-    return take_frames(
-        scene,
-        shake,
-        row_time=TIMING.row_time,
-        exposure_rows=TIMING.exposure_rows,
-        frame_rows=TIMING.frame_rows,
-        num_frames=count,
-        size=(size, size),
-        points=FINER,
-        between=BETWEEN,
-    )
+    return take_frames(scene, shake, TIMING, count, (size, size), **ALIASING)
 
 
 def noisy(clean: Array, noise: float, seed: int = 1) -> Tensor:

@@ -5,9 +5,10 @@ import argparse
 import numpy as np
 import pytest
 import torch
-from benchmarks import detection, detection_report
+from benchmarks import detection
 from benchmarks.detection import errors_of
 from benchmarks.independent_camera import Shake, take_frames
+from harness import defaults
 
 import rsvib_torch as rsv
 
@@ -21,7 +22,7 @@ def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, exposure):
     scene = 0.5 + 0.3 * np.cos(turn[0] * x + turn[1] * y)
     tones = ([[1.3, 0.4], [2.1, 0.0]], [[50.0, 120.0], [30.0, 0.0]], [[0.4, 1.0], [1.3, 0.0]])
     shake = Shake(*(np.array(values) for values in tones), np.array([40.0, -30.0]))
-    frames = take_frames(scene, shake, row_time=2e-4, exposure_rows=exposure, frame_rows=60, num_frames=2, size=size)
+    frames = take_frames(scene, shake, rsv.SensorTiming(2e-4, exposure, 60), 2, size)
     rows, columns = np.arange(size[0]), np.arange(size[1])
     for p in range(2):
         times = (p * 60 + rows[:, None] + (np.arange(2000) + 0.5) / 2000 * exposure) * 2e-4
@@ -52,11 +53,8 @@ def test_errors_refer_to_the_corresponding_tone():
 
 
 @pytest.mark.slow
-def test_a_small_run(tmp_path):
-    parser = argparse.ArgumentParser()
-    detection.add_options(parser)
-    options = parser.parse_args(["--detection-size", "512", "256", "--detection-noises", "0.01"])
-    options.detection_scenes, options.detection_phases, options.detection_repeats = 1, 1, 2
+def test_a_small_run():
+    options = defaults(detection)
     results = detection.rows(options)
     assert [r["trials"] for r in results] == [2, 2]
     for result in results:
@@ -64,6 +62,4 @@ def test_a_small_run(tmp_path):
         assert 0.1 < result["over_bound"] < 4
     text = detection.lines(results, options)
     assert sum(line.startswith("| 0.01 |") for line in text) == 2
-    detection_report.draw(results, tmp_path)
-    assert len(list(tmp_path.glob("*.png"))) == 2
     assert torch.get_default_dtype() == torch.float32

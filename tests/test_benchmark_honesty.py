@@ -4,7 +4,7 @@ import argparse
 
 import numpy as np
 import pytest
-from benchmarks import honesty, timing_mistakes
+from benchmarks import honesty, timing
 from benchmarks.honesty import best_constant
 from benchmarks.honesty_camera import FINER, MARGIN, OPTICS, fine_shape, layer, row_displacement, standing, take_frames
 from benchmarks.honesty_cases import recording
@@ -129,8 +129,8 @@ def test_outcomes_of_an_axis_follow_the_criteria():
 
 def test_a_mistake_of_the_timing_is_not_right():
     """Two frames with correct timing and with the image height as frame_rows."""
-    taken = timing_mistakes.take("city", 0, 128)
-    cases = {name: timing_mistakes.judge_mistake(taken, name, 2) for name in ("none", "frame_rows = image height")}
+    taken = timing.take("city", 0, 128)
+    cases = {name: timing.judge_mistake(taken, name, 2) for name in ("none", "frame_rows = image height")}
     assert cases["none"]["outcomes"] == ["right", "right"]
     assert cases["none"]["restored_db"] > cases["none"]["raw_db"] + 6
     assert "right" not in cases["frame_rows = image height"]["outcomes"]

@@ -1,25 +1,18 @@
 """The parts of the benchmark at small sizes: figures are plausible and consistent, independent of the speed."""
 
-import argparse
 import json
 import math
-import sys
 from pathlib import Path
 
 import benchmark
 import benchmark_page
 import pytest
 import torch
-from benchmarks import difficulty, live, pipeline, registration, roofline, video
-from benchmarks.measure import Timed, in_turns, peak_memory, shown_seconds
-from benchmarks.store import read_result, write_result
+from benchmarks import gpu, live, pipeline, roll, video
+from benchmarks.sections import SECTIONS, module_of
+from harness import Timed, defaults, in_turns, read_result, shown_seconds, table, write_result
 
 import rsvib_torch as rsv
-
-
-def options(**chosen):
-    usual = {"size": 256, "runs": 2, "device": ["cpu"], "scenes": ["city"], "exposures": [20], "noises": [0.005]}
-    return argparse.Namespace(**usual | {"grid_size": 128, "pipeline_rows": 384, "scaling_size": 256} | chosen)
 
 
 def in_order(row):
@@ -39,21 +32,8 @@ def test_timed_runs_are_added_run_by_run_and_scaled():
     assert [len(timed.runs) for timed in done.values()] == [2, 2]
 
 
-def test_registration():
-    chosen = options()
-    found = {row["method"]: row for row in registration.rows(chosen)}
-    assert all(in_order(row) for row in found.values())
-    slowest = found["skimage phase_cross_correlation"]
-    for row in found.values():
-        assert row["ratio"] == pytest.approx(slowest["seconds"] / row["seconds"])
-    for name in ("ncc", "phase", "cv2.matchTemplate, parabola", "cv2.findTransformECC, from matchTemplate"):
-        assert found[name]["share_off"] < 0.15
-        assert max(found[name]["rms_px"]) < 0.12
-
-
 def test_pipeline():
-    chosen = options(runs=1)
-    results = pipeline.rows(chosen)
+    results = pipeline.rows(defaults(pipeline))
     compared = {row["chain"]: row for row in results if row["part"] == "accuracy"}
     timed = {row["chain"]: row for row in results if row["part"] == "speed"}
     assert list(compared) == list(timed)
@@ -79,64 +59,53 @@ def test_pipeline():
     assert found["time of the paper's chain over ours"]["value"] == pytest.approx(ratio)
 
 
-def test_difficulty():
-    """Scenes are simplified until unwarping has the accuracy of the reference case, which makes goals comparable."""
-    chosen = options(images=[], difficulty_size=160, by=list(difficulty.WAYS))
-    results = difficulty.rows(chosen)
-    cases = [(row["by"], row["exposure_rows"], row["noise"]) for row in results]
-    assert cases == [(way, *case) for way in difficulty.WAYS for case in difficulty.CASES]
-    for row in results:
-        assert row["two_db"] > row["one_db"] > row["unwarped_db"]
-        if row["noise"] == 0:
-            assert row["unwarped_db"] == pytest.approx(difficulty.UNWARPED[0], abs=0.2)
-            assert row["one_db"] > 68
+def test_operations_transfers_and_bytes_are_counted():
+    values = torch.ones(100)
+    with gpu.Count("cpu") as count:
+        view = values[:50]  # no bytes
+        total = view + 1.0  # 200 bytes read and 200 written
+        total.add_(view)  # 200 read, 200 read and written
+        assert total.sum().item() == 150.0
+    assert count.transfers == 1
+    assert 4 <= count.operations <= 8
+    assert 400 + 600 <= count.moved < 2000
 
 
-@pytest.mark.slow
-def test_peak_memory():
-    if not Path("/proc/self/clear_refs").exists():
-        pytest.skip("the system does not report the peak of memory")
-    frame = 4 * 2048 * 1024  # memory that the process released before is reused and does not count: several MB
-    exact, dewarped = (peak_memory(method, 1, 2048, 1024) for method in ("exact", "dewarp"))
-    assert 2 * frame < dewarped < exact < 200 * frame
-    assert peak_memory("detection", 2, 512, 512) > 2 * 4 * 512 * 512
+def test_cases_without_time_are_left_out():
+    results = gpu.rows(defaults(gpu, gpu_sizes=(96,), gpu_stacks=(1, 2), gpu_seconds=0.0))
+    assert [row["left_out"] for row in results[1:]] == ["no time left"] * 7
+    assert any("no time left" in line for line in gpu.lines(results, defaults(gpu)))
 
 
-def test_roofline(monkeypatch):
-    monkeypatch.setattr(roofline, "COPIED", 1 << 22)
-    monkeypatch.setattr(roofline, "MULTIPLIED", 256)
-    chosen = options()
-    results = roofline.rows(chosen)
-    (device,) = (row for row in results if row["part"] == "device")
-    shapes, counted = device["shapes"], {row["step"]: row for row in results if row["part"] == "step"}
-    assert shapes["rows"] == shapes["columns"] == 256
-    assert shapes["frequencies"] == shapes["length"] // 2 + 1
-    # a kernel of six rows and one row for its displacement within a cell: half-width six
-    assert (shapes["taps"], shapes["width"]) == (7, 6)
-    unknowns = shapes["unknowns"] * shapes["frequencies"]
-    assert counted["factors"]["operations"] == 8 * (6 * 6 + 6) * unknowns  # updates of the window, scaling of a row
-    band = 8 * (shapes["unknowns"] + 6) * 13 * shapes["frequencies"]
-    assert counted["factors"]["bytes_least"] == 2 * band
-    assert counted["forward substitution"]["operations"] == (8 * 6 + 2) * unknowns
-    assert counted["back substitution"]["operations"] == 8 * 6 * shapes["unknowns"] * shapes["frequencies"]
-    for row in counted.values():
-        assert 0 < row["bytes_least"] <= row["bytes_moved"]
-    assert device["least_seconds"] <= device["moved_seconds"]
-    moved = sum(row["bytes_moved"] for row in counted.values())
-    assert device["share_of_bandwidth"] == pytest.approx(moved / device["bytes_a_second"] / device["seconds"])
+@pytest.mark.parametrize("name", SECTIONS)
+def test_sections_have_quick_options_of_the_same_names(name):
+    try:
+        section = module_of(name)
+    except ModuleNotFoundError as error:
+        pytest.skip(str(error))
+    assert set(section.QUICK) <= set(section.OPTIONS)
+    assert callable(section.rows)
+    assert callable(section.lines)
+
+
+def test_roll():
+    (row,) = roll.rows(defaults(roll, roll_cases=["none"], roll_size=160, roll_seeds=1))
+    assert {p["axis"] for p in row["parameters"]} == {"x", "y"}
+    assert max(p["rms"] for p in row["parameters"]) < 8
+    assert row["wrong_tones"] == 0
 
 
 def test_results_are_stored_and_read_back(tmp_path):
     rows = [{"name": "a", "values": [1.5, -math.inf, None], "error": math.nan, "pair": (2, "x")}]
-    chosen = options(out=tmp_path, images=[Path("scene.png")])
-    path = write_result("registration", rows, chosen, 12.34, tmp_path)
+    chosen = defaults(pipeline, out=tmp_path, images=[Path("scene.png")])
+    path = write_result("pipeline", rows, chosen, 12.34, tmp_path)
     text = path.read_text()
     assert "NaN" not in text
     assert "Infinity" not in text
     back = read_result(path)
     assert back.rows[0].pop("error") != back.rows[0].get("error")
     assert back.rows == [{"name": "a", "values": [1.5, -math.inf, None], "pair": [2, "x"]}]
-    assert (back.section, back.version, back.seconds) == ("registration", rsv.__version__, 12.3)
+    assert (back.section, back.version, back.seconds) == ("pipeline", rsv.__version__, 12.3)
     assert (back.options.size, back.options.images) == (256, ["scene.png"])
     assert not hasattr(back.options, "out")
     assert back.machine["torch"] == torch.__version__
@@ -148,22 +117,30 @@ def test_the_page_of_the_documentation_is_up_to_date():
         assert benchmark_page.PAGE.read_text() == benchmark_page.page_text(benchmark_page.RESULTS)
 
 
-def test_one_command_writes_markdown_and_json(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(sys, "argv", ["benchmark.py", "--out", str(tmp_path), "--size", "224", "--runs", "1"])
-    sys.argv += ["--only", "registration", "--device", "cpu"]
+def test_one_command_writes_markdown_and_json(tmp_path, capsys):
     threads = torch.get_num_threads()
     try:
-        benchmark.main()
+        benchmark.main(["--out", str(tmp_path), "--only", "gpu", "--quick", "--gpu-sizes", "96", "--gpu-stacks", "1"])
     finally:
         torch.set_num_threads(threads)
-    summary = json.loads((tmp_path / "registration.json").read_text())
+    summary = json.loads((tmp_path / "gpu.json").read_text())
     assert summary["machine"]["torch"] == torch.__version__
     assert {"OpenCV", "SciPy", "scikit-image", "Kornia"} < set(summary["machine"]["libraries"])
-    assert len(summary["rows"]) == 7
+    assert summary["options"]["gpu_stacks"] == [1]
+    rate, *cases = summary["rows"]
+    assert rate["bytes_a_second"] > 1e8
+    works = ["tracker, dewarp", "detection", "restoration, exact", "restoration, dewarp"]
+    assert [row["work"] for row in cases] == works
+    for row in cases:
+        assert row["seconds"] > 0
+        assert 0 < row["transfers"] < row["operations"]
     text = (tmp_path / "benchmark.md").read_text()
     assert text in capsys.readouterr().out + "\n"
-    assert "skimage" in text
-    assert rsv.__version__
+    assert sum(line.startswith("| cpu | 96² | 1 |") for line in text.splitlines()) == 4
+
+
+def test_a_table_has_a_line_for_each_row():
+    assert table(("a", "b"), [(1, "x")]) == ["| a | b |", "| --- | --- |", "| 1 | x |", ""]
 
 
 def test_live():
@@ -182,8 +159,7 @@ def test_live():
 
 
 def test_video():
-    chosen = options(video_rows=180, video_frames=12)
-    results = video.rows(chosen)
+    results = video.rows(defaults(video))
     taken, exact, dewarp = results
     for row in (exact, dewarp):
         assert row["psnr"][0] > taken["psnr"][0] + 10  # dB, of luma

@@ -34,6 +34,14 @@ def test_every_page_is_in_the_navigation(docs, tmp_path):
     assert set(reference) == {"configuration.md", "commands.md"} | {f"api/{name}.md" for name in docs["public_names"]()}
 
 
+def test_pages_are_plain_markdown():
+    """Without admonitions, tabs, icons, attribute lists and macros of a builder, so that another one can be used."""
+    special = re.compile(r"^(?:!!!|\?\?\?|===) |:(?:material|octicons|fontawesome)-|\{: |\{%|--8<--", re.MULTILINE)
+    pages = [*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")]
+    assert len(pages) > 20
+    assert [path.name for path in pages if special.search(path.read_text(encoding="utf-8"))] == []
+
+
 def test_names_in_a_given_order_come_first(docs):
     assert docs["ordered"](["new", "b", "a"], ("b", "a")) == ["b", "a", "new"]
 

@@ -2,7 +2,6 @@
 
 import re
 import runpy
-import sys
 from pathlib import Path
 
 import pytest
@@ -63,8 +62,7 @@ def test_help_is_the_docstring(script, capsys):
     assert "Printed:" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "scripts" / "trials").glob("*.py")), ids=lambda path: path.stem)
-def test_trials_can_be_imported(path, monkeypatch):
-    """Trials need recordings that are not part of the project; here only their imports are executed."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    assert callable(runpy.run_path(str(path), run_name="trial")["main"])
+def test_recordings_that_are_missing_are_named(capsys, tmp_path):
+    """The recordings are not part of the project."""
+    assert runpy.run_path(str(ROOT / "scripts" / "recordings.py"))["main"]([str(tmp_path), "--only", "eye"]) == 2
+    assert "revas missing" in capsys.readouterr().err

@@ -1,20 +1,20 @@
-"""The gallery: every picture is on the page, and those with short computations are drawn."""
+"""The figures of the documentation: every figure is on a page, and those with short computations are drawn."""
 
-import runpy
-import sys
 from pathlib import Path
 
 import cv2
+import figures
 
-ROOT = Path(__file__).parents[1]
+DOCS = Path(__file__).parents[1] / "docs"
 
 
-def test_pictures_are_drawn_and_on_the_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["gallery.py", "--out", str(tmp_path), "--only", "kernels", "training_data"])
-    script = runpy.run_path(str(ROOT / "scripts" / "gallery.py"), run_name="gallery")
-    script["main"]()
-    for name in ("kernels", "training_data"):
+def test_figures_are_drawn_and_on_a_page(tmp_path):
+    short = ("gallery/kernels", "gallery/training_data")
+    figures.main(["--out", str(tmp_path), "--only", *short])
+    for name in short:
         assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 10
-    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
-    assert sorted(path.stem for path in (ROOT / "docs" / "gallery").glob("*.png")) == sorted(script["PICTURES"])
-    assert all(f"](gallery/{name}.png)" in page for name in script["PICTURES"])
+    assert {path.stem for path in (DOCS / "gallery").glob("*.png")} == {
+        name.removeprefix("gallery/") for name in figures.PICTURES if "/" in name
+    }
+    pages = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    assert all(f"]({name}.png)" in pages for name in figures.PICTURES)

@@ -186,6 +186,10 @@ def formats():
     return [backend.fp32_precision for backend in backends]
 
 
+# PyTorch 2.9 warns where the earlier and the newer names of these settings are used together
+MIXED_NAMES = pytest.mark.filterwarnings("ignore:Please use the new API settings:UserWarning")
+
+
 @pytest.fixture
 def short_products():
     """Allow float32 products in formats of lower precision."""
@@ -195,6 +199,7 @@ def short_products():
     torch.set_float32_matmul_precision(before)
 
 
+@MIXED_NAMES
 def test_products_have_full_precision_and_settings_are_restored(short_products):
     allowed = formats()
     assert allowed != ["ieee"] * 3
@@ -210,6 +215,7 @@ def test_products_have_full_precision_and_settings_are_restored(short_products):
     assert torch.get_float32_matmul_precision() == "medium"
 
 
+@MIXED_NAMES
 def test_overlapping_threads_restore_the_settings(short_products):
     allowed, begun, ended = formats(), threading.Event(), threading.Event()
 

@@ -9,11 +9,10 @@ import pytest
 import reproduce
 from benchmarks.independent_camera import Shake, fine_rows
 from edge_truth import draw_edge, gaussian, through_pixels
-from reproduction.camera import PITCH, Scene, take_frames
 from reproduction.esfr import crossing, straight_edge_mtf
 from reproduction.paper import AMPLITUDE, DETECTED, PERIOD, RESTORED
-from reproduction.targets import shake_of
-from reproduction.trials import detection_values
+from reproduction.scenes import PITCH, Scene, shake_of, take_frames
+from reproduction.trials import GlobalShutter, detection_values
 
 import rsvib_torch as rsv
 
@@ -31,8 +30,8 @@ def test_frames_of_the_camera_equal_the_integral_of_a_wave(wave, row_time):
     shake = Shake(
         np.array([[1.3], [2.1]]), np.array([[50.0], [30.0]]), np.array([[0.4], [1.3]]), np.array([40.0, -30.0])
     )
-    timing = {"row_time": row_time, "exposure_time": 8e-4, "frame_period": 0.012}
-    frames = take_frames(Scene(samples, fine_rows(samples, 4), still, margin), shake, num_frames=2, **timing)
+    timing = GlobalShutter(row_time, 8e-4, 0.012)
+    frames = take_frames(Scene(samples, fine_rows(samples, 4), still, margin), shake, timing, 2)
     assert frames.shape == (2, *size)
     rows, columns = np.arange(size[0]), np.arange(size[1])
     for p in range(2):
@@ -109,9 +108,5 @@ def test_small_run(tmp_path, capsys):
     for title in ("Table 2", "Table 3", "Table 4", "MTF", "Push-scan", "50 Hz from 24 frames per second"):
         assert re.search(rf"^## {title}", text, re.MULTILINE)
     assert "nan" not in text
-    page = (out / "reproduction.html").read_text(encoding="utf-8")
-    sources = re.findall(r'src="([^"]{0,20})', page)
-    assert len(sources) > 15
-    assert all(source.startswith("data:image/") for source in sources)
-    for name in ("figure_4", "figure_5", "figure_6a_default", "figure_7", "figure_8", "figure_9", "sampling"):
+    for name in ("detection_errors", "global_shutter"):
         assert (out / f"{name}.png").stat().st_size > 5000

@@ -31,6 +31,7 @@ __all__ = ["calls", "trials"]
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _REFUSED = (ValueError, TypeError, OSError)
 _NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
+_OF_THE_PACKAGE = {"mapped", "refused"}  # methods that only the package calls
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ def _methods(value: Any, **arguments: Any) -> dict[str, Call]:
     """All public methods of an object whose arguments are known by name."""
     calls = {}
     for name, method in inspect.getmembers(value, callable):
-        if name.startswith("_") or name == "mapped" or not getattr(method, "__module__", "").startswith("rsvib_torch"):
+        of_package = str(getattr(method, "__module__", "")).startswith("rsvib_torch")
+        if name.startswith("_") or name in _OF_THE_PACKAGE or not of_package:
             continue
         parameters = inspect.signature(method).parameters
         known = {key: arguments[key] for key in parameters if key in arguments}
@@ -63,7 +65,7 @@ def _methods(value: Any, **arguments: Any) -> dict[str, Call]:
 
 
 @cache
-def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
+def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all parameters
     """Valid calls of everything in ``rsvib_torch.__all__``, by name."""
     folder.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator("cpu").manual_seed(0)
@@ -88,6 +90,9 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     counts = (frames * 4095).round().clamp(0, 4095).numpy().astype(np.uint16)
     stack, motion_file = folder / "frames.npy", folder / "motion.csv"
     rsv.write_stack(stack, frames, dtype="float32")
+    video = folder / "frames.mkv"
+    of_video = rsv.StackInfo(tuple(frames.shape), "uint8", 255.0, frame_rate=96.0)
+    rsv.write_stack(video, frames.clamp(0, 1), dtype="uint8", like=of_video)
     lines = [f"{t:.9g},{x:.9g},{y:.9g}" for t, (x, y) in zip(times.tolist(), path.tolist(), strict=True)]
     motion_file.write_text("\n".join(["time,x,y", *lines]))
     rates_file = folder / "rates.csv"
@@ -137,417 +142,140 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     slanted = rsv.SlantedEdge(0, 0, 64, 48, 5.0, True, "right", 0.6)
     info = rsv.read_stack_info(stack)
     figure = rsv.motion_figure(vibration)
-    common: dict[str, Any] = {"times": times, "starts": times, "later_starts": times + 0.01, "exposure_time": 6e-4}
-    common |= {"duration": 6e-4, "interval": 0.0104, "first": 0.0, "last": 0.03, "timing": timing, "order": [1, 0]}
-    common |= {"signs": [1.0, -1.0], "size": 2, "device": "cpu", "path": folder / "out.json", "offset": 0.001}
-    common |= {"scale": 1.0, "gain": (1.0, 1.0), "displacement": path, "spacing": 5e-4, "motions": [recorded, recorded]}
+    tracker = rsv.VibrationTracker(rsv.SensorTiming(1e-4, 6, 104), window=2)
+    tracked = [tracker.update(frame) for frame in frames][-1]
+    isd = rsv.camera_isd(rsv.Camera(2e6), (96, 64), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
     camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
-    common |= {"vibrations": [vibration, vibration], "camera": camera, "axes": 3}
-    common |= {"components": torch.zeros(2, 3, dtype=torch.float64)}
-    common |= {"batch_shape": (2,), "frequency": torch.tensor([0.1, 0.2], dtype=torch.float64), "num_rows": 96}
-    common |= {"num_frames": 3, "line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0}
-    common |= {"height": 24, "width": 16, "frames": frames, "generator": torch.Generator("cpu").manual_seed(1)}
-    common |= {"scene": scene, "u": times * 10, "v": times * 10, "input": frames[:, None], "image": image}
-    common |= {"vibration": vibration, "index": 0, "count": 3, "shape": (3, 96, 64), "dtype": "float32"}
-    common |= {"start": times, "end": times + 0.01, "reference": 0.01}
-    common |= {"frame": frames[0].numpy(), "x": scene, "y": frames[0], "scene_shape": (160, 128), "tones": None}
-    frames_call = {"frames": frames, "timing": timing, "full_scale": None, "channels": None, "ignore": None}
-    result = {
-        "align_motion": Call(
-            rsv.align_motion,
-            {
-                "frames": frames,
-                "timing": timing,
-                "recorded": recorded,
-                "offsets": (-0.001, 0.001),
-                "fit_scale": True,
-                "fit_gain": True,
-                **bands,
-            },
-        ),
-        "blind_frequencies": Call(rsv.blind_frequencies, {"timing": timing, "highest": 500.0}),
-        "calibrate_row_time": Call(
-            rsv.calibrate_row_time,
-            {
-                "frames": stripes,
-                "flicker_frequency": 1000.0,
-                "frame_rate": 30.0,
-                "on_fraction": None,
-                "light_contrast": None,
-                "scan_axis": "y",
-                "gamma": 1.0,
-                "full_scale": None,
-                "channels": None,
-            },
-        ),
-        "calibrate_row_time_by_exposure": Call(
-            rsv.calibrate_row_time_by_exposure,
-            {"frames": stripes, "exposure_times": [1e-3, 2.5e-4], "scan_axis": "y", "gamma": 1.0, "full_scale": None},
-        ),
-        "calibrate_row_time_by_motion": Call(
-            rsv.calibrate_row_time_by_motion,
-            {"frames": frames, "frame_rate": 30.0, "row_time": (5e-5, 2e-4), "scan_axis": "y", "full_scale": None},
-        ),
-        "check_motion": Call(rsv.check_motion, {"frames": frames, "timing": timing, "motion": recorded, **bands}),
-        "comparison_figure": Call(
-            rsv.comparison_figure,
-            {"raw": frames[0], "restored": restored[0], "count": 2, "size": 32, "names": ("input", "restored")},
-        ),
-        "detect_motion": Call(rsv.detect_motion, {**frames_call, "knot_rows": 24, "iterations": 1, **bands}),
-        "detect_swept_tone": Call(rsv.detect_swept_tone, {**frames_call, "iterations": 1, **bands}),
-        "detect_vibration": Call(
-            rsv.detect_vibration,
-            {
-                **frames_call,
-                "model": "tones",
-                "method": "bands",
-                "tones": 1,
-                "harmonics": 1,
-                "image_acceleration": False,
-                "columns": None,
-                "window": None,
-                "window_step": None,
-                "registration": "ncc",
-                **bands,
-            },
-        ),
-        "detect_vibration direct": Call(rsv.detect_vibration, {**frames_call, **bands}),
-        "find_slanted_edges": Call(
-            rsv.find_slanted_edges, {"image": image, "min_length": 32, "max_length": 64, "min_contrast": 0.1}
-        ),
-        "gain_figure": Call(rsv.gain_figure, {"result": detected, "timing": timing}),
-        "iterate_stack": Call(
-            lambda **given: list(rsv.iterate_stack(**given)), {"source": stack, "timing": timing, **windows}
-        ),
-        "judge_restoration": Call(
-            rsv.judge_restoration, {"frames": frames, "restored": restored, "timing": timing, "vibration": vibration}
-        ),
-        "motion_figure": Call(rsv.motion_figure, {"motion": vibration, "first": 0.0, "last": 0.1}),
-        "mtf_figure": Call(rsv.mtf_figure, {"curves": {"raw": [curve], "restored": [curve]}}),
-        "offset_endpoint_error": Call(
-            rsv.offset_endpoint_error, {"measured": path, "truth": path * 0.9, "reduction": "mean"}
-        ),
-        "offset_figure": Call(rsv.offset_figure, {"result": detected}),
-        "open_stack": Call(rsv.open_stack, {"path": stack}),
-        "predict_noise_gain": Call(
-            rsv.predict_noise_gain, {"frames": frames, "timing": timing, "vibration": vibration, "method": "dewarp"}
-        ),
-        "restoration_mtf": Call(rsv.restoration_mtf, {"frames": frames, "timing": timing, "vibration": vibration}),
-        "process_stack": Call(
-            rsv.process_stack,
-            {
-                "source": stack,
-                "sink": folder / "new.npy",
-                "timing": timing,
-                "bad_frames": "pass",
-                "compression": None,
-                "resume": False,
-                "manifest": None,
-                "given": None,
-                "scheduler": None,
-                "progress": None,
-                **windows,
-            },
-        ),
-        "psf_figure": Call(rsv.psf_figure, {"vibration": vibration, "timing": timing, "num_rows": 96}),
-        "psnr": Call(rsv.psnr, {"image": restored, "reference": frames, "data_range": 1.0, "rim": 4}),
-        "read_manifest": Call(rsv.read_manifest, {"path": folder / "out.npy.manifest.json"}),
-        "read_motion": Call(
-            rsv.read_motion,
-            {"path": motion_file, "unit": "rad", "focal_length": 100.0, "time_unit": "s", "signs": (1.0, -1.0)},
-        ),
-        "read_gyroscope": Call(rsv.read_gyroscope, {"path": rates_file, "unit": "rad/s", "time_unit": "s"}),
-        "read_stack": Call(rsv.read_stack, {"path": stack, "full_scale": None}),
-        "read_stack_info": Call(rsv.read_stack_info, {"path": stack}),
-        "read_vibration": Call(rsv.read_vibration, {"path": folder / "vibration.json", "timing": timing}),
-        "register_bands": Call(rsv.register_bands, {**frames_call, "method": "ncc", **bands}),
-        "register_bands phase": Call(
-            rsv.register_bands, {"frames": frames, "timing": timing, "method": "phase", **bands}
-        ),
-        "register_bands projection": Call(
-            rsv.register_bands, {"frames": frames, "timing": timing, "method": "projection", **bands}
-        ),
-        "restore": Call(
-            rsv.restore,
-            {
-                **frames_call,
-                "vibration": vibration,
-                "method": "exact",
-                "saturation": "auto",
-                "check": True,
-                "joint": False,
-                "prior": "gaussian",
-                "noise": "auto",
-                "regularisation": 1.0,
-                "chunk_frequencies": None,
-                "segments": None,
-            },
-        ),
-        "restore banded": Call(
-            rsv.restore,
-            {
-                "frames": frames,
-                "timing": timing,
-                "vibration": vibration,
-                "method": "banded",
-                "half_rows": 8,
-                "stride": 8,
-                "interpolation": "cubic",
-                "noise_to_signal": "auto",
-                "chunk_rows": None,
-                "check": False,
-            },
-        ),
-        "restore dewarp": Call(
-            rsv.restore,
-            {
-                "frames": frames,
-                "timing": timing,
-                "vibration": detected,
-                "method": "dewarp",
-                "chunk_rows": 64,
-                "check": False,
-            },
-        ),
-        "restore richardson-lucy": Call(
-            rsv.restore,
-            {
-                "frames": frames,
-                "timing": timing,
-                "vibration": vibration,
-                "method": "richardson-lucy",
-                "joint": False,
-                "iterations": 2,
-                "check": False,
-            },
-        ),
-        "restore_block": Call(
-            rsv.restore_block, {"frames": counts, "timing": timing, **options, "full_scale": 4095.0, "channels": None}
-        ),
-        "row_psf": Call(
-            rsv.row_psf,
-            {
-                "vibration": vibration,
-                "starts": timing.row_starts(1, 96)[0],
-                "timing": timing,
-                "interpolation": "linear",
-                "quadrature": "midpoint",
-                "num_nodes": 4,
-            },
-        ),
-        "rows_figure": Call(rsv.rows_figure, {"vibration": vibration, "timing": timing, "num_rows": 96}),
-        "save_figure": Call(rsv.save_figure, {"figure": figure, "path": folder / "figure.png", "dpi": 20}),
-        "simulate_frames": Call(
-            rsv.simulate_frames,
-            {
-                "scene": scene,
-                "timing": timing,
-                "vibration": vibration,
-                "num_frames": 2,
-                "frame_size": (64, 48),
-                "noise": sensor_noise,
-                "generator": torch.Generator("cpu").manual_seed(1),
-            },
-        ),
-        "slanted_edge_mtf": Call(rsv.slanted_edge_mtf, {"roi": edge}),
-        "ssim": Call(rsv.ssim, {"image": restored, "reference": frames, "data_range": 1.0, "rim": 4}),
-        "timing_from_first_frame": Call(rsv.timing_from_first_frame, {"timing": timing, "info": info}),
-        "trusted_vibration": Call(
-            rsv.trusted_vibration, {"detected": detected, "timing": timing, "num_frames": 3, "num_rows": 96}
-        ),
-        "visible_pixels": Call(
-            rsv.visible_pixels, {"timing": timing, "vibration": vibration, "size": (96, 64), "num_frames": 3}
-        ),
-        "windows_figure": Call(
-            rsv.windows_figure, {"times": [0.0], "detections": [detected], "time_label": "start (s)"}
-        ),
-        "camera_isd": Call(
-            rsv.camera_isd,
-            {
-                "camera": rsv.Camera(2e6),
-                "size": (96, 64),
-                "position": (6878.0, 0.0, 0.0),
-                "look": (-1.0, 0.0, 0.0),
-                "radii": (6378.0, 6357.0),
-                "ephemeris_time": 0.0,
-            },
-        ),
-        "sampling_map": Call(
-            rsv.sampling_map, {"motion": vibration, "timing": timing, "size": (96, 64), "num_frames": 2}
-        ),
-        "write_gcsv": Call(
-            rsv.write_gcsv,
-            {
-                "path": folder / "rates.gcsv",
-                "motion": vibration.with_camera(rsv.Camera(900.0)),
-                "timing": timing,
-                "size": (96, 64),
-                "num_frames": 2,
-                "sample_rate": None,
-            },
-        ),
-        "write_isd": Call(
-            rsv.write_isd,
-            {
-                "path": folder / "isd.json",
-                "motion": vibration,
-                "timing": timing,
-                "isd": rsv.camera_isd(rsv.Camera(2e6), (96, 64), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0)),
-                "frame": 1,
-                "model": "auto",
-                "tolerance": 0.005,
-            },
-        ),
-        "write_stmap": Call(
-            rsv.write_stmap,
-            {
-                "folder": folder / "maps",
-                "motion": vibration,
-                "timing": timing,
-                "size": (96, 64),
-                "num_frames": 2,
-                "convention": "nuke",
-            },
-        ),
-        "write_offsets": Call(rsv.write_offsets, {"path": folder / "offsets.csv", "result": detected}),
-        "write_stack": Call(
-            rsv.write_stack,
-            {
-                "path": folder / "written.tif",
-                "frames": frames,
-                "channels": None,
-                "dtype": "float32",
-                "full_scale": None,
-                "compression": None,
-                "like": info,
-            },
-        ),
-        "write_vibration": Call(
-            rsv.write_vibration, {"path": folder / "written.json", "result": detected, "timing": timing}
-        ),
-        "write_windows": Call(rsv.write_windows, {"path": folder / "windows.csv", "manifest": manifest}),
-        "FreeMotion": Call(
-            rsv.FreeMotion, {"coefficients": recorded.coefficients, "start": 0.0, "spacing": 5e-4, "tones": vibration}
-        ),
-        "RollingShutterVibration": Call(
-            rsv.RollingShutterVibration,
-            {
-                "timing": timing,
-                "amplitude": (0.5, 2.0),
-                "frequency": (40.0, 200.0),
-                "phase": (-3.0, 3.0),
-                "image_motion": 0.0,
-                "exposure_rows": (4.0, 8.0),
-                "tones": 1,
-                "interpolation": "cubic",
-                "p": 0.5,
-                "same_on_batch": False,
-                "keepdim": False,
-            },
-        ),
-        "RollingShutterVibration.forward": Call(augmentation, {"input": frames[:, None]}),
-        "RollingShutterVibration.drawn_vibration": Call(augmentation.drawn_vibration, {"params": None}),
-        "RowVaryingBlur": Call(
-            rsv.RowVaryingBlur, {"psf": psf, "frame_width": 64, "origin": (4, 4), "scene_size": (160, 128)}
-        ),
-        "SensorTiming": Call(
-            rsv.SensorTiming,
-            {
-                "row_time": 1e-4,
-                "exposure_rows": 6.0,
-                "frame_rows": 104.0,
-                "scan_axis": "y",
-                "readout_direction": "forward",
-                "frame_start_times": (0.0, 0.0104, 0.021),
-            },
-        ),
-        "Vibration": Call(
-            rsv.Vibration,
-            {
-                "amplitude": vibration.amplitude,
-                "frequency": [130.0, 170.0],
-                "phase": 0.3,
-                "image_motion": (5.0, 3.0),
-                "image_acceleration": (0.0, 0.0),
-                "image_shift": (0.0, 0.0),
-            },
-        ),
-        "VibrationDetector": Call(
-            rsv.VibrationDetector, {"timing": timing, "model": "tones", "method": "bands", "tones": 1, **bands}
-        ),
-        "VibrationRestorer": Call(
-            rsv.VibrationRestorer,
-            {
-                "timing": timing,
-                "method": "exact",
-                "full_scale": None,
-                "channels": None,
-                "saturation": "auto",
-                "check": True,
-                "joint": False,
-            },
-        ),
-        "VibrationDetector.forward": Call(detector, {"frames": frames}),
-        "VibrationRestorer.forward": Call(restorer, {"frames": frames, "vibration": vibration, "ignore": None}),
+    components = torch.zeros(2, 3, dtype=torch.float64)
+    # values of the parameters of all functions and methods, by name
+    pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **bands}
+    pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info, "manifest": manifest}
+    pool |= {"detected": detected, "result": detected, "restored": restored, "figure": figure, "psf": psf}
+    pool |= {"scene": scene, "noise": sensor_noise, "image": image, "reference": image, "roi": edge, "rim": 4}
+    pool |= {"data_range": 1.0, "raw": frames[0], "measured": path, "truth": path * 0.9, "curves": {"raw": [curve]}}
+    pool |= {"times": times, "starts": times, "later_starts": times + 0.01, "start": times, "end": times + 0.01}
+    pool |= {"exposure_time": 6e-4, "duration": 6e-4, "interval": 0.0104, "first": 0.0, "last": 0.03, "highest": 500.0}
+    pool |= {"order": [1, 0], "signs": [1.0, -1.0], "device": "cpu", "path": stack, "offset": 0.001, "scale": 1.0}
+    pool |= {"gain": (1.0, 1.0), "factor": 1.5, "displacement": path, "spacing": 5e-4, "motions": [recorded, recorded]}
+    pool |= {"vibrations": [vibration, vibration], "axes": 3, "components": components, "batch_shape": (2,)}
+    pool |= {"frequency": torch.tensor([0.1, 0.2], dtype=torch.float64), "num_rows": 96, "num_frames": 3}
+    pool |= {"line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0, "size": (96, 64)}
+    pool |= {"height": 24, "width": 16, "u": times * 10, "v": times * 10, "input": frames[:, None], "index": 0}
+    pool |= {"count": 2, "shape": (3, 96, 64), "dtype": "float32", "frame": frames[0].numpy(), "x": scene}
+    pool |= {
+        "y": frames[0],
+        "scene_shape": (160, 128),
+        "tones": None,
+        "flicker_frequency": 1000.0,
+        "isd": isd,
+        "results": [detected.std] * 2,
+        "images": frames,
     }
+    pool |= {"visible": torch.ones(96, 64, dtype=torch.bool), "other": rsv.Margins(1, 2, 3, 4), "place": torch.zeros(2)}
+    pool |= {"stated": timing, "agreeing": timing}
+    pool |= {"exposure_times": [1e-3, 2.5e-4], "frame_rate": 30.0, "detections": [detected], "source": stack}
+
+    def call(function: Callable[..., Any], **others: Any) -> Call:
+        """A valid call: all parameters, with these values, those of the pool, or their defaults."""
+        known = {
+            name: others.get(name, pool.get(name, one.default))
+            for name, one in inspect.signature(function).parameters.items()
+            if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+        }
+        return Call(function, others | {name: value for name, value in known.items() if value is not inspect._empty})
+
+    fast = {"method": "bands", "tones": 1}
+    new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "rates.gcsv", "isd.json", "maps")}
+    of_isd = {"camera": rsv.Camera(2e6), "position": (6878.0, 0.0, 0.0), "look": (-1.0, 0.0, 0.0)}
+    with_camera = vibration.with_camera(rsv.Camera(900.0))
+    different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
+        "align_motion": {"camera": None, "fit_gain": True},
+        "calibrate_row_time": {"frames": stripes},
+        "calibrate_row_time_by_exposure": {"frames": stripes},
+        "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4), "recorded": None, "offsets": None},
+        "camera_isd": of_isd,
+        "comparison_figure": {"size": 32, "restored": restored[0]},
+        "detect_motion": {"iterations": 1},
+        "detect_swept_tone": {"iterations": 1},
+        "detect_vibration": fast,
+        "iterate_stack": windows,
+        "motion_figure": {"motion": vibration, "last": 0.1},
+        "process_stack": {"sink": new["new.npy"], **windows},
+        "process_video": {"source": video, "sink": new["new.mkv"], "restoration": {"method": "dewarp"}},
+        "psnr": {"image": restored, "reference": frames},
+        "read_gyroscope": {"path": rates_file, "unit": "rad/s", "time_unit": "s"},
+        "read_manifest": {"path": folder / "out.npy.manifest.json"},
+        "read_motion": {"path": motion_file, "unit": "rad", "focal_length": 100.0},
+        "read_vibration": {"path": folder / "vibration.json"},
+        "restore_block": {"frames": counts, **options, "full_scale": 4095.0},
+        "row_psf": {"starts": timing.row_starts(1, 96)[0], "num_nodes": 4},
+        "sampling_map": {"motion": vibration},
+        "save_figure": {"path": new["figure.png"], "dpi": 20},
+        "simulate_frames": {"frame_size": (64, 48), "num_frames": 2, "generator": generator},
+        "ssim": {"image": restored, "reference": frames},
+        "windows_figure": {"times": [0.0]},
+        "write_gcsv": {"path": new["rates.gcsv"], "motion": with_camera, "num_frames": 2},
+        "write_isd": {"path": new["isd.json"], "motion": vibration, "frame": 1},
+        "write_offsets": {"path": folder / "offsets.csv"},
+        "write_stack": {"path": folder / "written.tif", "like": info},
+        "write_stmap": {"folder": new["maps"], "motion": vibration},
+        "write_vibration": {"path": folder / "written.json"},
+        "write_windows": {"path": folder / "windows.csv"},
+    }
+    functions = {name: getattr(rsv, name) for name in rsv.__all__ if inspect.isfunction(getattr(rsv, name))}
+    result = {name: call(function, **different.get(name, {})) for name, function in functions.items()}
+    iterate = functions["iterate_stack"]
+    result["iterate_stack"] = Call(lambda **given: list(iterate(**given)), result["iterate_stack"].arguments)
+    result["detect_vibration direct"] = call(rsv.detect_vibration)
+    for method in ("phase", "projection"):
+        result[f"register_bands {method}"] = call(rsv.register_bands, method=method)
+    methods: dict[str, dict[str, Any]] = {
+        "exact": {"joint": False, "prior": "gaussian", "noise": "auto", "regularisation": 1.0, "segments": None},
+        "banded": {"half_rows": 8, "stride": 8, "interpolation": "cubic", "noise_to_signal": "auto"},
+        "dewarp": {"vibration": detected, "chunk_rows": 64},
+        "richardson-lucy": {"joint": False, "iterations": 2},
+    }
+    for method, chosen in methods.items():
+        result[f"restore {method}"] = call(rsv.restore, method=method, check=method == "exact", **chosen)
     augmentation(frames[:, None])
-    for value in (
-        alignment,
-        rates,
-        rotation,
-        detected,
-        check,
-        free,
-        curve,
-        detected.offsets,
-        optics,
-        verdict,
-        calibration,
-        sensor_noise,
-        camera,
-        slanted,
-        info,
-        swept,
-        detected.std,
-    ):
-        result[type(value).__name__] = _with_fields(value)
+    constructed: dict[str, Call] = {
+        "FreeMotion": call(rsv.FreeMotion, coefficients=recorded.coefficients, start=0.0, tones=vibration),
+        "RollingShutterVibration": call(
+            rsv.RollingShutterVibration,
+            amplitude=(0.5, 2.0),
+            frequency=(40.0, 200.0),
+            exposure_rows=(4.0, 8.0),
+            tones=1,
+        ),
+        "RowVaryingBlur": call(rsv.RowVaryingBlur, frame_width=64, origin=(4, 4), scene_size=(160, 128)),
+        "SensorTiming": _with_fields(timing),
+        "Vibration": call(
+            rsv.Vibration, amplitude=vibration.amplitude, frequency=[130.0, 170.0], image_motion=(5.0, 3.0)
+        ),
+        "VibrationDetector": call(rsv.VibrationDetector, **fast),
+        "VibrationRestorer": call(rsv.VibrationRestorer, joint=False),
+        "VideoBorder": call(rsv.VideoBorder),
+        "VibrationTracker": call(rsv.VibrationTracker, timing=rsv.SensorTiming(1e-4, 6, 104)),
+    }
+    result |= constructed
+    modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
+    for name, module in modules.items():
+        result[f"{name}.forward"] = call(module.forward)
+    result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
-    result["StackReport"] = _with_fields(report)
-    for value in (
-        vibration,
-        recorded,
-        timing,
-        detected,
-        detected.std,
-        detected.offsets,
-        free,
-        swept,
-        check,
-        alignment,
-        rates,
-        rotation,
-        curve,
-        optics,
-        camera,
-        sensor_noise,
-        verdict,
-        calibration,
-        slanted,
-        info,
-        report,
-    ):
-        result |= _methods(value, **common)
-    images: dict[str, dict[str, Any]] = {"forward": {"scene": scene}, "A": {"x": scene}, "A_adjoint": {"y": frames[0]}}
-    images["adjoint"] = {"frames": frames[0], "scene_shape": (160, 128)}
-    for method, value in images.items():
-        result[f"RowVaryingBlur.{method}"] = Call(getattr(blur, method), value)
-    place = {"x": times[:2], "y": times[2:4]}
-    for name, others in (
-        ("displacement", {"components": common["components"]}),
-        ("factors", {"axes": 3}),
-        ("rays", {}),
-    ):
-        result[f"Camera.{name}"] = Call(getattr(camera, name), place | others)
+    described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
+    described += (tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
+    described += (rsv.TimingDiagnosis("frame_rows", 104.0, 110.0, timing),)
+    described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
+    for value in described:
+        result[type(value).__name__] = _with_fields(value)
+    for value in (vibration, recorded, timing, *described):
+        result |= _methods(value, **pool | {"path": folder / "out.json", "size": 2, "count": 3, "mosaic": "RGGB"})
+    for name, given in (("forward", "scene"), ("A", "x"), ("A_adjoint", "y")):
+        result[f"RowVaryingBlur.{name}"] = Call(getattr(blur, name), {given: pool[given]})
+    result["RowVaryingBlur.adjoint"] = Call(blur.adjoint, {"frames": frames[0], "scene_shape": (160, 128)})
+    for name in ("displacement", "factors", "rays"):
+        result[f"Camera.{name}"] = call(getattr(camera, name), x=times[:2], y=times[2:4])
     missing = set(rsv.__all__) - _NOT_CALLED - {name.partition(" ")[0] for name in result}
     if missing:
         raise LookupError(f"no valid call of {', '.join(sorted(missing))}")

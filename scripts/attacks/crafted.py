@@ -34,7 +34,6 @@ __all__ = ["CASES", "crafted", "trials"]
 _CPU_SECONDS, _SECONDS, _BYTES = 20.0, 90.0, 2 * 10**9  # limits of one file; others may use the processor
 _TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
 _CAMERA = "[sensor]\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 104\nfull_scale = 4095\n"
-_HUGE = (2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1)
 _DEEP = 20_000
 
 # A case writes a file into a folder and returns its path. The reader follows from the ending: a stack, a configuration,
@@ -84,27 +83,16 @@ def _npy(shape: str, dtype: str = "'<u2'", order: str = "False", held: int = 100
 for _order, _shape in product(
     ("False", "True"),
     (
-        *("(1000000000000, 64, 64)", "(2, 4294967296, 4294967296)", "(9223372036854775807, 2, 2)", "(2, 0, 4)"),
-        *("(1, 1, 1)", "(-5, 8, 8)", f"({'9' * 400}, 8, 8)", f"({'2, ' * 60})", "(True, 8, 8)", "(8.0, 8, 8)", "()"),
+        *("(1000000000000, 64, 64)", "(9223372036854775807, 2, 2)", "(2, 0, 4)", "(-5, 8, 8)", f"({'9' * 400}, 8, 8)"),
+        *(f"({'2, ' * 60})", "(True, 8, 8)"),
     ),
 ):
     CASES[f"npy: shape {_shape[:30]}, Fortran order {_order}"] = partial(_data, "a.npy", _npy(_shape, order=_order))
-for _dtype in (
-    "'O'",
-    "'<U1000000000'",
-    "'V1000000000'",
-    "[('a', '<u2')]",
-    "('<f4', (100000, 100000))",
-    "'|S0'",
-    "'M8'",
-):
+for _dtype in ("'O'", "'<U1000000000'", "('<f4', (100000, 100000))", "'|S0'"):
     CASES[f"npy: type {_dtype}"] = partial(_data, "a.npy", _npy("(2, 64, 64)", _dtype))
 CASES["npy: nested header"] = partial(_data, "a.npy", _npy("(" * 5000 + ")" * 5000))
 CASES["npy: header of 4 GB"] = partial(_data, "a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
 CASES["npy: sparse file of 64 GB"] = partial(_sparse, "a.npy", _npy("(8, 65536, 65536)"), 2**36 + 1000)
-CASES["npy: sparse file of 64 GB, Fortran order"] = partial(
-    _sparse, "a.npy", _npy("(8, 65536, 65536)", order="True"), 2**36 + 1000
-)
 CASES["npy: 10^8 frames of one pixel"] = partial(_sparse, "a.npy", _npy("(100000000, 1, 1)"), 2 * 10**8 + 1000)
 
 # --- raw ----------------------------------------------------------------------------------------------------------
@@ -117,18 +105,13 @@ def _raw(folder: Path, *, size: int = 1000, **keys: object) -> Path:
     return _sparse("a.raw", b"", size, folder)
 
 
-for _sizes in ([10**9, 64, 64], [2, 10**12, 10**12], [10**400, 2, 2], [0, 8, 8], [-1, 8, 8], [2] * 1000, []):
+for _sizes in ([10**9, 64, 64], [10**400, 2, 2], [-1, 8, 8], [2] * 1000):
     CASES[f"raw: shape {str(_sizes)[:30]}"] = partial(_raw, shape=_sizes)
-for _offset in _HUGE:
+for _offset in (2**32 - 1, 2**64 - 1):
     CASES[f"raw: offset {_offset}"] = partial(_raw, offset=_offset)
 CASES["raw: 10^6 frame times"] = partial(_raw, frame_times=[0.1 * i for i in range(10**6)])
 CASES["raw: sparse file of 64 GB"] = partial(_raw, size=2**36, shape=[8, 65536, 65536])
 CASES["raw: sidecar nested"] = lambda folder: (_raw(folder), _text("a.raw.json", "[" * _DEEP, folder))[0]
-CASES["raw: sidecar nested objects"] = lambda folder: (_raw(folder), _text("a.raw.json", '{"a":' * _DEEP, folder))[0]
-CASES["raw: sidecar with a long number"] = lambda folder: (
-    _raw(folder),
-    _text("a.raw.json", '{"shape": [' + "9" * 10**6 + ", 1, 1]}", folder),
-)[0]
 CASES["raw: sidecar of 2 GB"] = lambda folder: (_raw(folder), _sparse("a.raw.json", b"{", 2 * 10**9, folder))[0]
 
 # --- PNG and JPEG -------------------------------------------------------------------------------------------------
@@ -146,7 +129,7 @@ def _png(width: int, height: int, bits: int = 8, colour: int = 0, pixels: int = 
     return b"\x89PNG\r\n\x1a\n" + head + more + _chunk(b"IDAT", packed + packer.flush()) + _chunk(b"IEND", b"")
 
 
-for _width, _height in ((2**31 - 1, 2**31 - 1), (2**31 - 1, 1), (1, 2**31 - 1), (10**6, 10**6), (0, 0), (2**32 - 1, 9)):
+for _width, _height in ((2**31 - 1, 2**31 - 1), (1, 2**31 - 1), (10**6, 10**6), (0, 0)):
     for _bits, _colour in ((8, 0), (16, 6)):
         CASES[f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}"] = partial(
             _data, "a.png", _png(_width, _height, _bits, _colour)
@@ -170,14 +153,7 @@ def _png_folder(folder: Path) -> Path:
 CASES["PNG: text that expands to 1 GB"] = partial(
     _data, "a.png", _png(16, 16, more=_chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(10**7), 9) * 100))
 )
-CASES["PNG: profile that expands"] = partial(
-    _data, "a.png", _png(16, 16, more=_chunk(b"iCCP", b"a\0\0" + zlib.compress(bytes(10**8), 9)))
-)
 CASES["PNG: chunk of 4 GB"] = partial(_data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"a", 2**32 - 1)))
-CASES["PNG: 10^5 empty chunks"] = partial(_data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"") * 10**5))
-CASES["PNG: full scale of 10^6 digits"] = partial(
-    _data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"full_scale\0" + b"9" * 10**6))
-)
 CASES["PNG: Exif that refers to itself"] = partial(
     _data,
     "a.png",
@@ -193,7 +169,7 @@ def _jpeg(width: int, height: int) -> bytes:
     return data[:start] + struct.pack(">HH", height, width) + data[start + 4 :]
 
 
-for _size in ((65500, 65500), (0, 0), (1, 65535), (12000, 12000)):
+for _size in ((65500, 65500), (0, 0)):
     CASES[f"JPEG: {_size[0]} x {_size[1]} px"] = partial(_data, "a.jpg", _jpeg(*_size))
 
 # --- TIFF ---------------------------------------------------------------------------------------------------------
@@ -215,21 +191,19 @@ def _tiff(more: dict[int, tuple[int, int, int]], following: int = 0, tail: bytes
 
 for _code, _name in (
     *((256, "width"), (257, "length"), (258, "bits"), (259, "compression"), (277, "samples"), (278, "rows per strip")),
-    *((322, "tile width"), (323, "tile length"), (339, "sample format"), (32997, "depth"), (284, "planar")),
+    *((322, "tile width"), (32997, "depth")),
 ):
-    for _value in (0, 2**31 - 1, 2**32 - 1):
+    for _value in (0, 2**32 - 1):
         CASES[f"TIFF: {_name} {_value}"] = partial(_data, "a.tif", _tiff({_code: (4, 1, _value)}))
 for _code, _name in (
-    *((258, "bits"), (273, "strip offsets"), (279, "strip sizes"), (324, "tile offsets"), (270, "description")),
-    *((330, "SubIFDs"), (34665, "Exif"), (34735, "GeoKeys"), (50839, "ImageJ metadata"), (65000, "private tag")),
+    *((273, "strip offsets"), (279, "strip sizes"), (270, "description"), (330, "SubIFDs"), (34735, "GeoKeys")),
 ):
-    for _kind, _count in ((3, 2**31 - 1), (2, 2**32 - 1), (12, 2**29)):
+    for _kind, _count in ((3, 2**31 - 1), (12, 2**29)):
         CASES[f"TIFF: {_name}, type {_kind}, {_count} values"] = partial(
             _data, "a.tif", _tiff({_code: (_kind, _count, 64)})
         )
 CASES["TIFF: the next page is the same"] = partial(_data, "a.tif", _tiff({}, 8))
 CASES["TIFF: SubIFD is the page itself"] = partial(_data, "a.tif", _tiff({330: (4, 1, 8)}))
-CASES["TIFF: Exif is the page itself"] = partial(_data, "a.tif", _tiff({34665: (4, 1, 8), 40965: (4, 1, 8)}))
 CASES["TIFF: the next page lies beyond the end"] = partial(_data, "a.tif", _tiff({}, 2**32 - 2))
 CASES["TIFF: strips of one byte"] = partial(
     _data,
@@ -239,12 +213,8 @@ CASES["TIFF: strips of one byte"] = partial(
 CASES["TIFF: 60000 x 60000 px in tiles of 16"] = partial(
     _data, "a.tif", _tiff({256: (4, 1, 60000), 257: (4, 1, 60000), 322: (3, 1, 16), 323: (3, 1, 16), 273: (4, 0, 0)})
 )
-for _words in ('{"shape": [1000000000, 16, 16]}', '{"shape": [16, 16], "axes": "' + "T" * 10**5 + '"}', "[" * _DEEP):
+for _words in ('{"shape": [1000000000, 16, 16]}', "[" * _DEEP, "ImageJ=1.53\nimages=1000000000\nframes=1000000000\n"):
     CASES[f"TIFF: description {_words[:30]}"] = partial(
-        _data, "a.tif", _tiff({270: (2, len(_words) + 1, 600)}, tail=bytes(474) + _words.encode() + bytes(4096))
-    )
-for _words in ("ImageJ=1.53\nimages=1000000000\nframes=1000000000\n", "ImageJ=1.53\nimages=2\nslices=1000000\n"):
-    CASES[f"TIFF: {_words[12:40]!r}"] = partial(
         _data, "a.tif", _tiff({270: (2, len(_words) + 1, 600)}, tail=bytes(474) + _words.encode() + bytes(4096))
     )
 
@@ -341,13 +311,6 @@ def _groups(file: h5py.File, count: int) -> None:
         file.create_group(f"g{index}")
 
 
-def _mesh(file: h5py.File) -> None:
-    groups = [file.create_group(f"g{i}") for i in range(30)]
-    for group in groups:
-        for index, other in enumerate(groups):
-            group[f"to{index}"] = other
-
-
 def _zeros(file: h5py.File, shape: tuple[int, ...], **options: object) -> None:
     file.create_dataset("frames", shape=shape, dtype="u2", **options)
 
@@ -368,38 +331,23 @@ def _times(file: h5py.File) -> None:
     file.create_dataset("timestamps", shape=(2**40,), dtype="f8", chunks=(1024,))
 
 
-def _virtual_times(file: h5py.File) -> None:
-    file.create_dataset("frames", data=np.zeros((4, 16, 16), "u2"))
-    layout = h5py.VirtualLayout(shape=(4,), dtype="f8")
-    layout[:] = h5py.VirtualSource("/dev/urandom", "a", shape=(4,))
-    file.create_virtual_dataset("timestamps", layout)
-
-
 def _external(file: h5py.File, name: str) -> None:
     file.create_dataset("frames", shape=(4, 16, 16), dtype="u2", external=[(name, 0, h5py.h5f.UNLIMITED)])
 
 
-_ONE = (200, 512, 512)
 for _name, _write in {
     "25 groups linked to the root": partial(_links_to_root, count=25),
-    "1000 groups linked to the root": partial(_links_to_root, count=1000),
-    "30 groups that contain each other": _mesh,
     "2000 groups in each other": partial(_chain, count=2000),
     "20000 groups": partial(_groups, count=20_000),
     "no pixels stored, 2^60 bytes": partial(_zeros, shape=(2**25, 2**17, 2**17)),
-    "no chunks stored": partial(_zeros, shape=(2**25, 2**17, 2**17), chunks=(1, 64, 64)),
     "chunk of 4 GB": partial(_zeros, shape=(100, 4000, 4000), chunks=(100, 4000, 4000), compression="gzip"),
-    "one chunk of 100 MB": partial(_filled, shape=_ONE, chunks=_ONE, compression="gzip"),
     "chunks of 1 x 1 x 1": partial(_filled, shape=(8, 64, 64), chunks=(1, 1, 1)),
     "virtual dataset of a device": partial(_virtual, source="/dev/urandom"),
     "virtual dataset of itself": partial(_virtual, source="a.h5"),
-    "virtual times": _virtual_times,
     "2^40 times": _times,
     "external file /dev/urandom": partial(_external, name="/dev/urandom"),
-    "external file /etc/passwd": partial(_external, name="/etc/passwd"),
     "external link": lambda file: file.__setitem__("frames", h5py.ExternalLink("/dev/urandom", "/a")),
     "soft link to itself": lambda file: file.__setitem__("frames", h5py.SoftLink("/frames")),
-    "only a soft link to a group": lambda file: file.__setitem__("a", h5py.SoftLink("/")),
     "dataset of type object": lambda file: file.create_dataset("frames", data=["a"] * 4, dtype=h5py.string_dtype()),
     "attribute axes of 60 KB": lambda file: file.create_dataset("frames", data=np.zeros((2, 8, 8), "u2")).attrs.update(
         {"axes": "T" * 60_000}
@@ -424,9 +372,9 @@ def _chunks(*shape: int) -> dict[str, object]:
     return {"name": "regular", "configuration": {"chunk_shape": shape}}
 
 
-for _shape3 in ((10**9, 64, 64), (2**62, 2**62, 2**62), (4, 10**6, 10**6), (0, 16, 16), (-1, 16, 16), (10**30, 8, 8)):
+for _shape3 in ((10**9, 64, 64), (4, 10**6, 10**6), (-1, 16, 16), (10**30, 8, 8)):
     CASES[f"Zarr: shape {_shape3}"] = partial(_zarr, shape=_shape3)
-for _parts in ((1, 1, 1), (2**40, 2**40, 2**40), (0, 0, 0), (10**9, 16, 16), (4, 16), (-1, -1, -1)):
+for _parts in ((2**40, 2**40, 2**40), (0, 0, 0), (4, 16)):
     CASES[f"Zarr: chunks {_parts}"] = partial(_zarr, chunk_grid=_chunks(*_parts))
 CASES["Zarr: 10^9 chunks"] = partial(_zarr, held=10**5, shape=(1000, 1000, 1000), chunk_grid=_chunks(1, 1, 1))
 CASES["Zarr: 96 KB that expand to 6.3 GB"] = partial(
@@ -526,21 +474,19 @@ CASES["video: zeros after a header of .ts"] = partial(_sparse, "a.mts", b"G" + b
 
 # --- Pipes, devices, links ----------------------------------------------------------------------------------------
 
-for _ending in (".tif", ".png", ".npy", ".h5", ".raw", ".mp4", ".jpg", ".toml", ".csv", ".vibration.json"):
 
-    def _pipe(folder: Path, name: str = f"a{_ending}") -> Path:
+def _special(name: str, target: str, folder: Path) -> Path:
+    """A pipe, or a link to a device or a file of the system."""
+    if target:
+        (folder / name).symlink_to(target)
+    else:
         os.mkfifo(folder / name)
-        return folder / name
+    return folder / name
 
-    def _device(folder: Path, name: str = f"a{_ending}") -> Path:
-        (folder / name).symlink_to("/dev/urandom")
-        return folder / name
 
-    def _process_file(folder: Path, name: str = f"a{_ending}") -> Path:
-        (folder / name).symlink_to("/proc/self/mem")
-        return folder / name
-
-    CASES[f"pipe {_ending}"], CASES[f"device {_ending}"], CASES[f"/proc {_ending}"] = _pipe, _device, _process_file
+for _ending in (".tif", ".png", ".npy", ".h5", ".raw", ".mp4", ".toml", ".csv", ".vibration.json"):
+    for _name, _target in (("pipe", ""), ("device", "/dev/urandom")):
+        CASES[f"{_name} {_ending}"] = partial(_special, f"a{_ending}", _target)
 
 
 @case("pipe in a folder of images")
@@ -557,7 +503,6 @@ for _name, _words in {
     "nested lists": "x = " + "[" * _DEEP + "]" * _DEEP,
     "nested tables": "x = " + "{a=" * _DEEP + "1" + "}" * _DEEP,
     "key of 20000 parts": "a" + ".a" * _DEEP + " = 1",
-    "table of 20000 parts": "[" + "a." * _DEEP + "a]\nx = 1",
     "tables of 400 depths": "".join(f"[[{'.'.join(['a'] * n)}]]\n" for n in range(1, 400)),
     "10^5 unknown keys": "".join(f"a{n} = 1\n" for n in range(10**5)),
     "number of 10^6 digits": "x = " + "9" * 10**6,

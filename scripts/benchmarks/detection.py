@@ -14,14 +14,37 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks import detection_report
 from benchmarks.detection_cases import CASES, NAMES, PAPER, SMALL, Take, take
 from benchmarks.independent_camera import Array, Shake
+from harness import Rows, table
 
 import rsvib_torch as rsv
 
 NOISES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
 SEED = 11
+OPTIONS = {
+    "detection_method": ("direct", "method of detect_vibration"),
+    "detection_size": ((1024, 512), "rows, columns of the trials"),
+    "detection_noises": (NOISES, "noise levels of full scale"),
+    "detection_scenes": (2, "drawn scenes"),
+    "detection_phases": (4, "draws of the phases"),
+    "detection_repeats": (4, "draws of the noise"),
+    "detection_images": ((), "image files as further scenes", Path),
+    "cases": (False, "also run the held-out cases"),
+    "case_size": ((2048, 1024), "rows, columns of the cases"),
+    "case_scenes": (2, "scenes of each case"),
+    "case_phases": (3, "draws of the phases of each case"),
+}
+QUICK = {
+    "detection_size": (512, 256),
+    "detection_noises": (0.01,),
+    "detection_scenes": 1,
+    "detection_phases": 1,
+    "detection_repeats": 2,
+    "case_size": (512, 256),
+    "case_scenes": 1,
+    "case_phases": 1,
+}
 NEAR = 0.05  # of the frequency; a tone with a larger error is a different one
 
 
@@ -71,7 +94,7 @@ def trial(taken: Take, noise: float, seed: int, method: str) -> dict[str, Any]:
     }
 
 
-def monte_carlo(options: argparse.Namespace) -> list[dict[str, Any]]:
+def monte_carlo(options: argparse.Namespace) -> Rows:
     """Errors over the bound for every motion and noise, pooled over scenes, phases and seeds."""
     size = tuple(options.detection_size)
     sources = [SEED + i for i in range(options.detection_scenes)] + list(options.detection_images)
@@ -150,7 +173,7 @@ def pooled(trials: list[dict[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def held_out_cases(options: argparse.Namespace) -> list[dict[str, Any]]:
+def held_out_cases(options: argparse.Namespace) -> Rows:
     """Largest and root-mean-square errors of the cases, over scenes and phases."""
     size = tuple(options.case_size)
     results = []
@@ -175,40 +198,70 @@ def held_out_cases(options: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this part."""
-    group = parser.add_argument_group("detection")
-    group.add_argument("--quick", action="store_true", help="fewer trials and cases")
-    group.add_argument("--detection-method", default="direct", help="method of detect_vibration (default: direct)")
-    group.add_argument("--detection-size", type=int, nargs=2, default=(1024, 512), help="rows, columns of the trials")
-    group.add_argument("--detection-noises", type=float, nargs="+", default=NOISES, help="noise levels of full scale")
-    group.add_argument("--detection-scenes", type=int, default=2, help="drawn scenes (default: 2)")
-    group.add_argument("--detection-phases", type=int, default=4, help="draws of the phases (default: 4)")
-    group.add_argument("--detection-repeats", type=int, default=4, help="draws of the noise (default: 4)")
-    group.add_argument("--detection-images", type=Path, nargs="*", default=[], help="image files as further scenes")
-    group.add_argument("--cases", action="store_true", help="also run the held-out cases")
-    group.add_argument("--case-size", type=int, nargs=2, default=(2048, 1024), help="rows, columns of the cases")
-    group.add_argument("--case-scenes", type=int, default=2, help="scenes of each case (default: 2)")
-    group.add_argument("--case-phases", type=int, default=3, help="draws of the phases of each case (default: 3)")
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """The Monte Carlo trials, and with ``--cases`` the cases."""
-    if options.quick:
-        options = argparse.Namespace(**vars(options) | quick_options())
     return monte_carlo(options) + (held_out_cases(options) if options.cases else [])
 
 
-def quick_options() -> dict[str, Any]:
-    """Options that ``--quick`` sets."""
-    return {
-        "detection_noises": (0.002, 0.01, 0.05),
-        "detection_scenes": 1,
-        "detection_phases": 2,
-        "detection_repeats": 2,
-        "case_scenes": 1,
-        "case_phases": 1,
-    }
+def _number(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 1 else f"{value:.1f}"
 
 
-lines = detection_report.lines
+def _pair(values: list[float]) -> str:
+    return ", ".join(_number(value) for value in values)
+
+
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
+    """The figures as Markdown tables."""
+    text: list[str] = []
+    trials = [r for r in results if r["part"] == "monte carlo"]
+    for motion in dict.fromkeys(r["motion"] for r in trials):
+        of_motion = [r for r in trials if r["motion"] == motion]
+        height, width = of_motion[0]["size"]
+        text += [
+            f"{motion}: pairs of {height} x {width} px, {of_motion[0]['trials']} trials per line, "
+            f"{of_motion[0]['seconds']:.1f} s each. Errors are root-mean-square values for x, y; the bound is that for "
+            "an unknown scene, in brackets the ratio of the bound for a random scene to it.",
+            "",
+        ]
+        heads = ("noise", "period (%)", "amplitude (%)", "phase (π)", "error / bound: amplitude", "frequency", "phase")
+        heads += ("all", "error / estimated std", "in 95 % interval", "missed", "extra tones", "reliable")
+        lines_of_motion = []
+        for r in of_motion:
+            over = [
+                f"{_pair(r[name]['over_bound'])} ({_pair(r[name]['random_over_bound'])})"
+                for name in ("amplitude", "frequency", "phase")
+            ]
+            stated = [value for name in NAMES for value in r[name]["over_stated"]]
+            cells = [
+                f"{r['noise']:g}",
+                *(_pair(r[f"{name}_error"]["rms"]) for name in ("period", "amplitude", "phase")),
+                *over,
+                f"**{r['over_bound']:.2f}** ± {r['over_bound_std']:.2f}",
+                f"{(sum(v * v for v in stated) / len(stated)) ** 0.5:.2f}",
+                f"{100 * r['coverage']:.0f} ± {100 * r['coverage_std']:.0f} %",
+                f"{100 * r['lost']:.0f} %",
+                f"{r['extra_tones']:.2f}",
+                f"{100 * r['reliable']:.0f} %",
+            ]
+            lines_of_motion.append(cells)
+        text += table(heads, lines_of_motion)
+    cases = [r for r in results if r["part"] == "case"]
+    if not cases:
+        return text
+    height, width = cases[0]["size"]
+    text += [
+        f"Cases, {height} x {width} px, {cases[0]['trials']} trials each: largest error (root-mean-square), goal.",
+        "",
+    ]
+    lines_of_cases = []
+    for r in cases:
+        cells = [r["motion"], str(r["num_frames"]), f"{r['noise']:g}"]
+        for name, goal in zip(("period", "amplitude", "phase"), r["goal"], strict=True):
+            error = r[f"{name}_error"]
+            shown = f"{_number(error['largest'])} ({_number(error['all_rms'])})"
+            cells += [shown if error["largest"] <= goal else f"**{shown}**", f"{goal:g}"]
+        cells += [f"{r['over_bound']:.2f}", f"{100 * r['lost']:.0f} %", f"{r['extra_tones']:.2f}"]
+        lines_of_cases.append([*cells, f"{r['seconds']:.1f}"])
+    heads = ("case", "frames", "noise", "period (%)", "goal", "amplitude (%)", "goal", "phase (π)", "goal")
+    return text + table((*heads, "error / bound", "missed", "extra tones", "seconds"), lines_of_cases)

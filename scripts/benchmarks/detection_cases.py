@@ -120,13 +120,4 @@ def take(motion: Motion, source: int | Path, size: tuple[int, int], num_frames: 
     timing = camera(size[0])
     reach = np.ceil(shake.reach((num_frames + 1) * timing.frame_period)).astype(int) + RIM + 8
     scene = closed(scene_of(source, size[0] + 2 * int(reach[1]), size[1] + 2 * int(reach[0])), RIM)
-    frames = take_frames(
-        scene,
-        shake,
-        row_time=timing.row_time,
-        exposure_rows=timing.exposure_rows,
-        frame_rows=timing.frame_rows,
-        num_frames=num_frames,
-        size=size,
-    )
-    return Take(frames, scene, shake, timing)
+    return Take(take_frames(scene, shake, timing, num_frames, size), scene, shake, timing)

@@ -1,6 +1,6 @@
 """Joint restoration on a grid of half pixels, compared with still frames, other software and the grid of pixels.
 
-Frames come from cameras that alias and are made without the package, see ``finer_camera``, and for roll
+Frames come from cameras that alias and are made without the package, see ``independent_camera``, and for roll
 ``honesty_camera``. The vibration is detected in the frames of the first table, and given in those of the second.
 """
 
@@ -13,18 +13,31 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks import honesty_camera
-from benchmarks.finer_camera import BETWEEN, FINER, after_optics, still_image
 from benchmarks.finer_peers import drizzled, shift_and_add
-from benchmarks.independent_camera import Array, Shake, closed, take_frames
-from benchmarks.measure import one_thread
+from benchmarks.independent_camera import (
+    ALIASING,
+    POINTS_PER_PX,
+    Array,
+    Shake,
+    after_optics,
+    closed,
+    still_image,
+    take_frames,
+)
 from benchmarks.restoration import SCENES
+from harness import Rows, one_thread, table
 from scipy import ndimage
 
 import rsvib_torch as rsv
 
+OPTIONS = {
+    "scenes": (tuple(SCENES), "drawn scenes to compare on", SCENES),
+    "finer_size": (256, "finer: rows and columns of the frames"),
+    "finer_noises": ((0.002, 0.005, 0.02), "finer: noise levels of full scale"),
+}
+QUICK = {"scenes": ("city",), "finer_size": 128, "finer_noises": (0.005,)}
 ROW_TIME, EXPOSURE_ROWS, MARGIN, FADE, RIM, SEED = 20.52e-6, 20, 32, 60, 24, 1
 OPTICS = (0.3, 0.5)
-NOISES = (0.002, 0.005, 0.02)
 FRAMES = (2, 4, 8)
 SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
 
@@ -87,22 +100,12 @@ def record(
     scene, shape = after_optics(closed(fine, FADE), sigma), (size, size)
     timing = rsv.SensorTiming(ROW_TIME, exposure, max(2 * size + 59, exposure + 59))
     shake = replace(SHAKE, image_motion=np.array([image_motion, 0.0]))
-    frames = take_frames(
-        scene,
-        shake,
-        row_time=ROW_TIME,
-        exposure_rows=exposure,
-        frame_rows=timing.frame_rows,
-        num_frames=max(FRAMES),
-        size=shape,
-        points=FINER,
-        between=BETWEEN,
-    )
+    frames = take_frames(scene, shake, timing, max(FRAMES), shape, **ALIASING)
     vibration = rsv.Vibration(
         *(torch.from_numpy(v) for v in (SHAKE.amplitude, SHAKE.frequency, SHAKE.phase)), shake.image_motion
     )
     _, shift = rsv.visible_pixels(timing, vibration, shape, max(FRAMES))
-    offset = (0, FINER * int(shift[max(FRAMES) // 2, 0]))
+    offset = (0, POINTS_PER_PX * int(shift[max(FRAMES) // 2, 0]))
     return Recording(frames, still_image(scene, shape, 2, offset), timing, vibration)
 
 
@@ -126,12 +129,12 @@ def rolling(fine: Array, size: int, roll: float) -> Recording:
     return Recording(frames, half, timing, rsv.Vibration(amplitude, frequency, phase))
 
 
-def cases(name: str, options: argparse.Namespace, sigma: float) -> list[dict[str, Any]]:
+def cases(name: str, options: argparse.Namespace, sigma: float) -> Rows:
     """Figures of one scene behind optics of one width, for all noise levels and numbers of frames."""
-    side = FINER * (options.finer_size + 2 * MARGIN)
+    side = POINTS_PER_PX * (options.finer_size + 2 * MARGIN)
     taken = record(SCENES[name](side, side, 3).double().numpy(), sigma, options.finer_size)
     found = []
-    for noise in NOISES:
+    for noise in options.finer_noises:
         detection = rsv.detect_vibration(taken.noisy(noise), taken.timing)
         for count in FRAMES:
             frames = taken.noisy(noise)[:count]
@@ -162,10 +165,10 @@ def without_data(frames: torch.Tensor) -> torch.Tensor:
     return frames.masked_fill(missing, torch.nan)
 
 
-def conditions(options: argparse.Namespace) -> list[dict[str, Any]]:
+def conditions(options: argparse.Namespace) -> Rows:
     """Figures of eight frames of the city with other exposures, motions, missing data and a wrong vibration."""
     size, margin = options.finer_size, 64
-    side = FINER * (size + 2 * margin)
+    side = POINTS_PER_PX * (size + 2 * margin)
     scene = SCENES["city"](side, side, 3).double().numpy()
     usual = record(scene, 0.3, size)
     wrong = rsv.Vibration(usual.vibration.amplitude, usual.vibration.frequency, usual.vibration.phase + 0.05)
@@ -188,7 +191,7 @@ def conditions(options: argparse.Namespace) -> list[dict[str, Any]]:
     }
     found = []
     for name, (taken, change, motion, chosen) in named.items():
-        for noise in NOISES:
+        for noise in options.finer_noises:
             frames = change(taken.noisy(noise))
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", rsv.RestorationWarning)
@@ -205,12 +208,7 @@ def conditions(options: argparse.Namespace) -> list[dict[str, Any]]:
     return found
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--finer-size", type=int, default=256, help="rows and columns of the frames of section finer")
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """PSNR on half pixels and on pixels, for all scenes, optics, noise levels and numbers of frames."""
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
@@ -218,37 +216,53 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
         return [*table, *conditions(options)]
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """A table of the figures."""
-    text = [
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
+    """Tables of the scenes and of the conditions."""
+    heads = (
+        "scene",
+        "σ of the optics (px)",
+        "noise",
+        "frames",
+        "half pixels: still frames",
+        "drizzle",
+        "shift-and-add",
+    )
+    heads += ("`joint=True`, interpolated", "`joint=True, scale=2`", "pixels: `joint=True`", "`joint=True, scale=2`")
+    return [
         f"PSNR in dB against the noise-free scene after optics and pixel, without a border of {RIM} points; frames of "
         f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in all "
         f"{max(FRAMES)} frames. Still frames are averaged and interpolated; in brackets, infinitely many of them.",
         "",
-        "| scene | σ of the optics (px) | noise | frames | half pixels: still frames | drizzle | shift-and-add | "
-        "`joint=True`, interpolated | `joint=True, scale=2` | pixels: `joint=True` | `joint=True, scale=2` |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    text += [
-        f"| {row['scene']} | {row['sigma']} | {row['noise']} | {row['frames']} | {row['still']:.1f} "
-        f"({row['endless']:.1f}) | {row['drizzle']:.1f} | {row['added']:.1f} | "
-        f"{row['joint']:.1f} | **{row['finer']:.1f}** | {row['joint_pixels']:.1f} | "
-        f"**{row['finer_pixels']:.1f}** |"
-        for row in results
-        if "scene" in row
-    ]
-    text += [
-        "",
+        *table(
+            heads,
+            [
+                (
+                    *(row[name] for name in ("scene", "sigma", "noise", "frames")),
+                    f"{row['still']:.1f} ({row['endless']:.1f})",
+                    *(f"{row[name]:.1f}" for name in ("drizzle", "added", "joint")),
+                    f"**{row['finer']:.1f}**",
+                    f"{row['joint_pixels']:.1f}",
+                    f"**{row['finer_pixels']:.1f}**",
+                )
+                for row in results
+                if "scene" in row
+            ],
+        ),
         f"The same for {max(FRAMES)} frames of the city, σ 0.3 px (roll: 0.4 px), with the true vibration but in the "
         "last rows. Still frames have none of the conditions. Saturated: points below saturation only.",
         "",
-        "| condition | noise | still frames | `joint=True`, interpolated | `joint=True, scale=2` | warning |",
-        "|---|---|---|---|---|---|",
+        *table(
+            ("condition", "noise", "still frames", "`joint=True`, interpolated", "`joint=True, scale=2`", "warning"),
+            [
+                (
+                    row["condition"],
+                    row["noise"],
+                    *(f"{row[name]:.1f}" for name in ("still", "joint")),
+                    f"**{row['finer']:.1f}**",
+                    "yes" if row["warned"] else "",
+                )
+                for row in results
+                if "condition" in row
+            ],
+        ),
     ]
-    text += [
-        f"| {row['condition']} | {row['noise']} | {row['still']:.1f} | {row['joint']:.1f} | **{row['finer']:.1f}** | "
-        f"{'yes' if row['warned'] else ''} |"
-        for row in results
-        if "condition" in row
-    ]
-    return text

@@ -27,13 +27,19 @@ import numpy as np
 import torch
 from benchmarks.honesty_camera import Array
 from benchmarks.honesty_cases import CLASSES, MODELLED, MORE, TIMING_CORRECT, Recording, recording
-from benchmarks.measure import one_thread
+from harness import Rows, one_thread, table
 from scipy.ndimage import shift, spline_filter
 from scipy.optimize import linear_sum_assignment
 
 import rsvib_torch as rsv
 from rsvib_torch.restoration.verdict.trust import displacement_uncertainty
 
+OPTIONS = {
+    "honesty_classes": (tuple(CLASSES), "honesty: classes of recordings", CLASSES),
+    "honesty_cases": (9, "honesty: cases of each class, of some a multiple; 333 in all"),
+    "honesty_size": (384, "honesty: rows and columns of the frames"),
+}
+QUICK = {"honesty_classes": ("plain", "frame_rows +2%"), "honesty_cases": 1, "honesty_size": 128}
 MIN_OFFSET = 0.05  # px, amplitude of the offsets of a tone from which it must be correct
 MANY_STD, WRONG_SHARE = 5.0, 0.02  # of a parameter
 WRONG_DISPLACEMENT, WRONG_PX, KNOWN_DISPLACEMENT = 0.05, 0.01, 0.02  # share of its rms, px, share
@@ -247,17 +253,7 @@ def judge_case(name: str, number: int, size: int) -> dict[str, Any]:
     return case
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    group = parser.add_argument_group("honesty")
-    group.add_argument("--honesty-classes", nargs="+", choices=CLASSES, default=list(CLASSES), help="default: all")
-    group.add_argument(
-        "--honesty-cases", type=int, default=9, help="cases of each class, of some a multiple (default: 9, 333 in all)"
-    )
-    group.add_argument("--honesty-size", type=int, default=384, help="rows and columns of the frames (default: 384)")
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """All cases of the classes."""
     with one_thread():
         return [
@@ -272,23 +268,24 @@ def is_worse(case: dict[str, Any]) -> bool:
     return "restored_db" in case and case["restored_db"] < case["raw_db"] - WORSE_DB
 
 
-def covered(axes: list[dict[str, Any]]) -> str:
-    """Share of 95 % intervals of amplitude and frequency that contain the truth, over axes called reliable."""
+def covered(axes: list[dict[str, Any]]) -> list[Any]:
+    """Share of 95 % intervals of amplitude and frequency that contain the truth, over reliable axes; their number."""
     tones = [tone for axis in axes if axis["outcome"] in ("correct", "wrong") for tone in axis["tones"]]
     if not tones:
-        return "| | | 0 |"
+        return ["", "", 0]
     shares = [np.mean([abs(tone[f"{name}_z"]) < WITHIN_95 for tone in tones]) for name in ("amplitude", "frequency")]
-    return "| " + " | ".join(f"{share:.0%}" for share in shares) + f" | {len(tones)} |"
+    return [*(f"{share:.0%}" for share in shares), len(tones)]
 
 
-def counts(name: str, cases: list[dict[str, Any]]) -> str:
+def counts(name: str, cases: Rows) -> list[Any]:
     """Line of the table for a class."""
     axes = [axis for case in cases for axis in case["axes"]]
     outcomes = [axis["outcome"] for axis in axes]
     worse = [case["warnings"] for case in cases if is_worse(case)]
     about_axes = [all("is not restored" in one for one in texts) for texts in worse if texts]
     reliable = [axis["largest_z"] for axis in axes if axis["outcome"] in ("correct", "wrong")]
-    values = [
+    return [
+        name,
         len(cases),
         outcomes.count("correct"),
         outcomes.count("assumed"),
@@ -300,14 +297,24 @@ def counts(name: str, cases: list[dict[str, Any]]) -> str:
         sum(not texts for texts in worse),
         sum(about_axes),
         f"{max(reliable, default=0.0):.1f}",
+        *covered(axes),
     ]
-    return f"| {name} | " + " | ".join(str(value) for value in values) + " " + covered(axes)
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """Counts of each class and in all, and the coverage of intervals."""
-    names = dict.fromkeys(case["class"] for case in results)
-    text = [
+    classes = [
+        (name, [case for case in results if case["class"] == name])
+        for name in dict.fromkeys(case["class"] for case in results)
+    ]
+    for timing in ("correct", "wrong"):
+        chosen = [case for case in results if (case["class"] in TIMING_CORRECT) == (timing == "correct")]
+        classes.append((f"all, timing {timing}", chosen))
+    modelled = [axis for case in results if case["class"].startswith(MODELLED) for axis in case["axes"]]
+    heads = ("class", "cases", "correct", "assumed", "wrong", "parameters", "displacement", "refused")
+    heads += ("although known", "worse, no warning", "worse, warning about an axis only", "largest error")
+    within = ("amplitude within", "frequency within", "tones")
+    return [
         f"Frames of {options.honesty_size} x {options.honesty_size} px; exposures are given for frames of 2048 rows.",
         "An axis is correct, assumed, wrong or refused. Assumed: the stated timing is wrong, and the result",
         "states this timing as an assumption with its effect. The columns 'parameters' and 'displacement' state",
@@ -316,18 +323,12 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         "PSNR after restoration is more than 0.1 dB lower. 'Largest error': of a tone of a reliable axis, in",
         "standard deviations. 'Within': share of the 95 % intervals that contain the truth.",
         "",
-        "| class | cases | correct | assumed | wrong | parameters | displacement | refused | although known "
-        "| worse, no warning | worse, warning about an axis only | largest error | amplitude within "
-        "| frequency within | tones |",
-        "|---" * 15 + "|",
-        *(counts(name, [case for case in results if case["class"] == name]) for name in names),
-        counts("all, timing correct", [case for case in results if case["class"] in TIMING_CORRECT]),
-        counts("all, timing wrong", [case for case in results if case["class"] not in TIMING_CORRECT]),
-        "",
-        "| steady vibrations, timing correct | amplitude within | frequency within | tones |",
-        "|---" * 4 + "|",
+        *table((*heads, *within), [counts(*part) for part in classes]),
+        *table(
+            ("steady vibrations, timing correct", *within),
+            [
+                ("one tone", *covered([axis for axis in modelled if axis["true_tones"] == 1])),
+                ("several tones", *covered([axis for axis in modelled if axis["true_tones"] > 1])),
+            ],
+        ),
     ]
-    modelled = [axis for case in results if case["class"].startswith(MODELLED) for axis in case["axes"]]
-    text.append("| one tone " + covered([axis for axis in modelled if axis["true_tones"] == 1]))
-    text.append("| several tones " + covered([axis for axis in modelled if axis["true_tones"] > 1]))
-    return text

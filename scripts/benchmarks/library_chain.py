@@ -5,22 +5,52 @@ Bands are registered by ``cv2.matchTemplate`` with a parabola, and the offsets o
 averaged over an exposure T_e, between frames m T_row apart. The fit starts from the best frequency of a grid.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import cv2
 import numpy as np
 import torch
-from benchmarks.registration_peers import Array, by_match_template
+from benchmarks.independent_camera import Array
 from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
 import rsvib_torch as rsv
 
 BAND_ROWS, BAND_STEP = 32, 16
+SEARCH = 16  # px
 _LEAST_BANDS = 8
 _LOWEST_GAIN = 0.2  # smallest gain of a frequency of the grid
 _LARGEST = 32.0  # px of amplitude
 _OUTLIER = 0.1  # px; scale of the robust loss
 _GRID_STEP = 0.25  # of the frequency resolution
+
+
+def _between(before: float, at: float, after: float) -> float:
+    """Position of the maximum of the parabola through three values, between -1/2 and 1/2."""
+    bend = before - 2.0 * at + after
+    return 0.5 * (before - after) / bend if bend < 0 else 0.0
+
+
+def by_match_template(frames: NDArray[np.float32], tops: Sequence[int], band_rows: int) -> Array:
+    """``cv2.matchTemplate`` (normalised correlation), and a parabola through its peak along either axis.
+
+    Offsets (N, 2) are (x, y) in px, the displacement in the later frame minus that in the earlier one; NaN for a
+    failed band.
+    """
+    offsets = []
+    for top in tops:
+        first = max(0, top - SEARCH)
+        template = np.ascontiguousarray(frames[0, top : top + band_rows, SEARCH:-SEARCH])
+        window = frames[1, first : top + band_rows + SEARCH]
+        score = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
+        y, x = np.unravel_index(int(score.argmax()), score.shape)
+        if not (0 < x < score.shape[1] - 1 and 0 < y < score.shape[0] - 1):
+            offsets.append((np.nan, np.nan))  # the maximum may be outside
+            continue
+        fine_x = _between(*score[y, x - 1 : x + 2].tolist())
+        fine_y = _between(*score[y - 1 : y + 2, x].tolist())
+        offsets.append((x + fine_x - SEARCH, y + fine_y + first - top))
+    return np.array(offsets, dtype=float)
 
 
 def offset_model(timing: rsv.SensorTiming) -> Callable[..., Array]:

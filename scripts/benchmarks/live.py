@@ -18,12 +18,19 @@ import psutil
 import torch
 from benchmarks.independent_camera import closed, take_frames
 from benchmarks.vidstab_peer import stabilised
+from harness import Rows, table
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.live import LiveReport, TimedFrame, run_live
 
+OPTIONS = {
+    "minutes": (0.5, "live: duration of the session"),
+    "live_size": (1024, "live: rows and columns of the frames"),
+    "live_periods": (5, "live: repetitions of the frames for the accuracy"),
+}
+QUICK = {"minutes": 0.05, "live_size": 192, "live_periods": 2}
 SEED, NOISE, MARGIN, RATE, EXPOSURE_ROWS = 11, 0.005, 32, 30, 20
 AMPLITUDE, FREQUENCY, PHASE = np.array([2.1, 1.6]), np.array([52.0, 71.0]), np.array([0.5, 1.0])
 BEFORE = 0.3  # s, the vibration is steady before it changes
@@ -68,17 +75,7 @@ def timing_of(size: int) -> rsv.SensorTiming:
 def frames_of(size: int, motion: Changing, count: int) -> NDArray[np.uint8]:
     """Frames (T, size, size) with noise."""
     scene = closed(city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED).double().numpy(), MARGIN // 2)
-    timing = timing_of(size)
-    taken = take_frames(
-        scene,
-        motion,  # type: ignore[arg-type]
-        row_time=timing.row_time,
-        exposure_rows=EXPOSURE_ROWS,
-        frame_rows=timing.frame_rows,
-        num_frames=count,
-        size=(size, size),
-        between=4,
-    )
+    taken = take_frames(scene, motion, timing_of(size), count, (size, size), between=4)  # type: ignore[arg-type]
     noisy = taken + NOISE * np.random.default_rng(SEED).standard_normal(taken.shape)
     return np.clip(np.round(255 * noisy), 0, 255).astype(np.uint8)
 
@@ -121,12 +118,6 @@ class Output:
         """Nothing is open."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--minutes", type=float, default=0.5, help="duration of the live session (default: 0.5)")
-    parser.add_argument("--live-size", type=int, default=1024, help="rows and columns of live frames (default: 1024)")
-
-
 def errors(found: rsv.DetectionResult, amplitude: NDArray[Any], frequency: NDArray[Any]) -> NDArray[Any]:
     """(2, 2) errors of amplitudes in px and frequencies in Hz of the strongest tones."""
     vibration = found.vibration
@@ -164,7 +155,7 @@ def session(pixels: NDArray[np.uint8], size: int, minutes: float) -> dict[str, A
     }
 
 
-def accuracy(pixels: NDArray[np.uint8], size: int, periods: int = 5) -> dict[str, Any]:
+def accuracy(pixels: NDArray[np.uint8], size: int, periods: int) -> dict[str, Any]:
     """Errors of the tracker from the second period of the frames on, and of the batch on windows of the same frames."""
     timing, tracker = timing_of(size), rsv.VibrationTracker(timing_of(size))
     count, ours = len(pixels), []
@@ -242,13 +233,14 @@ def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> Callabl
     return run
 
 
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """Session, changes, and speed next to peers."""
     size = options.live_size
     pixels = frames_of(size, Changing(), RATE)
-    results = [session(pixels, size, options.minutes), accuracy(pixels, size)]
-    results.append(change("sweep of 2 Hz/s", size // 2, Changing(sweep=2.0)))
-    results.append(change("amplitude doubles in 1 s", size // 2, Changing(doublings=1.0)))
+    results = [session(pixels, size, options.minutes), accuracy(pixels, size, options.live_periods)]
+    smaller = max(192, size // 2)  # with fewer pixels, the tracker loses the vibration
+    results.append(change("sweep of 2 Hz/s", smaller, Changing(sweep=2.0)))
+    results.append(change("amplitude doubles in 1 s", smaller, Changing(doublings=1.0)))
     clip = np.concatenate([pixels, pixels])
     tasks: dict[str, Callable[[], NDArray[np.uint8]]] = {
         "as taken": lambda: clip,
@@ -276,53 +268,70 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def lines(rows: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(rows: Rows, options: argparse.Namespace) -> list[str]:
     """The tables in Markdown."""
     one, errors_of, *others = rows
     size = options.live_size
-    text = [
+    accuracies = []
+    for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):
+        ours, batch = (math.hypot(*errors_of[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))
+        values = f"{ours:.5f} {unit}, {batch:.5f} {unit}, {ours / batch:.2f}"
+        accuracies.append((f"error of the {quantity}: tracker, batch, ratio", values))
+    changes = [row for row in others if "lost" in row]
+    timed = [row for row in others if "rows" in row]
+    return [
         f"One session of {one['frames'] / RATE / 60:.2g} minutes, {size} x {size} at {RATE} frames/s, restored with "
         f"dewarp. Errors are rms over both axes; the batch is `detect_vibration` on {WINDOW} of the same frames.",
         "",
-        "| quantity | value |",
-        "|---|---|",
-        f"| frames, dropped | {one['frames']}, {one['dropped']} |",
-        f"| delay of the written frames in frame periods: median, 99 % | {one['delay_median']}, {one['delay_99']} |",
-        f"| frames with a delay of at most 2 frame periods | {one['within_two']:.1%} |",
-        f"| processor time per frame | {one['cpu']:.0f} ms |",
-        f"| largest resident memory, change between the halves | {one['memory']:.0f} MiB, {one['drift']:+.1%} |",
-        f"| frames with known motion, late ones that were predicted, detections | {one['tracked']:.1%}, "
-        f"{one['predicted']}, {one['detections']} |",
-    ]
-    for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):
-        ours, batch = (math.hypot(*errors_of[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))
-        text.append(
-            f"| error of the {quantity}: tracker, batch, ratio | {ours:.5f} {unit}, {batch:.5f} {unit}, "
-            f"{ours / batch:.2f} |"
-        )
-    changes = [row for row in others if "lost" in row]
-    text += [
-        "",
+        *table(
+            ("quantity", "value"),
+            [
+                ("frames, dropped", f"{one['frames']}, {one['dropped']}"),
+                (
+                    "delay of the written frames in frame periods: median, 99 %",
+                    f"{one['delay_median']}, {one['delay_99']}",
+                ),
+                ("frames with a delay of at most 2 frame periods", f"{one['within_two']:.1%}"),
+                ("processor time per frame", f"{one['cpu']:.0f} ms"),
+                (
+                    "largest resident memory, change between the halves",
+                    f"{one['memory']:.0f} MiB, {one['drift']:+.1%}",
+                ),
+                (
+                    "frames with known motion, late ones that were predicted, detections",
+                    f"{one['tracked']:.1%}, {one['predicted']}, {one['detections']}",
+                ),
+                *accuracies,
+            ],
+        ),
         f"Changes along x, {changes[0]['size']} x {changes[0]['size']}, rms errors from the beginning of the change:",
         "",
-        "| change | amplitude (%) | frequency (Hz) | frames without known motion | further detections |",
-        "|---|---|---|---|---|",
-    ]
-    text += [
-        f"| {row['name']} | {100 * row['amplitude']:.2f} | {row['frequency']:.3f} | {row['lost']} | "
-        f"{row['detections'] - 1} |"
-        for row in changes
-    ]
-    text += [
-        "",
+        *table(
+            ("change", "amplitude (%)", "frequency (Hz)", "frames without known motion", "further detections"),
+            [
+                (
+                    row["name"],
+                    f"{100 * row['amplitude']:.2f}",
+                    f"{row['frequency']:.3f}",
+                    row["lost"],
+                    row["detections"] - 1,
+                )
+                for row in changes
+            ],
+        ),
         "The same clip as fast as possible, with the motion between consecutive frames of the result:",
         "",
-        "| method | frames/s | processor ms per frame | rows about the frame (px) | whole frames (px) |",
-        "|---|---|---|---|---|",
+        *table(
+            ("method", "frames/s", "processor ms per frame", "rows about the frame (px)", "whole frames (px)"),
+            [
+                (
+                    row["name"],
+                    "" if math.isnan(row["rate"]) else f"{row['rate']:.1f}",
+                    "" if math.isnan(row["cpu"]) else f"{row['cpu']:.0f}",
+                    f"{row['rows']:.3f}",
+                    f"{row['whole']:.3f}",
+                )
+                for row in timed
+            ],
+        ),
     ]
-    for row in others:
-        if "rows" in row:
-            speed = "" if math.isnan(row["rate"]) else f"{row['rate']:.1f}"
-            cpu = "" if math.isnan(row["cpu"]) else f"{row['cpu']:.0f}"
-            text.append(f"| {row['name']} | {speed} | {cpu} | {row['rows']:.3f} | {row['whole']:.3f} |")
-    return text

@@ -1,6 +1,7 @@
 """Colour mosaics restored jointly, compared with demosaicing each frame before restoration.
 
-Frames come from the camera of ``finer_camera``, behind colour filters. The vibration is detected in the raw frames.
+Frames come from the camera of ``independent_camera``, behind colour filters. The vibration is detected in the raw
+frames.
 """
 
 import argparse
@@ -13,24 +14,36 @@ import cv2
 import numpy as np
 import torch
 from benchmarks.finer import EXPOSURE_ROWS, FADE, MARGIN, ROW_TIME, SEED, SHAKE, decibel
-from benchmarks.finer_camera import BETWEEN, FINER, after_optics, mosaic_of, still_image
-from benchmarks.independent_camera import Array, closed, take_frames
-from benchmarks.measure import one_thread
+from benchmarks.independent_camera import (
+    ALIASING,
+    POINTS_PER_PX,
+    Array,
+    after_optics,
+    closed,
+    mosaic_of,
+    still_image,
+    take_frames,
+)
+from harness import Rows, one_thread, table
 from skimage import data
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation.scenes import city_and_fields
 
+OPTIONS = {
+    "mosaic_size": (160, "mosaic: rows and columns of the frames"),
+    "mosaic_scenes": (("drawn", "astronaut", "coffee"), "mosaic: a drawing and photographs of scikit-image"),
+}
+QUICK = {"mosaic_size": 96, "mosaic_scenes": ("drawn",)}
 SIGMA, PATTERN, RIM = 0.4, "RGGB", 12
 NOISES = (0.002, 0.005, 0.01)
 FRAMES = (1, 8)
-PHOTOGRAPHS = ("astronaut", "coffee")
 Demosaicing = Callable[[Array], Array]
 
 
 def colour_scene(name: str, side: int) -> Array:
     """Red, green and blue (3, side, side), linear in light: a photograph of half the resolution, or a drawing."""
-    if name in PHOTOGRAPHS:
+    if name != "drawn":
         image = (getattr(data, name)()[..., :3] / 255.0) ** 2.2
         top, left = ((size - side // 2) // 2 for size in image.shape[:2])
         rows, columns = (max(0, -place) for place in (top, left))
@@ -81,18 +94,20 @@ def network(net: torch.nn.Module, raw: Array, rim: int = 32) -> Array:
     return images[..., cut : cut + raw.shape[-2], cut : cut + raw.shape[-1]][..., ::-1].copy()
 
 
-def cases(name: str, side: int) -> list[dict[str, Any]]:
+def raw_frames(name: str, timing: rsv.SensorTiming, count: int, side: int) -> tuple[list[Array], Array]:
+    """The colours of a scene after the optics, and its raw frames (T, side, side) without noise."""
+    whole = colour_scene(name, POINTS_PER_PX * (side + 2 * MARGIN))
+    scene = [after_optics(closed(part, FADE), SIGMA) for part in whole]
+    taken = [take_frames(part, SHAKE, timing, count, (side, side), **ALIASING) for part in scene]
+    return scene, mosaic_of(np.stack(taken, 1), PATTERN)
+
+
+def cases(name: str, side: int) -> Rows:
     """Figures of one scene for all noise levels and numbers of frames."""
     size = (side, side)
-    scene = [after_optics(closed(part, FADE), SIGMA) for part in colour_scene(name, FINER * (side + 2 * MARGIN))]
-    pixels, half = (np.stack([still_image(part, size, scale) for part in scene]) for scale in (1, 2))
     timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * side + 59)
-    camera = {"row_time": ROW_TIME, "exposure_rows": EXPOSURE_ROWS, "frame_rows": timing.frame_rows}
-    taken = [
-        take_frames(part, SHAKE, **camera, num_frames=max(FRAMES), size=size, points=FINER, between=BETWEEN)
-        for part in scene
-    ]
-    clean = mosaic_of(np.stack(taken, 1), PATTERN)
+    scene, clean = raw_frames(name, timing, max(FRAMES), side)
+    pixels, half = (np.stack([still_image(part, size, scale) for part in scene]) for scale in (1, 2))
     found = []
     for noise in NOISES:
         raw = clean + noise * np.random.default_rng(SEED).standard_normal(clean.shape)
@@ -115,18 +130,13 @@ def cases(name: str, side: int) -> list[dict[str, Any]]:
     return found
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--mosaic-size", type=int, default=160, help="rows and columns of the frames of section mosaic")
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """PSNR on pixels and on half pixels for all scenes, noise levels and numbers of frames."""
     with one_thread():
-        return [row for name in ("drawn", *PHOTOGRAPHS) for row in cases(name, options.mosaic_size)]
+        return [row for name in options.mosaic_scenes for row in cases(name, options.mosaic_size)]
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """A table of the figures."""
     names = list(results[0]["peers"])
     text = [
@@ -136,11 +146,10 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         "software interpolates the colours of each frame, and `restore(joint=True)` follows: on pixels / with "
         "`scale=2` on half pixels. Scenes: a drawing, and two photographs of scikit-image.",
         "",
-        f"| scene | noise | frames | {' | '.join(names)} | `restore(joint=True, mosaic=...)` |",
-        f"|---|---|---|{'---|' * len(names)}---|",
     ]
+    cells = []
     for row in results:
         others = [f"{row['peers'][name]:.1f} / {row['peers_half'][name]:.1f}" for name in names]
         ours = f"**{row['mosaic']:.1f}** / **{row['mosaic_half']:.1f}**"
-        text.append(f"| {row['scene']} | {row['noise']} | {row['frames']} | {' | '.join(others)} | {ours} |")
-    return text
+        cells.append((row["scene"], row["noise"], row["frames"], *others, ours))
+    return text + table(("scene", "noise", "frames", *names, "`restore(joint=True, mosaic=...)`"), cells)

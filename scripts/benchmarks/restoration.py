@@ -1,4 +1,4 @@
-"""Restoration compared with other software: quality over scenes, exposures and noise, speed, memory.
+"""Restoration compared with other software: quality over scenes, exposures and noise, and speed.
 
 Peers: unwarping by ``cv2.remap`` (Lanczos-4), loops of ``skimage.restoration.wiener`` and ``richardson_lucy`` over the
 rows, CGLS on ``pylops.signalprocessing.NonStationaryConvolve2D`` where pylops is installed (extra ``compare``), and
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.measure import in_turns, named, peak_memory, shown_seconds
 from benchmarks.restoration_peers import LOOPS, Peer, loop_rows, remap_lanczos
+from harness import Rows, in_turns, named, shown_seconds, table
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -35,30 +35,26 @@ try:
 except (ImportError, RuntimeError) as missing:  # RuntimeError: its torchvision was built for another torch
     LEFT_OUT["deepinv"] = str(missing)
 
-SEED = 7
-RIM, MARGIN, FADE = 32, 48, 24  # px
-AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
-NOISES = (0.0, 0.005, 0.02)
-EXPOSURES = (20, 100, 400)
-TIMED_NOISE = 0.005
-ROUND_TRIP = "FFT round trip"
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "city": city_and_fields,
     "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
 }
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument(
-        "--grid-size", type=int, default=512, help="frame side where quality is compared (default: 512)"
-    )
-    parser.add_argument("--exposures", type=int, nargs="+", default=EXPOSURES, help="exposures in row times")
-    parser.add_argument("--noises", type=float, nargs="+", default=NOISES, help="noise levels of full scale")
-    parser.add_argument("--scenes", choices=SCENES, nargs="*", default=list(SCENES), help="drawn scenes to compare on")
-    parser.add_argument("--images", type=Path, nargs="*", default=[], help="image files as further scenes")
-    parser.add_argument("--no-pylops", action="store_true", help="without pylops, which takes minutes")
-    parser.add_argument("--no-deepinv", action="store_true", help="without deepinv, which takes minutes")
+OPTIONS = {
+    "grid_size": (512, "frame side where quality is compared"),
+    "exposures": ((20, 100, 400), "exposures in row times"),
+    "noises": ((0.0, 0.005, 0.02), "noise levels of full scale"),
+    "scenes": (tuple(SCENES), "drawn scenes to compare on", SCENES),
+    "images": ((), "image files as further scenes", Path),
+    "no_pylops": (False, "without pylops, which takes minutes"),
+    "no_deepinv": (False, "without deepinv, which takes minutes"),
+}
+QUICK = {"grid_size": 128, "exposures": (20,), "noises": (0.005,), "scenes": ("city",)}
+QUICK |= {"no_pylops": True, "no_deepinv": True}
+SEED = 7
+RIM, MARGIN, FADE = 32, 48, 24  # px
+AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
+TIMED_NOISE = 0.005
+ROUND_TRIP = "FFT round trip"
 
 
 def camera(exposure_rows: int) -> rsv.SensorTiming:
@@ -142,21 +138,11 @@ def methods(
     return found
 
 
-def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace) -> list[dict[str, Any]]:
+def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace) -> Rows:
     """PSNR of all methods on one scene with one exposure, for every noise."""
     timing, truth, size = camera(exposure), vibration(), (options.grid_size, options.grid_size)
-    shake = Shake(*(values.numpy() for values in (truth.amplitude, truth.frequency, truth.phase, truth.image_motion)))
-    clean = torch.from_numpy(
-        take_frames(
-            closed(scene.double().numpy(), FADE),
-            shake,
-            row_time=timing.row_time,
-            exposure_rows=exposure,
-            frame_rows=timing.frame_rows,
-            num_frames=2,
-            size=size,
-        )
-    ).float()
+    taken = take_frames(closed(scene.double().numpy(), FADE), Shake.of(truth), timing, 2, size)
+    clean = torch.from_numpy(taken).float()
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
     results: dict[str, dict[str, Any]] = {}
     for noise in options.noises:
@@ -166,15 +152,8 @@ def compare(name: str, scene: Tensor, exposure: int, options: argparse.Namespace
         timed = noise == timed_noise(options)
         figures |= {name: run() for name, run in methods(frames, timing, truth, still, options, timed=timed).items()}
         for method, figure in figures.items():
-            row = {
-                "scene": name,
-                "exposure_rows": exposure,
-                "method": method,
-                "psnr_db": {},
-                "seconds": {},
-                "setting": {},
-            }
-            row = results.setdefault(method, row)
+            case = {"scene": name, "exposure_rows": exposure, "method": method}
+            row = results.setdefault(method, {**case, "psnr_db": {}, "seconds": {}, "setting": {}})
             row["psnr_db"][str(noise)] = quality(figure, still)
             row["seconds"][str(noise)] = figure.seconds
             row["setting"][str(noise)] = figure.setting
@@ -192,8 +171,8 @@ def fft_round_trip(frame: Tensor) -> Tensor:
     return image
 
 
-def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Seconds, FFT round trips and peak memory of the methods of the package for one large frame."""
+def speed(options: argparse.Namespace) -> Rows:
+    """Seconds and FFT round trips of the methods of the package for one large frame."""
     size = options.size
     timing, truth = camera(20), vibration()
     scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
@@ -209,21 +188,15 @@ def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
             works["cv2.remap, Lanczos-4"] = lambda a=array: remap_lanczos(a, timing, truth)
         done = in_turns(works, options.runs)
         unit = done[ROUND_TRIP].seconds
-        for name, timed in done.items():
-            memory = peak_memory(name, 1, size, size, device) if name in METHODS else None
-            results.append(
-                {
-                    "method": named(name, device),
-                    **timed.figures(),
-                    "round_trips": timed.seconds / unit,
-                    "frames_of_memory": None if memory is None else memory / (8 * size * size),
-                }
-            )
+        results += [
+            {"method": named(name, device), **timed.figures(), "round_trips": timed.seconds / unit}
+            for name, timed in done.items()
+        ]
     return results
 
 
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Quality of every method on every scene and exposure, then speed and memory."""
+def rows(options: argparse.Namespace) -> Rows:
+    """Quality of every method on every scene and exposure, then speed."""
     compared = [
         row
         for name, scene in scenes(options).items()
@@ -237,41 +210,33 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as Markdown tables."""
     compared = [row for row in results if row["part"] == "quality"]
-    noises = [str(noise) for noise in options.noises]
-    timed = str(timed_noise(options))
+    noises, timed = [str(noise) for noise in options.noises], str(timed_noise(options))
     text = [
         f"PSNR in dB without a border of {RIM} px, frames of {options.grid_size} x {options.grid_size} px, true "
-        f"vibration given; seconds at noise {timed}. Peers use the setting with the highest PSNR.",
+        f"vibration given; seconds at noise {timed}. Peers use the setting with the highest PSNR; the best value of "
+        "each column has a star.",
+        "",
     ]
     for scene, exposure in dict.fromkeys((row["scene"], row["exposure_rows"]) for row in compared):
-        text += [
-            "",
-            f"| {scene}, exposure of {exposure} rows | {' | '.join(f'noise {noise}' for noise in noises)} | seconds |",
-            "|---" * (len(noises) + 2) + "|",
-        ]
         here = [row for row in compared if (row["scene"], row["exposure_rows"]) == (scene, exposure)]
         best = {noise: max(row["psnr_db"][noise] for row in here) for noise in noises}
+        cells = []
         for row in here:
-            cells = [f"{row['psnr_db'][n]:.2f}{'*' if row['psnr_db'][n] == best[n] else ''}" for n in noises]
-            text.append(f"| {row['method']} | {' | '.join(cells)} | {row['seconds'][timed]:.2f} |")
-    text += [
-        "",
-        f"| one frame of {options.size} x {options.size} px | seconds | FFT round trips | peak memory / frame |",
-        "|---|---|---|---|",
-    ]
-    for row in (row for row in results if row["part"] == "speed"):
-        memory = row["frames_of_memory"]
-        shown = "" if memory is None else f"{memory:.1f}"
-        text.append(f"| {row['method']} | {shown_seconds(row)} | {row['round_trips']:.1f} | {shown} |")
-    text += [
-        "",
-        "The best value of each column has a star. The row loops of skimage process a sample of the rows: their time "
-        f"is scaled to all rows, their PSNR is that of the sample. Speed: medians of {options.runs} alternating runs "
-        "(range); memory relative to the frame in complex64.",
-    ]
+            values = [f"{row['psnr_db'][n]:.2f}{'*' if row['psnr_db'][n] == best[n] else ''}" for n in noises]
+            cells.append((row["method"], *values, f"{row['seconds'][timed]:.2f}"))
+        heads = (f"{scene}, exposure of {exposure} rows", *(f"noise {noise}" for noise in noises), "seconds")
+        text += table(heads, cells)
+    text += table(
+        (f"one frame of {options.size} x {options.size} px", "seconds", "FFT round trips"),
+        [(row["method"], shown_seconds(row), f"{row['round_trips']:.1f}") for row in results if row["part"] == "speed"],
+    )
+    text.append(
+        "The row loops of skimage process a sample of the rows: their time is scaled to all rows, their PSNR is that "
+        f"of the sample. Speed: medians of {options.runs} alternating runs (range)."
+    )
     for row in (row for row in results if row["part"] == "left out"):
         text.append(f"Not compared with {row['peer']}, which cannot be imported: {row['why'].splitlines()[0]}.")
     return text

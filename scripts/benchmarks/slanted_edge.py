@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.measure import one_thread
+from harness import Rows, one_thread, table
 from scipy.special import j1
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
@@ -17,6 +17,8 @@ from edge_truth import draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixe
 
 import rsvib_torch as rsv
 
+OPTIONS = {"seeds": (100, "slanted_edge: noise seeds for Gaussian optics; a fifth for others")}
+QUICK = {"seeds": 2}
 NOISE = 0.008  # 1 % of the contrast, 0.8
 SIGMAS = (0.5, 0.8)
 Transfer = Callable[[np.ndarray], np.ndarray]
@@ -122,14 +124,7 @@ def eight_bits(noise: float, seeds: int) -> dict[str, Any]:
     return {"part": "8 bits", "noise": noise, "mtf50_percent": float(np.mean(measured))}
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument(
-        "--seeds", type=int, default=100, help="noise seeds for Gaussian optics; a fifth for others (default: 100)"
-    )
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """Errors of the MTF and of MTF50 for all optics."""
     fewer = max(options.seeds // 5, 1)
     with one_thread():
@@ -141,34 +136,36 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
         ]
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as Markdown tables."""
-    text = [
-        "| optics | largest MTF error at 0.1 ... 0.5 cycles/px | MTF50, no noise | MTF50 rms, noise 1 % | bound |",
-        "|---|---|---|---|---|",
+    of_part = {part: [row for row in results if row["part"] == part] for part in ("gaussian", "other", "8 bits")}
+    rounding = (f"{row['mtf50_percent']:+.2f} % at noise {row['noise']:g}" for row in of_part["8 bits"])
+    measured = ("MTF50, no noise", "MTF50 rms, noise 1 %")
+    return [
+        *table(
+            ("optics", "largest MTF error at 0.1 ... 0.5 cycles/px", *measured, "bound"),
+            [
+                (
+                    row["optics"],
+                    f"{row['mtf_error']:.0e}",
+                    f"{row['mtf50_percent']:.0e} %",
+                    f"{row['noisy_percent']:.2f} %",
+                    f"{row['bound_percent']:.2f} %",
+                )
+                for row in of_part["gaussian"]
+            ],
+        ),
+        *table(
+            ("optics", "largest MTF error at 0.02 ... 0.5 cycles/px", *measured),
+            [
+                (
+                    row["optics"],
+                    f"{row['mtf_error']:.0e}",
+                    f"{row['mtf50_percent']:+.4f} %",
+                    f"{row['noisy_percent']:.2f} %",
+                )
+                for row in of_part["other"]
+            ],
+        ),
+        f"8 bits, sigma = 0.5 px, contrast 204 counts, mean error of MTF50: {', '.join(rounding)}.",
     ]
-    text += [
-        f"| {row['optics']} | {row['mtf_error']:.0e} | {row['mtf50_percent']:.0e} % | {row['noisy_percent']:.2f} % "
-        f"| {row['bound_percent']:.2f} % |"
-        for row in results
-        if row["part"] == "gaussian"
-    ]
-    text += [
-        "",
-        "| optics | largest MTF error at 0.02 ... 0.5 cycles/px | MTF50, no noise | MTF50 rms, noise 1 % |",
-        "|---|---|---|---|",
-    ]
-    text += [
-        f"| {row['optics']} | {row['mtf_error']:.0e} | {row['mtf50_percent']:+.4f} % | {row['noisy_percent']:.2f} % |"
-        for row in results
-        if row["part"] == "other"
-    ]
-    text += [
-        "",
-        "8 bits, sigma = 0.5 px, contrast 204 counts, mean error of MTF50: "
-        + ", ".join(
-            f"{row['mtf50_percent']:+.2f} % at noise {row['noise']:g}" for row in results if row["part"] == "8 bits"
-        )
-        + ".",
-    ]
-    return text

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.measure import plain_environment
+from harness import Rows, plain_environment, table
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
@@ -24,6 +24,12 @@ from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 
+OPTIONS = {
+    "frames": ((100, 1000), "streaming: lengths of the stacks"),
+    "frame_size": (1024, "streaming: rows and columns"),
+    "memory": ("2GB", "streaming: memory of the process"),
+}
+QUICK = {"frames": (22,), "frame_size": 128}
 _DRAWN, WINDOW = 14, 8  # frames; period of the vibration, and of the stack
 DETECTION = {"method": "bands", "tones": 1, "band_step": 32, "search": 8}
 RESTORATION = {"method": "dewarp"}
@@ -34,13 +40,6 @@ torch.set_num_threads(1)
 from benchmarks import streaming
 print(json.dumps(streaming.one_run(**json.loads(sys.argv[1]))))
 """
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--frames", type=int, nargs="+", default=[100, 1000], help="streaming: lengths of the stacks")
-    parser.add_argument("--frame-size", type=int, default=1024, help="streaming: rows and columns (default: 1024)")
-    parser.add_argument("--memory", default="2GB", help="streaming: memory of the process (default: 2GB)")
 
 
 def timing_of(size: int) -> rsv.SensorTiming:
@@ -137,11 +136,11 @@ def _computing_alone(source: Path, size: int, windows: int) -> float:
     return (time.perf_counter() - begin) / sum(window.kept for window in cut)
 
 
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """Runs of each length; then one worker with and without input and output, alternating."""
     import torch  # noqa: PLC0415
 
-    results: list[dict[str, Any]] = []
+    results: Rows = []
     size = options.frame_size
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -171,23 +170,23 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as Markdown tables."""
-    table = [
+    names = ("seconds_a_frame", "cpu_seconds_a_frame", "peak_memory_gb")
+    text = [
         f"Stacks of {options.frame_size} x {options.frame_size} 16-bit frames, windows of {WINDOW}, bands and dewarp.",
         "",
-        "| run | s per frame | CPU s per frame | peak memory (GB) |",
-        "|---|---|---|---|",
+        *table(
+            ("run", "s per frame", "CPU s per frame", "peak memory (GB)"),
+            [(row["name"], *(f"{row[name]:.3f}" if name in row else "" for name in names)) for row in results],
+        ),
     ]
-    for row in results:
-        cpu, peak = row.get("cpu_seconds_a_frame"), row.get("peak_memory_gb")
-        cells = ["" if value is None else f"{value:.3f}" for value in (row["seconds_a_frame"], cpu, peak)]
-        table.append(f"| {row['name']} | {' | '.join(cells)} |")
     runs = [row for row in results if "memory" in row["name"]]
     if len(runs) > 1:
-        ratios = [
-            runs[-1][name] / runs[0][name] for name in ("peak_memory_gb", "seconds_a_frame", "cpu_seconds_a_frame")
+        time_, cpu, peak = (runs[-1][name] / runs[0][name] for name in names)
+        text += [
+            f"Longest over shortest: memory {peak:.3f}, time per frame {time_:.3f}, CPU time {cpu:.3f}.",
+            "",
         ]
-        table += ["", "Longest over shortest: memory {:.3f}, time per frame {:.3f}, CPU time {:.3f}.".format(*ratios)]
     rate = next(row["rate"] for row in results if "rate" in row)
-    return [*table, "", f"With reading and writing: {100 * rate:.0f} % of the rate of computation only."]
+    return [*text, f"With reading and writing: {100 * rate:.0f} % of the rate of computation only."]

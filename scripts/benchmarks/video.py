@@ -20,12 +20,18 @@ from typing import Any
 import av
 import numpy as np
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from harness import Rows, table
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.stacks import process_video
 
+OPTIONS = {
+    "video_frames": (300, "video: frames"),
+    "video_rows": (1080, "video: rows, 16:9"),
+}
+QUICK = {"video_frames": 12, "video_rows": 180}
 RATE, MARGIN, SEED, NOISE = 30, 32, 3, 0.004
 EXPOSURE_ROWS = 15
 AMPLITUDE, FREQUENCY, PHASE = np.array([2.1, 1.6]), np.array([52.0, 71.0]), np.array([0.5, 1.0])
@@ -56,12 +62,6 @@ PARTS: dict[str, list[tuple[str, str]]] = {
 CODECS = "decoding, encoding and the rest"
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--video-frames", type=int, default=300, help="frames of the video (default: 300)")
-    parser.add_argument("--video-rows", type=int, default=1080, help="rows of the video, 16:9 (default: 1080)")
-
-
 def timing_of(rows: int) -> rsv.SensorTiming:
     """A camera of 30 frames/s with a tenth of the frame period for blanking."""
     row_time = 0.9 / RATE / rows
@@ -79,16 +79,8 @@ def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Arra
         # rows of chroma lie between two rows of luma
         later = 2 * np.pi * FREQUENCY * 0.5 * (step - 1) * timing.row_time
         shake = Shake(AMPLITUDE[:, None] / step, FREQUENCY[:, None], (PHASE + later)[:, None], np.zeros(2))
-        taken = take_frames(
-            closed(scene, MARGIN // 2),
-            shake,
-            row_time=step * timing.row_time,
-            exposure_rows=EXPOSURE_ROWS / step,
-            frame_rows=timing.frame_rows / step,
-            num_frames=min(count, RATE),
-            size=size,
-            between=4,
-        )
+        chroma = rsv.SensorTiming(step * timing.row_time, EXPOSURE_ROWS / step, timing.frame_rows / step)
+        taken = take_frames(closed(scene, MARGIN // 2), shake, chroma, min(count, RATE), size, between=4)
         noisy = taken + NOISE / step * np.random.default_rng(SEED + number).standard_normal(taken.shape)
         low, high = (16, 235) if step == 1 else (16, 240)
         counts.append(np.clip(np.round(low + (high - low) * noisy), 0, 255).astype(np.uint8))
@@ -160,7 +152,7 @@ def processor_times(parts: dict[str, list[tuple[str, str]]]) -> Iterator[Counter
             setattr(owner, name, function)
 
 
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """Figures of each method, and of the video as taken."""
     count = options.video_frames
     planes, still = planes_of(options.video_rows, count)
@@ -189,7 +181,7 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The tables in Markdown."""
     taken, *methods = results
     height, count = options.video_rows, options.video_frames
@@ -199,9 +191,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         "machine, processor time much less. The figures before are those of windows of eight frames, on 24 frames of a "
         "photograph of 1920 x 1080 px.",
         "",
-        "| method | processor s per frame | goal | before | frames/s | PSNR of Y (dB) | PSNR of U, V (dB) | MB per s |",
-        "|---|---|---|---|---|---|---|---|",
     ]
+    lines_of_methods = []
     for row in [taken, *methods]:
         timed = [""] * 4
         if "cpu" in row:
@@ -209,10 +200,8 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
             met = "met" if row["cpu"] <= goal else "**missed**"
             timed = [f"{row['cpu']:.3f}", f"{goal} ({met})", f"{BEFORE[row['name']]:.2f}", f"{row['rate']:.1f}"]
         rate = row["size"] / 1e6 / count * RATE
-        cells = [row["name"], *timed, *(f"{value:.1f}" for value in row["psnr"]), f"{rate:.1f}"]
-        text.append(f"| {' | '.join(cells)} |")
-    names = list(methods[0]["parts"])
-    text += ["", "Shares of the processor time:", "", f"| part | {' | '.join(row['name'] for row in methods)} |"]
-    text.append("|---" * (1 + len(methods)) + "|")
-    text += [f"| {name} | {' | '.join(format(row['parts'][name], '.0%') for row in methods)} |" for name in names]
-    return text
+        lines_of_methods.append((row["name"], *timed, *(f"{value:.1f}" for value in row["psnr"]), f"{rate:.1f}"))
+    heads = ("method", "processor s per frame", "goal", "before", "frames/s", "PSNR of Y (dB)", "PSNR of U, V (dB)")
+    shares = [(name, *(f"{row['parts'][name]:.0%}" for row in methods)) for name in methods[0]["parts"]]
+    text += [*table((*heads, "MB per s"), lines_of_methods), "Shares of the processor time:", ""]
+    return text + table(("part", *(row["name"] for row in methods)), shares)

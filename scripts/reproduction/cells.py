@@ -10,6 +10,7 @@ from reproduction.trials import METHODS, RESTORED_BY
 
 TABLES: dict[Target, str] = {"chart": "Table 2", "landscape": "Table 3"}
 FRAMES = ("frame p", "frame p + 1")
+NAMES = {"paper": "the paper's methods", "default": "default methods", "joint": "both frames jointly"}
 _METRICS = {
     "psnr": ("PSNR", "dB", 2),
     "ssim": ("SSIM", "", 4),

@@ -16,13 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.measure import one_thread
+from harness import Rows, one_thread, table
 from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration import judge_restoration, restore
 
+OPTIONS = {
+    "verdict_draws": (60, "verdict: random recordings"),
+    "verdict_seed": (0, "verdict: seed of the first recording"),
+}
+QUICK = {"verdict_draws": 1}
 HEIGHT, WIDTH, MARGIN, RIM = 384, 192, 48, 32
 ROW_TIME = 4e-5
 NOISES = (0.0, 0.002, 0.005, 0.01, 0.02, 0.04)
@@ -78,7 +83,7 @@ def psnr(images: Tensor, still: Tensor) -> float:
     return float(-10 * torch.log10((images[inner].double() - still[inner]).square().mean()))
 
 
-def cases(draw: int) -> list[dict[str, Any]]:
+def cases(draw: int) -> Rows:
     """All hypotheses on one random recording of two frames: verdict, its scores, and the true gain in dB."""
     generator = np.random.default_rng(draw)
     size = (HEIGHT + 2 * MARGIN, WIDTH + 2 * MARGIN)
@@ -87,18 +92,8 @@ def cases(draw: int) -> list[dict[str, Any]]:
     truth = draw_vibration(generator)
     timing = rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=exposure, frame_rows=int(generator.integers(384, 700)))
     vibration = as_vibration(truth)
-    shake = Shake(
-        *(value.numpy() for value in (vibration.amplitude, vibration.frequency, vibration.phase)), np.zeros(2)
-    )
-    taken = take_frames(
-        closed(scene.double().numpy(), 24),
-        shake,
-        row_time=ROW_TIME,
-        exposure_rows=exposure,
-        frame_rows=timing.frame_rows,
-        num_frames=2,
-        size=(HEIGHT, WIDTH),
-    )
+    periodic = closed(scene.double().numpy(), 24)
+    taken = take_frames(periodic, Shake.of(vibration), timing, 2, (HEIGHT, WIDTH))
     frames = torch.from_numpy(taken + noise * generator.standard_normal(taken.shape)).float()
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN].double()
     raw = psnr(frames, still)
@@ -158,24 +153,17 @@ def residual(row: dict[str, Any]) -> float:
     return max(ratios, default=0.0)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--verdict-draws", type=int, default=60, help="verdict: random recordings (default: 60)")
-    parser.add_argument("--verdict-seed", type=int, default=0, help="verdict: seed of the first recording")
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """All cases of the random recordings."""
     with one_thread():
         return [row for draw in range(options.verdict_draws) for row in cases(options.verdict_seed + draw)]
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace, tie: float = 0.3) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace, tie: float = 0.3) -> list[str]:
     """Outcomes by the true gain, and the ROC of both scores; gains within ``tie`` dB count as equal."""
     counts = Counter(((row["gain_db"] > tie) - (row["gain_db"] < -tie), row["outcome"]) for row in results)
-    text = ["| true gain | " + " | ".join(OUTCOMES) + " |", "|---" * (len(OUTCOMES) + 1) + "|"]
-    for name, sign in ((f"> {tie} dB", 1), (f"within {tie} dB", 0), (f"< -{tie} dB", -1)):
-        text.append(f"| {name} | " + " | ".join(str(counts[sign, outcome]) for outcome in OUTCOMES) + " |")
+    gains = ((f"> {tie} dB", 1), (f"within {tie} dB", 0), (f"< -{tie} dB", -1))
+    text = table(("true gain", *OUTCOMES), [(name, *(counts[sign, one] for one in OUTCOMES)) for name, sign in gains])
     visible = [row for row in results if row["outcome"] != "unknown"]
     motion = [row for row in visible if row["hypothesis"] != "amplitude +10 %" and row["group"] != "smoothing"]
     right = [row for row in visible if residual(row) < 0.35 and abs(row["gain_db"]) > tie]
@@ -189,16 +177,14 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace, tie: float
             [row["gain_db"] < 0 for row in right],
         ),
     }
-    text += [
-        "",
-        "| score | area under the curve | best threshold | sensitivity | specificity | cases |",
-        "|---" * 6 + "|",
-    ]
+    curves = []
     for name, (score, positive) in scores.items():
         values, truth = torch.tensor(score, dtype=torch.float64), torch.tensor(positive)
         if not bool(truth.any()) or bool(truth.all()):
             continue  # no curve without both kinds of cases
         threshold, sensitivity, specificity = best_threshold(values, truth)
         area = area_under_curve(values, truth)
-        text.append(f"| {name} | {area:.3f} | {threshold:.2f} | {sensitivity:.2f} | {specificity:.2f} | {len(truth)} |")
-    return text
+        rates = (f"{value:.2f}" for value in (threshold, sensitivity, specificity))
+        curves.append((name, f"{area:.3f}", *rates, len(truth)))
+    heads = ("score", "area under the curve", "best threshold", "sensitivity", "specificity", "cases")
+    return text + table(heads, curves)

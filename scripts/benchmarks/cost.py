@@ -1,10 +1,12 @@
-"""Time of detection and restoration of difficult inputs, over the time of a plain vibration of the same size.
+"""Time of detection, in seconds and FFT round trips, and of difficult inputs over that of a plain vibration.
 
-The recordings are those of ``honesty_cases`` and some of other shapes and numbers of frames. An input and its plain
-counterpart alternate, and the shortest times are compared, because other load on the machine can only increase them.
+A round trip is rfft2 and irfft2 of one frame. The difficult recordings are those of ``honesty_cases`` and some of
+other shapes and numbers of frames. An input and its plain counterpart alternate, and the shortest times are compared,
+because other load on the machine can only increase them.
 """
 
 import argparse
+import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,12 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.honesty_cases import BLANKING, FRAME_PERIOD, of_tones, plain, record, recording, tones_of
-from benchmarks.measure import seconds_of
+from harness import Rows, in_turns, named, seconds_of, shown_seconds, table
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 
+OPTIONS = {
+    "cost_size": (384, "cost: rows and columns of the difficult inputs"),
+    "cost_inputs": (100, "cost: at most so many difficult inputs"),
+}
+QUICK = {"cost_size": 128, "cost_inputs": 2}
 SEED, NOISE = 5, 0.005
+PLAIN_SEED, MARGIN = 11, 40  # of the plain vibration whose time is measured in round trips; px
 BOUND = 3.0  # times the time of the plain recording
 OF_CLASSES = {  # recordings (class, number) of honesty_cases
     "wrong timing": (
@@ -63,13 +71,6 @@ class Input:
     timing: rsv.SensorTiming
     plain_frames: torch.Tensor
     plain_timing: rsv.SensorTiming
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument(
-        "--cost-size", type=int, default=384, help="cost: rows and columns of the difficult inputs (default: 384)"
-    )
 
 
 def _frames(values: Any) -> torch.Tensor:
@@ -214,36 +215,72 @@ def measure(task: Input, runs: int) -> dict[str, Any]:
     }
 
 
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Figures of all inputs."""
-    return [
+def plain_rows(options: argparse.Namespace) -> Rows:
+    """Time of each method for two and four frames of a plain vibration, alternating with the round trip."""
+    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=options.size)
+    vibration = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
+    scene = city_and_fields(options.size + 2 * MARGIN, options.size + 2 * MARGIN, seed=PLAIN_SEED)
+    frames = rsv.simulate_frames(scene, timing, vibration, 4, frame_size=(options.size, options.size))
+    frames = frames + NOISE * torch.randn(frames.shape, generator=torch.Generator().manual_seed(PLAIN_SEED))
+    results = []
+    for device in options.device:
+        taken = frames.to(device)
+        tasks = {"round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]))}
+        for method, count in itertools.product(("bands", "direct"), (2, 4)):
+            tasks[f"{method}, {count} frames"] = lambda m=method, f=taken[:count]: rsv.detect_vibration(
+                f, timing, method=m
+            )
+        done = in_turns(tasks, options.runs)
+        unit = done["round trip"].seconds
+        results += [
+            {"name": named(name, device), **timed.figures(), "round_trips": timed.seconds / unit}
+            for name, timed in done.items()
+        ]
+    return results
+
+
+def rows(options: argparse.Namespace) -> Rows:
+    """Time of a plain vibration, then of all difficult inputs."""
+    return plain_rows(options) + [
         {"part": "bounded", "name": name, **measure(build(options.cost_size), options.runs)}
-        for name, build in inputs().items()
+        for name, build in itertools.islice(inputs().items(), options.cost_inputs)
     ]
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
-    """The inputs, slowest first, as a Markdown table."""
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
+    """Both tables in Markdown; the difficult inputs with the slowest first."""
+    plain_cases = [row for row in results if row.get("part") != "bounded"]
+    difficult = [row for row in results if row.get("part") == "bounded"]
     both = {
         row["name"]: (row["detection"] + row["restoration"]) / (row["plain_detection"] + row["plain_restoration"])
-        for row in results
+        for row in difficult
     }
-    slowest = sorted(results, key=lambda row: -both[row["name"]])
-    of_parts = [[row[f"{of}_ratio"] for row in results] for of in ("detection", "restoration")]
+    of_parts = [[row[f"{of}_ratio"] for row in difficult] for of in ("detection", "restoration")]
     beyond = [sum(ratio > BOUND for ratio in ratios) for ratios in (list(both.values()), *of_parts)]
-    text = [
-        f"{len(results)} difficult inputs of {options.cost_size} x {options.cost_size} px, or as many pixels; times "
+    return [
+        *table(
+            (f"detection, {options.size}^2", "seconds", "FFT round trips"),
+            [(row["name"], shown_seconds(row), f"{row['round_trips']:.1f}") for row in plain_cases],
+        ),
+        f"{len(difficult)} difficult inputs of {options.cost_size} x {options.cost_size} px, or as many pixels; times "
         "over those of a plain vibration of the same size, the shortest of alternating runs. Restoration uses the "
         f"result of detection. More than {BOUND:g} times as long: both together of {beyond[0]} inputs, detection of "
         f"{beyond[1]}, restoration of {beyond[2]}.",
         "",
-        "| input | frames | detection (s) | ratio | restoration (s) | ratio | ratio of both | first reason |",
-        "|---|---|---|---|---|---|---|---|",
+        *table(
+            ("input", "frames", "detection (s)", "ratio", "restoration (s)", "ratio", "ratio of both", "first reason"),
+            [
+                (
+                    row["name"],
+                    "{} of {} x {}".format(*row["shape"]),
+                    f"{row['detection']:.2f}",
+                    f"{row['detection_ratio']:.1f}",
+                    f"{row['restoration']:.2f}",
+                    f"{row['restoration_ratio']:.1f}",
+                    f"{both[row['name']]:.1f}",
+                    row["reason"],
+                )
+                for row in sorted(difficult, key=lambda row: -both[row["name"]])
+            ],
+        ),
     ]
-    for row in slowest:
-        count, height, width = row["shape"]
-        text.append(
-            f"| {row['name']} | {count} of {height} x {width} | {row['detection']:.2f} | {row['detection_ratio']:.1f} "
-            f"| {row['restoration']:.2f} | {row['restoration_ratio']:.1f} | {both[row['name']]:.1f} | {row['reason']} |"
-        )
-    return text

@@ -1,24 +1,21 @@
-#!/usr/bin/env python
 """Row time from motion: errors, stated standard deviations and wrong results on frames of an independent camera.
 
-Every case is simulated with several noise seeds, and with phases and (case "random") frequencies of a seed. Printed are
-the rms error of the row time in per cent, the rms ratio of error to stated standard deviation, the coverage of the
-95 % intervals, the number of results that are reliable, and of those that are reliable and wrong by more than 1 %.
+Every case is simulated with several noise seeds, and case "random" with new amplitudes, frequencies and phases for each
+of them. A result is wrong if it is reliable and off by more than 1 %, or has the wrong direction. The Cramér-Rao bound
+is that with all tones and the image motion unknown.
 """
 
 import argparse
 import math
-import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.detection_cases import RIM
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from harness import Rows, table
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
@@ -51,6 +48,15 @@ CASES = {
     "random": Case("two random tones", ((), ()), ((), ())),
 }
 
+OPTIONS = {
+    "row_time_cases": (tuple(CASES), "row_time: motions", CASES),
+    "row_time_size": (256, "row_time: rows and columns"),
+    "row_time_frames": (8, "row_time: frames"),
+    "row_time_seeds": (20, "row_time: seeds"),
+    "row_time_bound": (False, "row_time: also compute the Cramér-Rao bound"),
+}
+QUICK = {"row_time_cases": ("one",), "row_time_size": 128, "row_time_frames": 4, "row_time_seeds": 1}
+
 
 def shake_of(case: Case, seed: int) -> Shake:
     """The motion with phases, and where the case leaves them open amplitudes and frequencies, of a seed."""
@@ -71,16 +77,8 @@ def taken(shake: Shake, size: int, num_frames: int, seed: int) -> tuple[Array, A
     reach = np.ceil(shake.reach((num_frames + 1) * FRAME_PERIOD)).astype(int) + RIM + 8
     scene = closed(city_and_fields(size + 2 * int(reach[1]), size + 2 * int(reach[0]), seed).double().numpy(), RIM)
     row_time = READOUT / size
-    frames = take_frames(
-        scene,
-        shake,
-        row_time=row_time,
-        exposure_rows=EXPOSURE / row_time,
-        frame_rows=FRAME_PERIOD / row_time,
-        num_frames=num_frames,
-        size=(size, size),
-    )
-    return frames, scene
+    timing = rsv.SensorTiming(row_time, EXPOSURE / row_time, FRAME_PERIOD / row_time)
+    return take_frames(scene, shake, timing, num_frames, (size, size)), scene
 
 
 def bound(scene: Array, shake: Shake, size: int, num_frames: int) -> float:
@@ -111,24 +109,23 @@ def bound(scene: Array, shake: Shake, size: int, num_frames: int) -> float:
 
     sensitivity(torch.zeros(1, 1, dtype=torch.float64))
     recording = Recording(torch.from_numpy(scene), timing, motion, num_frames, (size, size), tuple(axes), sensitivity)
-    each = projected_information(recording)
+    separate = projected_information(recording)
     merge = torch.eye(len(axes), dtype=torch.float64)[:, :-1]
     merge[-1, -1] = 1.0
-    information = merge.T @ each @ merge
+    information = merge.T @ separate @ merge
     scale = information.diagonal().rsqrt()
     inverse = torch.linalg.inv(information * scale * scale[:, None]) * scale * scale[:, None]
     return NOISE * float(inverse[-1, -1].sqrt())
 
 
-def run(case: Case, options: argparse.Namespace) -> None:
-    """Print the figures of one case."""
-    row_time = READOUT / options.size
-    rows, stds, wrong, reliable, begin = [], [], 0, 0, time.perf_counter()
-    frames, scene, shake = None, None, shake_of(case, options.first)
-    for seed in range(options.first, options.first + options.seeds):
-        if frames is None or case is CASES["random"] or options.new_motions:
+def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Figures of one case, row times relative to the true one."""
+    case, row_time, begin = CASES[name], READOUT / options.row_time_size, time.perf_counter()
+    errors, stds, wrong, reliable, frames = [], [], 0, 0, None
+    for seed in range(options.row_time_seeds):
+        if frames is None or name == "random":
             shake = shake_of(case, seed)
-            frames, scene = taken(shake, options.size, options.frames, 3)
+            frames, scene = taken(shake, options.row_time_size, options.row_time_frames, 3)
         noisy = frames + NOISE * np.random.default_rng(1000 + seed).standard_normal(frames.shape)
         found = rsv.calibrate_row_time_by_motion(
             torch.from_numpy(noisy).float(),
@@ -138,45 +135,37 @@ def run(case: Case, options: argparse.Namespace) -> None:
             exposure_time=EXPOSURE,
         )
         error = (found.row_time or math.nan) / row_time - 1
-        stated = (found.row_time_std or math.nan) / row_time
         off = not abs(error) < 0.01 or found.readout_direction != "forward"
         wrong += found.reliable and off
         reliable += found.reliable
         if found.reliable and not off:
-            rows.append(error)
-            stds.append(stated)
-        if options.verbose:
-            why = "" if found.reliable else f" ({found.reasons[0][:90]})"
-            print(f"  {seed}: {100 * error:+.5f} ± {100 * stated:.5f} %{why}", flush=True)
-    line = f"{case.name}: {options.seeds} results, {reliable} reliable, {wrong} of them wrong"
-    if rows:
-        errors = np.array(rows)
-        ratio = errors / np.array(stds)
-        line += (
-            f"; rms error {100 * np.sqrt(np.mean(errors**2)):.5f} %, largest {100 * np.abs(errors).max():.5f} %, "
-            f"over stated std {np.sqrt(np.mean(ratio**2)):.2f}, "
-            f"95 % intervals cover {np.mean(np.abs(ratio) < 1.96):.0%}"
-        )
-    if options.bound and case is not CASES["free"] and scene is not None:
-        line += f"; bound {100 * bound(scene, shake, options.size, options.frames) / row_time:.5f} %"
-    print(f"{line}; {(time.perf_counter() - begin) / options.seeds:.0f} s each", flush=True)
+            errors.append(error)
+            stds.append((found.row_time_std or math.nan) / row_time)
+    least = None
+    if options.row_time_bound and name != "free":
+        least = bound(scene, shake, options.row_time_size, options.row_time_frames) / row_time
+    seconds = (time.perf_counter() - begin) / options.row_time_seeds
+    figures = {"errors": errors, "stds": stds, "wrong": wrong, "reliable": reliable, "bound": least}
+    return {"case": case.name, "seconds": seconds, **figures}
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
-    parser.add_argument("--size", type=int, default=256, help="rows and columns")
-    parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--new-motions", action="store_true", help="new phases for every seed")
-    parser.add_argument("--bound", action="store_true", help="also compute the Cramér-Rao bound")
-    parser.add_argument("--verbose", action="store_true", help="print every result")
-    options = parser.parse_args()
-    for name in options.cases:
-        run(CASES[name], options)
-    return 0
+def rows(options: argparse.Namespace) -> Rows:
+    """Figures of all cases."""
+    return [run(name, options) for name in options.row_time_cases]
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
+    """The figures as a Markdown table."""
+    heads = ("motion", "results", "reliable", "of these wrong", "rms error (%)", "largest (%)", "bound (%)")
+    cells = []
+    for row in results:
+        errors, least = np.array(row["errors"]), row["bound"]
+        figures = [""] * 4
+        if len(errors):
+            z = errors / np.array(row["stds"])
+            figures = [f"{100 * np.sqrt(np.mean(errors**2)):.5f}", f"{100 * np.abs(errors).max():.5f}"]
+            figures += [f"{np.sqrt(np.mean(z**2)):.2f}", f"{np.mean(np.abs(z) < 1.96):.0%}"]
+        shown_bound = "" if least is None else f"{100 * least:.5f}"
+        counts = (options.row_time_seeds, row["reliable"], row["wrong"])
+        cells.append((row["case"], *counts, *figures[:2], shown_bound, *figures[2:], f"{row['seconds']:.0f}"))
+    return table((*heads, "error / stated std", "within 95 %", "seconds of a result"), cells)

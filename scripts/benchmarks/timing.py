@@ -27,11 +27,19 @@ import numpy as np
 import torch
 from benchmarks.honesty import judge_axis, psnr
 from benchmarks.honesty_cases import BLANKING, Recording, plain, record
-from benchmarks.measure import one_thread
+from harness import Rows, one_thread, table
 
 import rsvib_torch as rsv
 
-SCENES = ("city", "chart", "text")
+OPTIONS = {
+    "mistake_size": (160, "timing: rows and columns of the frames"),
+    "mistake_vibrations": (3, "timing: vibrations of each scene"),
+    "mistake_scenes": (("city", "chart", "text"), "timing: scenes"),
+    "mistake_names": ((), "timing: mistakes, all if none are named", str),
+    "mistake_processes": (2, "timing: processes"),
+}
+QUICK = {"mistake_size": 128, "mistake_vibrations": 1, "mistake_scenes": ("city",), "mistake_processes": 1}
+QUICK |= {"mistake_names": ("none", "frame_rows = image height")}
 NUM_FRAMES = (2, 4, 8, 12)
 EXPOSURE = 100.0  # rows of a frame of 2048 rows, so that twice and half of it differ in their blur
 RESTORED = 2  # frames
@@ -145,57 +153,52 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
     return case
 
 
-def judge_recording(scene: str, number: int, size: int) -> list[dict[str, Any]]:
+def judge_recording(scene: str, number: int, size: int, names: tuple[str, ...]) -> Rows:
     """Outcomes of all mistakes with a recording."""
     with one_thread():
         taken = take(scene, number, size)
         return [
             {"scene": scene, "number": number} | judge_mistake(taken, name, count)
             for count in NUM_FRAMES
-            for name in MISTAKES
+            for name in names or MISTAKES
         ]
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    group = parser.add_argument_group("timing mistakes")
-    group.add_argument("--mistake-size", type=int, default=160, help="rows and columns of the frames (default: 160)")
-    group.add_argument("--mistake-vibrations", type=int, default=3, help="vibrations of each scene (default: 3)")
-    group.add_argument("--mistake-processes", type=int, default=2, help="processes (default: 2)")
-
-
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """All mistakes with all recordings."""
     recordings = [
-        (scene, number, options.mistake_size) for scene in SCENES for number in range(options.mistake_vibrations)
+        (scene, number, options.mistake_size, tuple(options.mistake_names))
+        for scene in options.mistake_scenes
+        for number in range(options.mistake_vibrations)
     ]
     with ProcessPoolExecutor(options.mistake_processes, multiprocessing.get_context("spawn")) as pool:
-        each = list(pool.map(judge_recording, *zip(*recordings, strict=True)))
-    return [case for cases in each for case in cases]
+        done = list(pool.map(judge_recording, *zip(*recordings, strict=True)))
+    return [case for cases in done for case in cases]
 
 
-def share(cases: list[dict[str, Any]], outcome: str) -> float:
+def share(cases: Rows, outcome: str) -> float:
     """Percentage of the axes of cases with an outcome."""
     return float(100 * np.mean([one == outcome for case in cases for one in case["outcomes"]]))
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """Tables of the shares and of the loss, one row per mistake and one column per number of frames."""
-    chosen = {
-        (name, count): [case for case in results if (case["mistake"], case["num_frames"]) == (name, count)]
-        for name in MISTAKES
-        for count in NUM_FRAMES
+    names = list(dict.fromkeys(case["mistake"] for case in results))
+    chosen: dict[tuple[str, int], Rows] = {}
+    for case in results:
+        chosen.setdefault((case["mistake"], case["num_frames"]), []).append(case)
+    correct = {
+        (case["scene"], case["number"], case["num_frames"]): case for case in results if case["mistake"] == "none"
     }
-    correct = {(case["scene"], case["number"], case["num_frames"]): case for case in chosen_cases(results, "none")}
 
-    def detected(name: str, cases: list[dict[str, Any]]) -> str:
+    def detected(name: str, cases: Rows) -> str:
         named = 100 * np.mean([one for case in cases for one in case["named"]])
         return f"{share(cases, 'detected'):.0f} ({named:.0f})"
 
-    def wrong(name: str, cases: list[dict[str, Any]]) -> str:
+    def wrong(name: str, cases: Rows) -> str:
         return f"{share(cases, 'assumed'):.0f} / {share(cases, 'missed'):.0f}"
 
-    def loss(name: str, cases: list[dict[str, Any]]) -> str:
+    def loss(name: str, cases: Rows) -> str:
         of_cases = [
             correct[case["scene"], case["number"], case["num_frames"]]["restored_db"] - case["restored_db"]
             for case in cases
@@ -203,27 +206,20 @@ def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[st
         gain = np.mean([case["restored_db"] - case["raw_db"] for case in cases])
         return f"(gain {gain:.1f})" if name == "none" else f"{np.mean(of_cases):.1f}"
 
-    def table(head: str, cell: Callable[[str, list[dict[str, Any]]], str]) -> list[str]:
-        counted = [
-            f"| {name} | " + " | ".join(cell(name, chosen[name, count]) for count in NUM_FRAMES) + " |"
-            for name in MISTAKES
-        ]
-        columns = " | ".join(f"{count} frames" for count in NUM_FRAMES)
-        return ["", head, "", f"| mistake | {columns} |", "|---" * (1 + len(NUM_FRAMES)) + "|", *counted]
+    def counted(head: str, cell: Callable[[str, Rows], str]) -> list[str]:
+        cells = [(name, *(cell(name, chosen[name, count]) for count in NUM_FRAMES)) for name in names]
+        return [head, "", *table(("mistake", *(f"{count} frames" for count in NUM_FRAMES)), cells)]
 
     return [
         f"Frames of {options.mistake_size} x {options.mistake_size} px, exposed for {EXPOSURE:.0f} / 2048 of the rows;",
-        f"a frame period has {BLANKING:g} row times per row. {len(SCENES)} scenes with {options.mistake_vibrations}",
+        f"a frame period has {BLANKING:g} row times per row. {len({case['scene'] for case in results})} scenes with "
+        f"{options.mistake_vibrations}",
         "vibrations each, one tone along each axis. Every cell has both axes of these recordings. The row 'none' is",
         "for correct timing, and contains the false alarms.",
-        *table("Percentage of axes that are detected as doubtful (of all axes, with the cause named):", detected),
-        *table(
+        "",
+        *counted("Percentage of axes that are detected as doubtful (of all axes, with the cause named):", detected),
+        *counted(
             "Percentage of axes that are reliable and wrong, with / without the setting among the assumptions:", wrong
         ),
-        *table("Loss of restoration in dB relative to the correct timing, mean over the recordings:", loss),
+        *counted("Loss of restoration in dB relative to the correct timing, mean over the recordings:", loss),
     ]
-
-
-def chosen_cases(results: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """Cases of a mistake."""
-    return [case for case in results if case["mistake"] == name]

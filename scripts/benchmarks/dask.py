@@ -14,20 +14,20 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import streaming
+from harness import Rows, table
 
 from rsvib_torch.io import open_stack
 from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 
+OPTIONS = {
+    "dask_frames": (113, "dask: length of the stack"),
+    "dask_size": (512, "dask: rows and columns"),
+    "dask_workers": ((1, 2), "dask: numbers of workers"),
+}
+QUICK = {"dask_frames": 22, "dask_size": 96, "dask_workers": (1,)}
 _LINKS = {"1 Gbit/s": 125e6, "10 Gbit/s": 1250e6}  # bytes per second
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this section."""
-    parser.add_argument("--dask-frames", type=int, default=113, help="dask: length of the stack (default: 113)")
-    parser.add_argument("--dask-size", type=int, default=512, help="dask: rows and columns (default: 512)")
-    parser.add_argument("--dask-workers", type=int, nargs="+", default=[1, 2], help="dask: numbers of workers")
 
 
 def _process(source: Path, sink: Path, size: int, **options: Any) -> Any:
@@ -94,7 +94,7 @@ def _one_cluster(workers: int, source: Path, few: Path, sink: Path, size: int, r
     }
 
 
-def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(options: argparse.Namespace) -> Rows:
     """A local run on one thread, then Dask with each number of workers; the output must be the same."""
     size, runs = options.dask_size, max(1, min(options.runs, 3))
     with tempfile.TemporaryDirectory() as name:
@@ -112,35 +112,31 @@ def rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     return results
 
 
-def lines(results: list[dict[str, Any]], options: argparse.Namespace) -> list[str]:
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as a Markdown table, and the limits of linear scaling."""
-    table = [
+    cells = []
+    for row in results:
+        cpu = (f"{row[key]:.4f}" if key in row else "" for key in ("worker_cpu_a_frame", "here_cpu_a_frame"))
+        moved = "" if row.get("moved_a_frame") is None else f"{row['moved_a_frame'] / 1e6:.2f}"
+        same = "" if "same" not in row else "yes" if row["same"] else "NO"
+        cells.append((row["name"], f"{row['seconds_a_frame']:.4f}", *cpu, moved, same))
+    heads = ("run", "s per frame", "CPU s of workers", "CPU s of scheduler, client and writer")
+    text = [
         f"Dask on this machine: {options.dask_frames} frames of {options.dask_size} x {options.dask_size} px, 16 bit.",
         "",
-        "| run | s per frame | CPU s of workers | CPU s of scheduler, client and writer | MB over the local network "
-        "| same bytes |",
-        "|---|---|---|---|---|---|",
+        *table((*heads, "MB over the local network", "same bytes"), cells),
     ]
-    for row in results:
-        moved = row.get("moved_a_frame")
-        cells = [
-            f"{row['seconds_a_frame']:.4f}",
-            *("" if row.get(key) is None else f"{row[key]:.4f}" for key in ("worker_cpu_a_frame", "here_cpu_a_frame")),
-            "" if moved is None else f"{moved / 1e6:.2f}",
-            "" if "same" not in row else "yes" if row["same"] else "NO",
-        ]
-        table.append(f"| {row['name']} | {' | '.join(cells)} |")
     clusters = results[1:]
     if len(clusters) > 1:
         gain = clusters[0]["seconds_a_frame"] / clusters[-1]["seconds_a_frame"]
-        table += ["", f"{clusters[-1]['name']}: {gain:.2f} times the rate of {clusters[0]['name']}."]
+        text += [f"{clusters[-1]['name']}: {gain:.2f} times the rate of {clusters[0]['name']}.", ""]
     read, sent = results[0]["read"], results[0]["sent"]
     work, here = clusters[0]["worker_cpu_a_frame"], min(row["here_cpu_a_frame"] for row in clusters)
     limits = {"this process": work / here, **{link: work * rate / sent for link, rate in _LINKS.items()}}
-    table += ["", f"Per frame: {read / 1e6:.2f} MB read by a worker, {sent / 1e6:.2f} MB returned."]
-    table.append(
+    return [
+        *text,
+        f"Per frame: {read / 1e6:.2f} MB read by a worker, {sent / 1e6:.2f} MB returned.",
         "Linear scaling ends when the writing process or its network link is saturated: "
         + ", ".join(f"{name} at {count:.0f} workers" for name, count in limits.items())
-        + "."
-    )
-    return table
+        + ".",
+    ]

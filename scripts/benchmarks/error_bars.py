@@ -1,38 +1,47 @@
-#!/usr/bin/env python
 """Validation of standard deviations: errors over estimated standard deviations, on simulated recordings.
 
 Free motions are random walks, smooth motions, sums of three tones, and single tones within 8 % of the frequency at
-which all frames are displaced alike; five frames of drawn cities, noise 0.005. Printed: root mean square of error over
-standard deviation of the part of the motion that differs between frames, and of the whole motion.
+which all frames have the same displacement; five frames of drawn cities, noise 0.005. The error is that of the part of
+the motion that differs between frames, and of the whole motion.
 
 Calibrations have random row times and LED frequencies, in front of a plain wall, with 20 times the noise, of textured
-scenes in one frame, strong and weak, and in four frames. Printed: number of successful calibrations, root mean square
-and median absolute value of error over standard deviation; 1 and 0.67 are expected.
+scenes in one frame, strong and weak, and in four frames. 1 is expected for the root mean square of error over standard
+deviation, 0.67 for the median of its absolute value.
 """
 
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "calibration"))
 import torch
-from motion_truth import common_warp, rms
+from harness import Rows, table
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine
-from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
+
+_TESTS = Path(__file__).parents[2] / "tests"
+sys.path += [str(_TESTS), str(_TESTS / "calibration")]
+
+from motion_truth import common_warp, rms  # noqa: E402
+from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine  # noqa: E402
+from truth import Motion, draw_scene, take_frames  # noqa: E402
 
 Array = NDArray[np.float64]
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
 FRAMES, ROWS, COLUMNS, NOISE, RIM = 5, 192, 160, 0.005, 12
 KINDS = ("walk", "smooth", "tones", "blind")
-RECORDINGS = ("wall", "noisy wall", "textured", "weakly textured", "textured, four frames")
+CALIBRATIONS = ("wall", "noisy wall", "textured", "weakly textured", "textured, four frames")
+OPTIONS = {
+    "bar_kinds": ((*KINDS, *CALIBRATIONS), "error_bars: kinds of motions and calibrations", (*KINDS, *CALIBRATIONS)),
+    "bar_motions": (12, "error_bars: motions of each kind"),
+    "bar_seeds": (1, "error_bars: noise seeds of each motion"),
+    "bar_recordings": (40, "error_bars: recordings of each calibration"),
+}
+QUICK = {"bar_kinds": ("walk", "wall"), "bar_motions": 1, "bar_recordings": 2}
 
 
 class Drawn(Motion):
@@ -62,7 +71,8 @@ class Drawn(Motion):
         return np.asarray(self.curve(times))  # type: ignore[attr-defined]
 
 
-def free_motion(kind: str, motions: int, seeds: int) -> str:
+def free_motion(kind: str, motions: int, seeds: int) -> dict[str, Any]:
+    """Errors of the displacement over its standard deviations, and of the part that differs between frames."""
     pulls, seen = [], []
     moments = (TIMING.row_starts(FRAMES, ROWS) + 0.5 * TIMING.exposure_time).numpy()
     for number in range(motions):
@@ -77,15 +87,19 @@ def free_motion(kind: str, motions: int, seeds: int) -> str:
             left = found.motion.displacement(torch.from_numpy(moments)).numpy() - truth
             left = left - common_warp(left, truth)
             seen.append(rms(left[:, RIM:-RIM]) / found.std_seen.numpy())
+    between = float(np.sqrt(np.mean(np.square(seen))))
+    return {"kind": kind, "number": motions * seeds, "between": between, **spread(np.ravel(pulls))}
+
+
+def spread(pulls: Array) -> dict[str, float]:
+    """Root mean square and median of errors over standard deviations, and the share within two."""
     size = np.abs(pulls)
-    return (
-        f"{kind}, {motions} motions, {seeds} seeds: differences between frames "
-        f"{np.sqrt(np.mean(np.square(seen))):.2f}; whole motion {np.sqrt(np.mean(size**2)):.2f} (median "
-        f"{np.median(size):.2f}; {np.mean(size < 2):.0%} within two)"
-    )
+    rms_ = float(np.sqrt(np.mean(size**2)))
+    return {"rms": rms_, "median": float(np.median(size)), "within_two": float(np.mean(size < 2))}
 
 
-def calibration(kind: str, count: int) -> str:
+def calibration(kind: str, count: int) -> dict[str, Any]:
+    """Errors of the row time over its standard deviation."""
     pulls = []
     for seed in range(count):
         draw = np.random.default_rng(1000 + seed)
@@ -117,27 +131,32 @@ def calibration(kind: str, count: int) -> str:
         except ValueError:
             continue
         pulls.append((found.row_time - row_time) / found.row_time_std)
-    return (
-        f"{kind}: {len(pulls)} of {count} successful, {np.sqrt(np.mean(np.square(pulls))):.2f}, median "
-        f"{np.median(np.abs(pulls)):.2f}, largest {np.max(np.abs(pulls)):.1f}"
+    return {"kind": kind, "number": len(pulls), "between": None, **spread(np.array(pulls))}
+
+
+def rows(options: argparse.Namespace) -> Rows:
+    """All kinds."""
+    return [
+        free_motion(kind, options.bar_motions, options.bar_seeds)
+        if kind in KINDS
+        else calibration(kind, options.bar_recordings)
+        for kind in options.bar_kinds
+    ]
+
+
+def lines(results: Rows, options: argparse.Namespace) -> list[str]:
+    """The figures as a Markdown table."""
+    cells = []
+    for row in results:
+        between = "" if row["between"] is None else f"{row['between']:.2f}"
+        figures = (f"{row['rms']:.2f}", f"{row['median']:.2f}", f"{row['within_two']:.0%}")
+        cells.append((row["kind"], row["number"], between, *figures))
+    heads = (
+        "motion or calibration",
+        "results",
+        "rms error / std between frames",
+        "of the whole",
+        "median",
+        "within two",
     )
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=("motion", "calibration"))
-    parser.add_argument("--motions", type=int, default=12)
-    parser.add_argument("--seeds", type=int, default=1, help="noise seeds of each motion")
-    parser.add_argument("--recordings", type=int, default=40)
-    options = parser.parse_args()
-    if options.only != "calibration":
-        for kind in KINDS:
-            print(free_motion(kind, options.motions, options.seeds), flush=True)
-    if options.only != "motion":
-        for kind in RECORDINGS:
-            print(calibration(kind, options.recordings), flush=True)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return table(heads, cells)

@@ -1,0 +1,267 @@
+#!/usr/bin/env python
+"""Draw the figures of the documentation again, each from a scene, a camera and a seed given here.
+
+Each figure is one case; statistics are in docs/accuracy.md and docs/benchmarks.md.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from benchmarks import live, mosaic
+from benchmarks.finer import EXPOSURE_ROWS, FADE, ROW_TIME, SHAKE, decibel, interpolated
+from benchmarks.finer import MARGIN as FINER_MARGIN
+from benchmarks.independent_camera import ALIASING, POINTS_PER_PX, Array, after_optics, closed, still_image, take_frames
+from kornia.augmentation import AugmentationSequential
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from torch import Tensor
+
+import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.live import Spectrogram
+from rsvib_torch.report.plots import offset_figure, psf_figure, save_figure
+
+SEED = 3
+FRAME_ROWS = 2048
+VIBRATION = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, -1.9])  # amplitudes and frequencies of Liu et al. 2023
+MARGIN = 32  # px of scene around the frame
+COLOURS = ("#14487a", "#c8102e")
+
+
+def camera(exposure_rows: int) -> rsv.SensorTiming:
+    """The camera of Liu et al. 2023 with another exposure."""
+    return rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=exposure_rows, frame_rows=FRAME_ROWS)
+
+
+def taken(scene: Tensor, timing: rsv.SensorTiming, noise: float) -> Tensor:
+    """Two frames of the scene."""
+    return rsv.simulate_frames(
+        scene,
+        timing,
+        VIBRATION,
+        2,
+        frame_size=(scene.shape[0] - 2 * MARGIN, scene.shape[1] - 2 * MARGIN),
+        noise=rsv.SensorNoise(read_noise=noise),
+        generator=torch.Generator().manual_seed(SEED),
+    )
+
+
+def offsets() -> Figure:
+    """Measured offsets of rows between two frames, and the vibration fitted to them."""
+    timing = camera(20)
+    frames = taken(city_and_fields(FRAME_ROWS + 2 * MARGIN, 512 + 2 * MARGIN, SEED), timing, 0.005)
+    return offset_figure(rsv.detect_vibration(frames, timing))
+
+
+def kernels() -> Figure:
+    """Point spread functions of rows that are exposed for 8.2 ms."""
+    return psf_figure(VIBRATION, camera(400), FRAME_ROWS)
+
+
+def ways_to_restore() -> Figure:
+    """One crop of a long exposure: input, and restored by four methods."""
+    timing, size = camera(400), 640
+    scene = resolution_chart(size + 2 * MARGIN, size + 2 * MARGIN, seed=SEED)
+    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    frames = taken(scene, timing, 0.01)
+    shown = {"input": frames[0]}
+    for name, options in {
+        'method="dewarp"': {"method": "dewarp"},
+        'method="exact"': {},
+        "exact, two frames jointly": {"joint": True},
+        'jointly, prior="edges"': {"joint": True, "prior": "edges"},
+    }.items():
+        shown[name] = rsv.restore(frames, timing, VIBRATION, check=False, **options)[0]
+    shown["still camera, no noise"] = still
+    figure = Figure(figsize=(11.4, 7.9), layout="constrained")
+    crop = (slice(200, 360), slice(240, 400))
+    for panel, (name, image) in zip(figure.subplots(2, 3).flatten(), shown.items(), strict=True):
+        panel.imshow(image[crop].numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        quality = rsv.psnr(image, still, 1.0, rim=MARGIN)
+        panel.set_title(name + (f": {quality:.1f} dB" if image is not still else ""), fontsize=10, loc="left")
+        panel.set_axis_off()
+    return figure
+
+
+def training_data() -> Figure:
+    """One image with four random vibrations, with a box and keypoints that are displaced with it."""
+    scene = resolution_chart(256, 256, seed=SEED).expand(4, 1, 256, 256)
+    points = torch.tensor([[64.0, 64.0], [192.0, 64.0], [64.0, 192.0], [192.0, 192.0]]).expand(4, 4, 2)
+    boxes = torch.tensor([[[96.0, 96.0, 160.0, 160.0]]]).expand(4, 1, 4)
+    timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+    shake = rsv.RollingShutterVibration(timing, amplitude=(2.0, 8.0), frequency=((60, 300), (40, 200)), p=1.0)
+    torch.manual_seed(SEED)
+    chain = AugmentationSequential(shake, data_keys=["input", "keypoints", "bbox_xyxy"])
+    images, moved, frames = chain(scene, points, boxes)
+    figure = Figure(figsize=(11.4, 3.1), layout="constrained")
+    for index, panel in enumerate(figure.subplots(1, 4)):
+        panel.imshow(images[index, 0].numpy(), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        panel.plot(*points[index].T.numpy(), "o", color="#14487a", markersize=4, fillstyle="none")
+        panel.plot(*moved[index].T.numpy(), "x", color="#c8102e", markersize=5)
+        left, top, right, bottom = frames[index].flatten().tolist()
+        panel.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, color="#c8102e"))
+        panel.set_axis_off()
+    return figure
+
+
+def side_by_side(images: dict[str, Array], height: float) -> Figure:
+    """Images in a row, grey (H, W) or coloured (3, H, W), with their names."""
+    figure = Figure(figsize=(12, height), layout="constrained")
+    for panel, (name, image) in zip(figure.subplots(1, len(images)), images.items(), strict=True):
+        grey = image.ndim == 2
+        shown = image if grey else np.moveaxis(image.clip(0, 1) ** (1 / 2.2), 0, -1)
+        panel.imshow(shown, cmap="gray", vmin=0.1, vmax=0.9, interpolation="nearest")
+        panel.set_axis_off()
+        panel.set_title(name, fontsize=9)
+    return figure
+
+
+def wedge_scene(size: int) -> Array:
+    """A city with a wedge of lines that converge from 0.35 to 0.85 cycles per px."""
+    side = POINTS_PER_PX * (size + 2 * FINER_MARGIN)
+    scene = closed(city_and_fields(side, side, seed=3).double().numpy(), FADE)
+    row, column = np.meshgrid(np.arange(side), np.arange(side) - side / 2, indexing="ij")
+    progress = (row - side / 2 + 160) / 320
+    cycles = 0.35 + 0.5 * progress.clip(0, 1)
+    lines = 0.5 + 0.35 * np.cos(2 * np.pi * cycles / POINTS_PER_PX * column)
+    inside = (progress >= 0) & (progress < 1) & (np.abs(column) < 220 * 0.35 / cycles)
+    return np.where(inside, lines, scene)
+
+
+def finer_grid() -> Figure:
+    """A wedge beyond the Nyquist frequency of the pixels, from frames of a camera at rest and of a vibrating camera."""
+    side, noise, count = 160, 0.002, 8
+    scene, size = after_optics(wedge_scene(side), 0.3), (side, side)
+    timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * side + 59)
+    clean = take_frames(scene, SHAKE, timing, count, size, **ALIASING)
+    generator = np.random.default_rng(1)
+    frames = torch.from_numpy(clean + noise * generator.standard_normal(clean.shape)).float()
+    still = still_image(scene, size) + noise * generator.standard_normal(clean.shape)
+    restored = rsv.restore(frames, timing, rsv.detect_vibration(frames, timing), joint=True, scale=2)[0].numpy()
+    truth = still_image(scene, size, 2)
+    images = {
+        "one still frame, interpolated": interpolated(still[0]),
+        f"mean of {count} still frames, interpolated": interpolated(still.mean(0)),
+        f"{count} vibrating frames, scale=2": restored,
+    }
+    images = {f"{name}\n{decibel(image, truth):.1f} dB": image for name, image in images.items()}
+    images["scene after optics and pixel"] = truth
+    return side_by_side({name: image[60:-60, 90:-90] for name, image in images.items()}, 4.2)
+
+
+def colour_mosaic() -> Figure:
+    """A part of a colour scene, from raw frames that are demosaiced one by one and together."""
+    side, noise, count = 128, 0.003, 8
+    timing = rsv.SensorTiming(ROW_TIME, EXPOSURE_ROWS, 2 * side + 59)
+    scene, clean = mosaic.raw_frames("astronaut", timing, count, side)
+    raw = clean + noise * np.random.default_rng(1).standard_normal(clean.shape)
+    frames = torch.from_numpy(raw).float()
+    detection = rsv.detect_vibration(frames, timing)
+    demosaiced = torch.from_numpy(mosaic.opencv(raw)).float()
+    truth = np.stack([still_image(part, (side, side)) for part in scene])
+    together = {
+        f"{count} frames, OpenCV, then joint=True": rsv.restore(demosaiced, timing, detection, joint=True)[0],
+        f"{count} frames, mosaic={mosaic.PATTERN!r}": rsv.restore(
+            frames, timing, detection, joint=True, mosaic=mosaic.PATTERN
+        )[0],
+    }
+    images = {
+        "one frame, OpenCV": demosaiced[0].numpy(),
+        **{f"{name}\n{decibel(i, truth, mosaic.RIM):.1f} dB": i.numpy() for name, i in together.items()},
+        "scene after optics and pixel": truth,
+    }
+    return side_by_side({name: image[:, 24:-24, 24:-24] for name, image in images.items()}, 3.7)
+
+
+def tracking() -> Figure:
+    """A tone that sweeps and grows, as the tracker follows it, and its spectrogram."""
+    size, count, motion = 256, 90, live.Changing(sweep=2.0, doublings=0.5)
+    timing = live.timing_of(size)
+    middle = 0.5 * (size - 1 + live.EXPOSURE_ROWS) * timing.row_time
+    tracker, spectrogram = rsv.VibrationTracker(timing), Spectrogram(timing, 0.4, 120.0)
+    times, values, stds = [], [], []
+    for frame in live.frames_of(size, motion, count):
+        tracked = tracker.update(frame)
+        spectrogram.add(tracked)
+        found = tracked.detection
+        if found is None:
+            continue
+        times.append(tracked.time + middle)
+        values.append([found.vibration.frequency[:, 0].tolist(), found.vibration.amplitude[:, 0].tolist()])
+        stds.append([found.std.frequency[:, 0].tolist(), found.std.amplitude[:, 0].tolist()])
+    when, found_values, found_stds = np.array(times), np.array(values), np.array(stds)
+    truth = motion.frequency(when), motion.amplitude(when)
+    figure = Figure(figsize=(13, 5.6), layout="constrained")
+    panels = figure.subplots(2, 3, sharex="col", width_ratios=(1, 1, 1.15))
+    for place, unit in enumerate(("frequency (Hz)", "amplitude (px)")):
+        for axis, name in enumerate("xy"):
+            start = truth[place][axis, 0]
+            panels[place, 0].plot(when, truth[place][axis] - start, color="#8a8a8a", linewidth=3, alpha=0.6)
+            panels[place, 0].plot(when, found_values[:, place, axis] - start, color=COLOURS[axis], label=name)
+            error = found_values[:, place, axis] - truth[place][axis]
+            panels[place, 1].plot(when, error, color=COLOURS[axis])
+            deviation = 2 * found_stds[:, place, axis]
+            panels[place, 1].fill_between(when, -deviation, deviation, color=COLOURS[axis], alpha=0.15, linewidth=0)
+        panels[place, 0].set_ylabel(f"change of the {unit}")
+        panels[place, 1].set_ylabel(f"error of the {unit}")
+    limit = 3 * float(np.quantile(np.abs(found_values[:, 0, 0] - truth[0][0]), 0.8))
+    panels[0, 1].set_ylim(-limit, limit)
+    panels[1, 1].set_ylim(-0.12, 0.12)
+    panels[0, 0].legend(frameon=False)
+    columns, frequencies, amplitude = spectrogram.result()
+    for panel, picture, name in zip(panels[:, 2], amplitude, "xy", strict=True):
+        step = columns[1] - columns[0]
+        image = panel.pcolormesh(
+            np.append(columns, columns[-1] + step),
+            np.append(frequencies, 2 * frequencies[-1] - frequencies[-2]),
+            picture.T,
+            vmin=0,
+            cmap="viridis",
+            rasterized=True,
+        )
+        panel.set_ylabel(f"frequency along {name} (Hz)")
+        figure.colorbar(image, ax=panel, label="amplitude (px)")
+    for panel in panels[:, :2].flat:
+        panel.axvline(live.BEFORE, color="#d9d9d9", linewidth=1, zorder=0)
+        panel.spines[["top", "right"]].set_visible(False)
+    for panel in panels[1]:
+        panel.set_xlabel("time (s)")
+    figure.suptitle(
+        f"{live.FREQUENCY[0]:.0f} Hz along x, swept by {motion.sweep:g} Hz/s and grown by "
+        f"{100 * (2**motion.doublings - 1):.0f} % per second from {live.BEFORE} s on; {live.RATE} frames/s "
+        "(grey: truth)",
+        fontsize=10,
+    )
+    return figure
+
+
+PICTURES: dict[str, Callable[[], Figure]] = {  # by the path in docs/
+    "gallery/offsets": offsets,
+    "gallery/kernels": kernels,
+    "gallery/ways_to_restore": ways_to_restore,
+    "gallery/training_data": training_data,
+    "finer_grid": finer_grid,
+    "mosaic": colour_mosaic,
+    "live": tracking,
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/figures"), help="folder, e.g. docs (default: out/figures)"
+    )
+    parser.add_argument("--only", choices=PICTURES, nargs="+", default=list(PICTURES), help="figures to draw")
+    options = parser.parse_args(arguments)
+    for name in options.only:
+        path = options.out / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_figure(PICTURES[name](), path, dpi=90 if "/" in name else 105)
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

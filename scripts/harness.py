@@ -1,0 +1,321 @@
+"""What benchmarks, attacks and the reproduction share: options, timed runs, tables, the machine, stored results.
+
+A section is a module with
+
+* ``OPTIONS``: its options, by name: the default, the help text, and for values that do not follow from the default
+  their type or their choices. ``QUICK``: values of options that ``--quick`` sets, for a run of seconds;
+* ``rows(options)``: the figures, one dictionary per case, of numbers, texts, lists and dictionaries;
+* ``lines(rows, options)``: the tables in Markdown, without further measurement.
+
+``benchmark.py`` runs sections, ``write_result`` stores their rows, and ``benchmark_page.py`` makes the page of all.
+"""
+
+import argparse
+import datetime
+import json
+import math
+import os
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import rsvib_torch as rsv
+
+Rows = list[dict[str, Any]]
+OptionTable = Mapping[str, tuple[Any, ...]]  # default, help text, and for some the type or the choices
+
+RESULTS = Path(__file__).parent / "benchmarks" / "results"
+# Environment variables that must be set before a process starts. PyTorch uses huge pages, as NumPy does by default.
+# glibc keeps freed memory of all threads for the next call; virtual machines may take long to provide memory again.
+HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"
+KEPT = {
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 40),
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 40),
+    "MALLOC_TOP_PAD_": str(1 << 26),
+}
+ENVIRONMENT = {HUGE_PAGES: "1", **KEPT}
+_LIBRARIES = {
+    "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
+    "SciPy": ("scipy",),
+    "scikit-image": ("scikit-image",),
+    "Kornia": ("kornia",),
+    "NumPy": ("numpy",),
+    "PyLops": ("pylops",),
+    "deepinv": ("deepinv",),
+    "vidstab": ("vidstab",),
+}
+_NOT_FINITE = ("nan", "inf", "-inf")  # JSON has no such numbers, they are stored as text
+
+
+# Options
+
+
+def add_options(parser: argparse.ArgumentParser, options: OptionTable) -> None:
+    """Add the options of a section; sections that share an option have it from the same table."""
+    for name, (default, text, *kind) in options.items():
+        flag = "--" + name.replace("_", "-")
+        if isinstance(default, bool):
+            parser.add_argument(flag, action="store_true", help=text)
+            continue
+        several = isinstance(default, tuple | list)
+        more: dict[str, Any] = {"nargs": "*"} if several else {}
+        if kind and not isinstance(kind[0], type):
+            more["choices"] = kind[0]
+        else:
+            more["type"] = kind[0] if kind else type(default[0] if several else default)
+        parser.add_argument(flag, default=default, help=f"{text} (default: {default})", **more)
+
+
+def devices() -> list[str]:
+    """Devices of this machine."""
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+def defaults(section: Any, *, quick: bool = True, **chosen: Any) -> argparse.Namespace:
+    """Options of a section with their defaults, or with ``QUICK`` values, for use without a command line."""
+    usual = {"size": 256, "runs": 1, "device": ["cpu"], "quick": quick}
+    usual |= {name: default for name, (default, *_) in section.OPTIONS.items()}
+    return argparse.Namespace(**usual | (section.QUICK if quick else {}) | chosen)
+
+
+# Timed runs
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """Timed runs of a task.
+
+    Attributes:
+        result: Return value of the task.
+        runs: Seconds of each run.
+    """
+
+    result: Any
+    runs: tuple[float, ...]
+
+    @property
+    def seconds(self) -> float:
+        """The median."""
+        return statistics.median(self.runs)
+
+    def __add__(self, other: "Timed") -> "Timed":
+        """Sum of the times of two tasks, run by run; the result is that of the second."""
+        return Timed(other.result, tuple(a + b for a, b in zip(self.runs, other.runs, strict=True)))
+
+    def scaled(self, factor: float) -> "Timed":
+        """Times multiplied by a factor."""
+        return Timed(self.result, tuple(factor * seconds for seconds in self.runs))
+
+    def figures(self) -> dict[str, float]:
+        """Median, shortest and longest time."""
+        return {"seconds": self.seconds, "seconds_least": min(self.runs), "seconds_most": max(self.runs)}
+
+
+def shown_seconds(row: dict[str, Any]) -> str:
+    """Median and range of ``Timed.figures`` as a cell of a table."""
+    return f"{row['seconds']:.3f} ({row['seconds_least']:.3f} to {row['seconds_most']:.3f})"
+
+
+def finish() -> None:
+    """Wait for a GPU, if it is used."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def seconds_of(work: Callable[[], Any]) -> float:
+    """Seconds of one run, including the pending work of a GPU."""
+    finish()
+    begin = time.perf_counter()
+    work()
+    finish()
+    return time.perf_counter() - begin
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one thread: small tensors are slower on several."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def in_turns(works: dict[str, Callable[[], Any]], runs: int) -> dict[str, Timed]:
+    """Timed runs of each task; the tasks alternate, so that other load on the machine affects all of them equally."""
+    results = {name: work() for name, work in works.items()}  # warm-up
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(max(1, runs)):
+        for name, work in works.items():
+            seconds[name].append(seconds_of(work))
+    return {name: Timed(results[name], tuple(seconds[name])) for name in works}
+
+
+def named(name: str, device: str) -> str:
+    """Name of a task on a device."""
+    return name if device == "cpu" else f"{name} on {device}"
+
+
+def plain_environment() -> dict[str, str]:
+    """Environment of processes whose memory is measured, without the settings that keep freed memory."""
+    return {name: value for name, value in os.environ.items() if name not in KEPT}
+
+
+# Tables
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """A Markdown table, with an empty line after it."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return [*(f"| {' | '.join(map(str, line))} |" for line in lines), ""]
+
+
+# The machine
+
+
+def machine() -> dict[str, Any]:
+    """Processor, devices, libraries and settings of this machine."""
+    return {
+        "cores": os.cpu_count() or 1,
+        "threads": torch.get_num_threads(),
+        "processor": _processor(),
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "huge_pages": os.environ.get(HUGE_PAGES) == "1",
+        "kept_memory": all(name in os.environ for name in KEPT),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "libraries": {name: version for name in _LIBRARIES if (version := _version(name)) is not None},
+    }
+
+
+def machine_line(of: dict[str, Any]) -> str:
+    """Processor, threads, libraries and settings of a run as one paragraph."""
+    libraries = ", ".join(f"{name} {version}" for name, version in of["libraries"].items())
+    load = "" if of["load"] is None else f" Load average at the start: {of['load']:.1f}."
+    pages = "huge pages" if of["huge_pages"] else "default page size"
+    pages += ", freed memory kept by the allocator" if of["kept_memory"] else ""
+    cuda = "No CUDA device." if of["cuda"] is None else f"CUDA device: {of['cuda']}."
+    return (
+        f"{of['processor']}, {of['cores']} cores, {of['threads']} threads; Python {of['python']}, "
+        f"torch {of['torch']}, {libraries}; {pages}.{load} {cuda}"
+    )
+
+
+def _processor() -> str:
+    """Name of the processor, or of its architecture if the system does not provide the name."""
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _version(library: str) -> str | None:
+    for distribution in _LIBRARIES[library]:
+        try:
+            return metadata.version(distribution)
+        except metadata.PackageNotFoundError:
+            continue
+    return None
+
+
+# Stored results
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """Result of one section.
+
+    Attributes:
+        section: Name of the section.
+        version: Version of rsvib_torch.
+        commit: Commit of the working tree, with "+" if it had changes; None outside a repository.
+        date: Date of the run, YYYY-MM-DD.
+        seconds: Duration of the run.
+        machine: Processor, cores, threads and libraries, see ``machine``.
+        options: Options of the run.
+        rows: Measured figures.
+    """
+
+    section: str
+    version: str
+    commit: str | None
+    date: str
+    seconds: float
+    machine: dict[str, Any]
+    options: argparse.Namespace
+    rows: Rows
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON data; numbers that are not finite become text."""
+    if isinstance(value, dict):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def _restored(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _restored(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_restored(item) for item in value]
+    return float(value) if value in _NOT_FINITE else value
+
+
+def _commit() -> str | None:
+    """Short hash of the commit of this working tree, with "+" if files of it have changed."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", *arguments]
+        return subprocess.run(command, cwd=RESULTS.parent, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short=10", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def today() -> str:
+    """The date, YYYY-MM-DD."""
+    return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+
+
+def write_result(section: str, rows: Rows, options: argparse.Namespace, seconds: float, folder: Path = RESULTS) -> Path:
+    """Store the figures of a section with options, version, date and machine as ``section.json`` in a folder."""
+    content = {
+        "section": section,
+        "version": rsv.__version__,
+        "commit": _commit(),
+        "date": today(),
+        "seconds": round(seconds, 1),
+        "machine": machine(),
+        "options": {name: value for name, value in vars(options).items() if name not in ("out", "only", "store")},
+        "rows": rows,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{section}.json"
+    path.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def read_result(path: Path) -> StoredResult:
+    """Read a file that ``write_result`` wrote."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    rows, options = _restored(content["rows"]), argparse.Namespace(**_restored(content["options"]))
+    return StoredResult(**{**content, "rows": rows, "options": options})
