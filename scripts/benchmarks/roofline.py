@@ -67,8 +67,8 @@ def shapes_of(size: tuple[int, int], timing: rsv.SensorTiming, truth: rsv.Vibrat
     """Sizes for a frame of that size, camera and vibration."""
     height, width = size
     motion = frame_motion(truth.expanded(1), timing.in_row_order(), 1, height)
-    moved, weights = motion.exposures(height)
-    length = exact.scene_periods(motion, moved, width)[0]
+    moved, weights = motion.exposures
+    length = exact.scene_period(motion, width)
     kernels = row_kernels(moved[0], weights, torch.ones(1), height)
     observation = Observation(kernels, height, length, torch.float32)
     band = observation.normal(ORDER)
