@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import skew_band, solve_skewed
+from rsvib_torch.core.banded_solver import from_both_ends, skew_band, solve_halves
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
@@ -18,7 +18,9 @@ def solved_in_windows(windows, band, right_side):
     parts = torch.stack([skew_band(band)[window] for window in windows], dim=-2).flatten(-2)
     full = torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])])
     right = torch.stack([right_side[window] for window in windows], dim=-2).flatten(-2)
-    return join_windows(solve_skewed(full, right).unflatten(-1, (-1, band.shape[-1])), windows)
+    return join_windows(
+        solve_halves(from_both_ends(full).flatten(2), right).unflatten(-1, (-1, band.shape[-1])), windows
+    )
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])

@@ -25,7 +25,7 @@ from rsvib_torch.core.banded_solver import (
     InterpolatedFactors,
     factor_banded,
     node_frequencies,
-    solve_skewed,
+    solve_halves,
 )
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
@@ -176,12 +176,12 @@ class SceneSolver:
             num_scenes=observation.num_scenes,
         )
         self._normal = normal.in_windows(self._windows)
-        self._keep = keep
+        self._keep, self._num_rows = keep, self._windows[0].stop - self._windows[0].start
         self._interpolated: InterpolatedFactors | None = None
         nodes = None if keep or self._differentiates() else self._nodes()
         if nodes is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
-            self._interpolated = InterpolatedFactors.of(systems, nodes)
+            self._interpolated = InterpolatedFactors.of(systems, nodes, self._num_rows)
 
     @property
     def interpolates(self) -> bool:
@@ -191,7 +191,7 @@ class SceneSolver:
     @cached_property
     def _factors(self) -> list[BandedFactor]:
         """Factors of all parts, where they are kept."""
-        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p])) for p in self.parts]
+        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p]), self._num_rows) for p in self.parts]
 
     def _nodes(self) -> Tensor | None:
         """Frequencies whose systems are factored; None: all.
@@ -242,14 +242,14 @@ class SceneSolver:
                 factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
                 if thread is not None:
                     interpolated[thread] = factor
-                solution = solve_skewed(factor, right)
+                solution = solve_halves(factor, right)
             elif factors:
-                solution = solve_skewed(factors[number], right)
+                solution = solve_halves(factors[number], right)
             else:
                 left = self._normal.left
-                shape = (*left.shape[:3], len(u))
+                shape = (*left.shape[:4], len(u))
                 out = None if thread is None else self._partition.buffer(thread, shape, given)
-                solution = solve_skewed(self._normal.at(u, self.precision[..., part], out), right)
+                solution = solve_halves(self._normal.at(u, self.precision[..., part], out), right)
             return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
         if self._differentiates(given):

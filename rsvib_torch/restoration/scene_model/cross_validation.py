@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from rsvib_torch.restoration.scene_model.observation import RowKernels, add_row_prior
+from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 
 __all__ = ["Explained", "SampledRows", "prior_strengths", "sample_rows", "select_strengths", "smoothness"]
@@ -101,8 +101,8 @@ class SampledRows:
         step = 1.2
         products = np.stack([*precisions, *(step * products for products in precisions)], 2).repeat(self.slabs, 3)
         bands = np.repeat(self._normal(width)[:, :, None], 2 * number, 2)  # (K + b, 2 b + 1, 2 n, G, F)
-        merged = products.reshape(*products.shape[:2], 2 * number * groups, 1, frequencies)
-        add_row_prior(bands.reshape(*bands.shape[:2], -1, 1, frequencies), merged, self.count, width)
+        merged = products.reshape(*products.shape[:2], -1, frequencies)
+        _add_row_prior(bands.reshape(*bands.shape[:2], -1, frequencies), merged, self.count, width)
         upper, pivots = _factored(bands.reshape(*bands.shape[:2], -1), self.count)
         logs = np.log(pivots.astype(np.float64)).sum(0).reshape(2, number, groups, frequencies)
         growth = (logs[1] - logs[0]) / math.log(step)
@@ -127,6 +127,28 @@ class SampledRows:
         freedom = (self.count - growth).reshape(number, -1, self.slabs, frequencies).sum(2)
         power = np.moveaxis(power, 1, 0).reshape(number, -1, self.slabs, frequencies).sum(2)
         return Explained(power, freedom, (self.weight > 0).reshape(power.shape[1], -1).sum(1))
+
+
+def _add_row_prior(bands: Array, precision: Array, rows: int, width: int) -> None:
+    """Add the precision of an autoregressive prior to skewed bands, in their memory.
+
+    Args:
+        bands: (rows + width, 2 width + 1, N, U), of N scenes.
+        precision: Products (p + 1, p + 1, N, U) as from ``RowPrior.precision``.
+        rows: Rows of a scene.
+        width: Half-width of the band.
+    """
+    for d in range(len(precision)):
+        for side in {d, -d}:
+            # rows of the scene: the sum of the products; the first and the last ones are predicted from fewer rows
+            top, bottom = max(0, -side), rows - max(0, side)
+            inner = bands[top:bottom, width + side]
+            inner += precision[d].sum(0)
+            for k in range(1, len(precision) - d):
+                first = bands[top : top + k, width + side]
+                first -= precision[d, k]
+                last = bands[bottom - k : bottom, width + side]
+                last -= precision[d, k]
 
 
 def _factored(skewed: Array, count: int) -> tuple[Array, Array]:

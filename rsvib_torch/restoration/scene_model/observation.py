@@ -23,12 +23,12 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.banded_solver import from_both_ends
 from rsvib_torch.core.fourier import shift_phases
 from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
@@ -43,7 +43,6 @@ __all__ = [
     "Observation",
     "RowKernels",
     "SmoothBand",
-    "add_row_prior",
     "finer_kernels",
     "interpolation_error",
     "interpolation_matrix",
@@ -289,15 +288,17 @@ class SmoothBand:
     """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added.
 
     Attributes:
-        left: (R + b, 2 b + 1, n, 2 Q) real and imaginary parts at Q nodes, for n = N W windows of R rows, those of a
-            scene one after the other; the last b rows are 0.
+        left: (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows; the last b rows are 0.
+            In windows the halves (H + b, 2 b + 1, 2, N W, 2 Q) as from ``from_both_ends`` of W windows of each scene.
         reach: Largest distance along the rows in px of the products of kernels.
-        windows: W, windows of each scene.
+        windows: W.
+        rows: R, in windows.
     """
 
     left: Tensor
     reach: float
     windows: int = 1
+    rows: int = 0
 
     @property
     def width(self) -> int:
@@ -305,15 +306,13 @@ class SmoothBand:
         return self.left.shape[1] // 2
 
     def in_windows(self, windows: list[slice]) -> "SmoothBand":
-        """The matrices of all rows as those of windows of rows."""
-        if len(windows) == 1:
-            return self
+        """The matrices of all rows as those of windows of rows, eliminated from both ends."""
         parts = torch.stack([self.left[window] for window in windows], dim=3).flatten(2, 3)
-        left = torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])])
-        return replace(self, left=left, windows=len(windows))
+        left = from_both_ends(torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
+        return replace(self, left=left, windows=len(windows), rows=len(parts))
 
     def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
-        """Skewed bands (R + b, 2 b + 1, n U), complex.
+        """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex.
 
         Args:
             u: (U,) frequencies in cycles per px.
@@ -321,40 +320,30 @@ class SmoothBand:
             out: Memory for them; page faults in fresh memory take as long as the product that fills it.
         """
         bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], out)
-        real = bands[..., 0].unflatten(2, (-1, self.windows))  # (R + b, 2 b + 1, N, W, U)
-        add_row_prior(real, precision[:, :, :, None].to(real.dtype), len(self.left) - self.width, self.width)
+        real = bands[..., 0].unflatten(3, (-1, self.windows))
+        halves = real[:, :, 0], real[:, :, 1]  # (H + b, 2 b + 1, N, W, U) each
+        precision = precision[:, :, :, None].to(bands.dtype)
+        width, half = self.width, len(self.left) - self.width
+        for d in range(len(precision)):
+            for side in {d, -d}:
+                # rows of the scene: the sum of the products; the middle rows in the first half only
+                top, total = max(0, -side), precision[d].sum(0)
+                halves[0][top : half - max(0, side), width + side].add_(total)
+                halves[1][top : self.rows - half + top, width + side].add_(total)
+                # rows at the ends of the scene are predicted from fewer rows
+                for k in range(1, len(precision) - d):
+                    halves[0][top : top + k, width + side, :, :1].sub_(precision[d, k])
+                    halves[1][top : top + k, width + side, :, -1:].sub_(precision[d, k])
         return torch.view_as_complex(bands).flatten(2)
 
     def _product(self, right: Tensor, out: Tensor | None) -> Tensor:
-        """Products (R + b, 2 b + 1, n, U, 2) with a matrix."""
-        rows, right = self.left.flatten(0, 2), right.to(self.left)
+        """Products (H + b, 2 b + 1, 2, n, U, 2) with a matrix."""
+        rows, right = self.left.flatten(0, 3), right.to(self.left)
         if out is None:
             product = rows @ right
         else:
             product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
-        return product.view(*self.left.shape[:3], -1, 2)
-
-
-def add_row_prior(bands: Any, precision: Any, rows: int, width: int) -> None:
-    """Add the precision of an autoregressive prior to skewed bands, tensors or arrays, in their memory.
-
-    Args:
-        bands: (rows + width, 2 width + 1, N, W, U), W windows of each of N scenes.
-        precision: Products (p + 1, p + 1, N, 1, U) as from ``RowPrior.precision``.
-        rows: Rows of a window.
-        width: Half-width of the band.
-    """
-    for d in range(len(precision)):
-        for side in {d, -d}:
-            # rows of the scene: the sum of the products; the first and the last ones are predicted from fewer rows
-            top, bottom = max(0, -side), rows - max(0, side)
-            inner = bands[top:bottom, width + side]
-            inner += precision[d].sum(0)
-            for k in range(1, len(precision) - d):
-                first = bands[top : top + k, width + side, :, :1]
-                first -= precision[d, k]
-                last = bands[bottom - k : bottom, width + side, :, -1:]
-                last -= precision[d, k]
+        return product.view(*self.left.shape[:4], -1, 2)
 
 
 def normal_matrices(
