@@ -1,10 +1,12 @@
 """Filling of missing pixels by local means, and the choice of columns with detail."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["cut_columns", "detailed_columns", "detailed_parts", "enlarged", "fill_with_means"]
+__all__ = ["cut_columns", "cut_parts", "detailed_columns", "detailed_parts", "enlarged", "fill_with_means"]
 
 
 def fill_with_means(frames: Tensor, missing: Tensor) -> Tensor:
@@ -82,21 +84,42 @@ def detailed_columns(images: Tensor, count: int) -> slice:
         >>> detailed_columns(image, 4)
         slice(5, 9, None)
     """
-    width = images.shape[-1]
-    if width <= count:
-        return slice(0, width)
-    rows = slice(0, None, 4)  # a quarter of the rows is a sufficient sample
-    detail = (images[..., 1:, :][..., rows, :] - images[..., :-1, :][..., rows, :]).square()
-    total = functional.pad(detail.flatten(0, -2).sum(0).to(torch.float64).cumsum(0), (1, 0))
-    first = int((total[count:] - total[:-count]).argmax())
-    return slice(first, first + count)
+    return detailed_parts(images[None, None], count)[0]
 
 
 def detailed_parts(images: Tensor, count: int) -> list[slice]:
-    """``detailed_columns`` of the first frame of each stack (B, T, H, W)."""
-    return [detailed_columns(stack[0], count) for stack in images]
+    """``detailed_columns`` of the first frame of each stack (B, T, ..., H, W)."""
+    width = images.shape[-1]
+    if width <= count:
+        return [slice(0, width)] * len(images)
+    rows = slice(0, None, 4)  # a quarter of the rows is a sufficient sample
+    first = images[:, 0]
+    detail = (first[..., 1:, :][..., rows, :] - first[..., :-1, :][..., rows, :]).square()
+    total = functional.pad(detail.flatten(1, -2).sum(1).to(torch.float64).cumsum(1), (1, 0))
+    starts = (total[:, count:] - total[:, :-count]).argmax(1).tolist()
+    return [slice(start, start + count) for start in starts]
 
 
 def cut_columns(values: Tensor, parts: list[slice]) -> Tensor:
     """Columns of each stack (B, ..., W), equally many of all stacks."""
     return torch.stack([stack[..., part] for stack, part in zip(values, parts, strict=True)])
+
+
+def cut_parts(images: Tensor, tops: Sequence[int], lefts: Sequence[int], size: tuple[int, int]) -> Tensor:
+    """Parts (B, ..., h, w) of one size of images (B, ..., H, W), from row ``tops[b]`` and column ``lefts[b]`` on.
+
+    Example:
+        >>> cut_parts(torch.arange(12).view(2, 2, 3), [0, 1], [0, 2], (1, 1)).flatten().tolist()
+        [0, 11]
+    """
+    height, width = size
+    if len({*zip(tops, lefts, strict=True)}) == 1:
+        return images[..., tops[0] : tops[0] + height, lefts[0] : lefts[0] + width]
+    flat = images.flatten(1, -3) if images.ndim > 3 else images[:, None]
+    stack, plane = (torch.arange(extent, device=images.device) for extent in flat.shape[:2])
+    first = torch.tensor([tops, lefts], device=images.device)[..., None]
+    rows, columns = (
+        start + torch.arange(extent, device=images.device) for start, extent in zip(first, size, strict=True)
+    )
+    parts = flat[stack[:, None, None, None], plane[:, None, None], rows[:, None, :, None], columns[:, None, None]]
+    return parts.view(*images.shape[:-2], height, width)

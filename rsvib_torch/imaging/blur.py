@@ -192,7 +192,14 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
 
 
 def form_rows(
-    spectra: Tensor, places: Tensor, along: Tensor, node_weights: Tensor, frequencies: Tensor, degree: int
+    spectra: Tensor,
+    places: Tensor,
+    along: Tensor,
+    node_weights: Tensor,
+    frequencies: Tensor,
+    degree: int,
+    *,
+    num_scenes: int = 1,
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
@@ -203,12 +210,17 @@ def form_rows(
         node_weights: They sum to 1.
         frequencies: (U,) in cycles per px.
         degree: Degree of the B-spline.
+        num_scenes: B scenes, whose rows follow each other in ``spectra``; places and displacements are then (B, R, N).
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)
+    num_rows = spectra.shape[-2] // num_scenes
+    source = mirrored(source, num_rows)
+    if num_scenes > 1:
+        source = source + num_rows * torch.arange(num_scenes, device=source.device)[:, None, None]
     transfer = row_transfer(taps, along, frequencies).to(spectra.dtype)
     # sum over the taps of each row
-    return (spectra[..., mirrored(source, spectra.shape[-2]), :] * transfer).sum(-2)
+    return (spectra[..., source, :] * transfer).sum(-2)
 
 
 _EXTRA_STATE = ("degree", "frame_width", "origin", "scene_size")  # attributes in state_dict besides the buffers

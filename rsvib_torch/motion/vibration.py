@@ -260,6 +260,11 @@ class Vibration(Motion, units=_UNITS):
         return self.amplitude.device
 
     @property
+    def num_axes(self) -> int:
+        """Number of components of the displacement."""
+        return self.amplitude.shape[-2]
+
+    @property
     def period(self) -> Tensor:
         """Period T = 1/f in seconds, (..., 2, K); infinite where the frequency is 0."""
         return 1.0 / self.frequency
@@ -274,7 +279,7 @@ class Vibration(Motion, units=_UNITS):
             )
         shape = (*self.batch_shape, *(1,) * steps, *self.amplitude.shape[-2:])
         amplitude, frequency, phase = (t.reshape(shape) for t in (self.amplitude, self.frequency, self.phase))
-        return 2 * math.pi * frequency * times[..., None, None] + phase, amplitude, frequency
+        return torch.addcmul(phase, frequency, times[..., None, None], value=2 * math.pi), amplitude, frequency
 
     def _at(self, times: Tensor, values: Tensor) -> Tensor:
         """Values (..., A) for each motion, to broadcast with times (S, 1)."""
@@ -286,7 +291,7 @@ class Vibration(Motion, units=_UNITS):
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)[..., None]
         velocity, acceleration = self._at(times, self.image_motion), self._at(times, self.image_acceleration)
-        return (velocity + 0.5 * acceleration * times) * times
+        return torch.addcmul(velocity, acceleration, times, value=0.5) * times
 
     @checks_arguments
     def displacement(self, times: Tensor) -> Tensor:

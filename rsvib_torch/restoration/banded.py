@@ -149,7 +149,7 @@ def restore_banded(
     weights = _noise_to_signal(frames, noise_to_signal)
     B, T, C, H, W = frames.shape
     length = extended_length(
-        W, max(motion.displacement_bounds(H)) + 8
+        W, motion.displacement_bound() + 8
     )  # a Wiener filter extends at least 8 px beyond the displacement
     size = 2 * half_rows + 1
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)

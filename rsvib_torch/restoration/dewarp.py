@@ -9,7 +9,7 @@ from torch.nn.functional import embedding_bag
 
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import gathered, runs
-from rsvib_torch.core.fourier import extended_length, shift_phases, spline_spectra
+from rsvib_torch.core.fourier import extended_length, phase_products, phase_tables, spline_spectra
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
@@ -36,7 +36,7 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128
     rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
     along, rows = motion.mean_displacement(rows)[..., 0].flatten(0, 1), rows.flatten(0, 1)
 
-    length = extended_length(W, max(motion.displacement_bounds(H)))
+    length = extended_length(W, motion.displacement_bound())
     spectra = spline_spectra(frames, degree, length)
     count = spectra.shape[-1]
     cell = rows.detach().floor()
@@ -47,12 +47,14 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128
     # one entry per row, with all channels
     flat = torch.view_as_real(spectra.movedim(2, 3)).reshape(B * T * H, -1)
 
+    coarse, fine = phase_tables(along, length, slice(0, count), frames.dtype.to_complex())
+
     def restored(part: slice) -> Tensor:
         fetched = embedding_bag(
             taps[:, part].flatten(0, 1), flat, per_sample_weights=weights[:, part].flatten(0, 1), mode="sum"
         )
         moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2))
-        moved = moved * shift_phases(along[:, part], length, slice(0, count), moved.dtype)[:, :, None]
+        moved = moved * phase_products(coarse[:, part], fine[:, part], count)[:, :, None]
         image: Tensor = torch.fft.irfft(moved, n=length)[..., :W]
         return image
 

@@ -10,9 +10,12 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
@@ -42,6 +45,7 @@ class FrameMotion:
         timing: The sensor, in row order.
         frame_starts: (T,) seconds.
         shift: (B, T, 2) whole px, axes (x, y), float64.
+        num_rows: Rows of a frame.
         neglected: Standard deviation in px of the displacement of the columns of a strip about that of its middle,
             which is that of all columns in this motion. Only the exact method with ``scale=2`` uses it.
     """
@@ -50,7 +54,15 @@ class FrameMotion:
     timing: RowTiming
     frame_starts: Tensor
     shift: Tensor
+    num_rows: int
     neglected: float = 0.0
+
+    def of(self, stacks: list[int], frames: list[int] | None = None) -> "FrameMotion":
+        """The motion of some stacks of the batch, and of some of their frames; None for all."""
+        members = slice(None) if frames is None else frames
+        vibration = self.vibration.mapped(lambda values: values[stacks])
+        shift = self.shift[stacks][:, members]
+        return replace(self, vibration=vibration, frame_starts=self.frame_starts[members], shift=shift)
 
     def frame_rows(self, scene_rows: Tensor) -> Tensor:
         """Frame rows (B, T, S) that contain rows (S,) of the restored frames."""
@@ -58,32 +70,34 @@ class FrameMotion:
             scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
         )
 
-    def _bounds(self, num_rows: int) -> Tensor:
-        """Bound (B, T, axes) on the displacement in a frame of ``num_rows`` rows, beyond the shift, in px."""
-        half = 0.5 * (num_rows * self.timing.row_time + self.timing.exposure_time)
-        first, middle, last = (
-            self.vibration.drift((self.frame_starts + delay).expand(len(self.shift), -1)).detach()
-            for delay in (0.0, half, 2 * half)
-        )
-        drift = torch.maximum((first - middle).abs(), (last - middle).abs())
-        return self.vibration.largest_oscillation()[:, None] + drift
+    @cached_property
+    def bounds(self) -> list[list[float]]:
+        """Bound on the displacement in any frame of each stack, beyond the shift, in px along (x, y)."""
+        half = 0.5 * (self.num_rows * self.timing.row_time + self.timing.exposure_time)
+        times = self.frame_starts[:, None] + half * torch.arange(3, dtype=torch.float64, device=self.shift.device)
+        first, middle, last = self.vibration.drift(times.expand(len(self.shift), -1, -1)).detach().unbind(-2)
+        drift = torch.maximum((first - middle).abs(), (last - middle).abs()).amax(1)
+        bounds: list[list[float]] = (self.vibration.largest_oscillation() + drift).tolist()
+        return bounds
 
-    def check_fits(self, height: int, width: int) -> None:
-        """Raise a ``ValueError`` if frames of this size, in row order, may move by more than their own size.
+    def check_fits(self, width: int) -> None:
+        """Raise a ``ValueError`` if frames of so many columns, in row order, may move by more than their own size.
 
         No content is then certain to stay in the frame, and kernels and padding grow with the motion.
         """
-        bounds = self._bounds(height).amax((0, 1)).tolist()
-        for direction, bound, size in zip(("along", "across"), bounds, (width, height), strict=False):
+        for direction, bounds, size in zip(
+            ("along", "across"), zip(*self.bounds, strict=True), (width, self.num_rows), strict=False
+        ):
+            bound = max(bounds, key=lambda value: math.inf if math.isnan(value) else value)
             if not bound <= size:  # also NaN
                 raise ValueError(
                     f"the motion {direction} the rows reaches {bound:.4g} px within a frame, more than its size of "
                     f"{size} px; check the unit of amplitudes (px) and image motion (px/s)"
                 )
 
-    def displacement_bounds(self, num_rows: int) -> list[int]:
-        """For each stack, a bound on the displacement along one of ``num_rows`` rows, beyond the shift, in whole px."""
-        return [math.ceil(bound + 0.5) for bound in self._bounds(num_rows)[..., 0].amax(1).tolist()]
+    def displacement_bound(self) -> int:
+        """Bound on the displacement along a row of any stack, beyond the shift, in whole px."""
+        return max(math.ceil(bounds[0] + 0.5) for bounds in self.bounds)
 
     def row_starts(self, frame_rows: Tensor) -> Tensor:
         """Exposure starts of frame rows (B, T, S) in seconds."""
@@ -94,11 +108,19 @@ class FrameMotion:
         starts = self.row_starts(frame_rows)
         return self.vibration.mean_displacement(starts, self.timing.exposure_time) - self.shift[..., None, :]
 
-    def exposures(self, num_rows: int) -> tuple[Tensor, Tensor]:
-        """Displacement (B, T, R, N, 2) in px of rows 0 ... R - 1 at N nodes of their exposures, and weights (N,)."""
-        rows = torch.arange(num_rows, dtype=torch.float64, device=self.frame_starts.device)
-        starts = self.row_starts(rows).expand(*self.shift.shape[:2], num_rows)
+    @cached_property
+    def exposures(self) -> tuple[Tensor, Tensor]:
+        """Displacement (B, T, R, N, 2) in px of the rows of the frames at N nodes of their exposures, weights (N,)."""
+        rows = torch.arange(self.num_rows, dtype=torch.float64, device=self.frame_starts.device)
+        starts = self.row_starts(rows).expand(*self.shift.shape[:2], self.num_rows)
         return exposure_trajectory(self.vibration, starts, self.timing, "gauss")
+
+    @cached_property
+    def blur_lengths(self) -> NDArray[np.float64]:
+        """Largest range (B, T, 2) of the displacement along (x, y) during the exposure of a row, in px."""
+        displacement = self.exposures[0].detach()
+        lengths: NDArray[np.float64] = (displacement.amax(-2) - displacement.amin(-2)).amax(2).cpu().numpy()
+        return lengths
 
 
 def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
@@ -106,7 +128,7 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
     starts = timing.frame_starts(num_frames, vibration.device)
     middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
-    return FrameMotion(vibration, timing, starts, shift)
+    return FrameMotion(vibration, timing, starts, shift, num_rows)
 
 
 def motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
@@ -167,7 +189,7 @@ def visible_pixels(
         if not rowwise.same_for_all_columns:
             of_column = ColumnMotion.of_columns(rowwise, column[None], row_timing, num_frames, height)
         motion = frame_motion(of_column, row_timing, num_frames, height)
-        motion.check_fits(height, width)
+        motion.check_fits(width)
         rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
         along = motion.mean_displacement(rows)[..., 0]
         columns = torch.arange(first, last, device=vibration.device) + along[..., None]
@@ -247,7 +269,7 @@ def restore_in_strips(
     count, (height, width) = images.shape[1], images.shape[-2:]
     if motion.same_for_all_columns:
         of_frames = frame_motion(motion, timing, count, height)
-        of_frames.check_fits(height, width)
+        of_frames.check_fits(width)
         return method(images, of_frames, **options)
     starts = timing.frame_starts(count).tolist()
     end = starts[-1] + height * timing.row_time + timing.exposure_time
@@ -259,7 +281,7 @@ def restore_in_strips(
     }
     of_frames = frame_motion(of_strips, timing, count, height)
     of_frames = replace(of_frames, neglected=neglected)
-    of_frames.check_fits(height, width)
+    of_frames.check_fits(width)
     if "strips" in cut:
         cut["strips"] = len(strips.firsts)
     restored = method(strips.cut(images), of_frames, **cut)

@@ -11,16 +11,17 @@ import math
 from collections.abc import Callable, Sequence
 from statistics import NormalDist
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import squared_modulus, waves
-from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.cross_validation import sample_rows
+from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
 from rsvib_torch.restoration.scene_model.observation import row_kernels
-from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
+from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts
 
 __all__ = ["ESTIMATORS", "estimate_noise", "fit_noise", "noise_floor", "noise_levels", "noise_of_blurred_frames"]
 
@@ -29,20 +30,10 @@ __all__ = ["ESTIMATORS", "estimate_noise", "fit_noise", "noise_floor", "noise_le
 _SIDE = 64  # px; side of the squares whose power spectra are computed
 
 
-def _spread_squares(shape: Sequence[int], counts: Sequence[int], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Rows (n, _SIDE) and columns (m, _SIDE) of n x m squares spread evenly over an image of that shape."""
-    inside = torch.arange(_SIDE, device=device)
-    rows, columns = (
-        torch.linspace(0, extent - _SIDE, count, device=device, dtype=torch.float32).round().to(torch.int64)[:, None]
-        + inside
-        for extent, count in zip(shape, counts, strict=True)
-    )
-    return rows, columns
-
-
-def _cut_squares(images: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """The squares (..., n, m, _SIDE, _SIDE) of images (..., H, W)."""
-    return images[..., rows[:, None, :, None], columns[None, :, None, :]]
+def _cut_squares(images: Tensor, counts: Sequence[int]) -> Tensor:
+    """Squares (..., n, m, _SIDE, _SIDE) of images (..., H, W), n x m of which are spread evenly over the image."""
+    tops, lefts = (spread_starts(extent, _SIDE, count) for extent, count in zip(images.shape[-2:], counts, strict=True))
+    return cut_pieces(images, tops, lefts, (_SIDE, _SIDE))
 
 
 def _tapered(squares: Tensor) -> Tensor:
@@ -62,7 +53,7 @@ def _mostly_measured(missing: Tensor, dims: tuple[int, ...], *, max_missing: flo
 
 # Single images: the quietest blocks of a high-pass residual
 
-_ELEMENTS = {"cpu": 1 << 16}  # values filtered at a time; they fit into the cache (speed only)
+_PIXELS = {"cpu": 1 << 22, "cuda": 1 << 26}  # px filtered at a time; bounds the memory
 
 
 def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
@@ -88,35 +79,33 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     """
     shape = (frames.shape[-2], frames.shape[-1])
     orders = [min(8, (extent - 1) // 2 + 1, extent - 1) for extent in shape]
-    inner = [extent - difference for extent, difference in zip(shape, orders, strict=True)]
+    inner = [extent - order for extent, order in zip(shape, orders, strict=True)]
     block = min(16, *inner)
     height, width = (extent // block * block for extent in inner)
     stride = max(1, height * width // (block**2 * 2048))  # 2048 blocks determine the quantile well enough
-    windows = [block + difference for difference in orders]
 
-    def strips_of(images: Tensor) -> Tensor:
+    def blocks_of(images: Tensor) -> Tensor:
+        """Blocks (..., n, m, rows, columns), with the neighbours that differences need."""
         inside = images[..., : height + orders[0], : width + orders[1]]
-        return inside.unfold(-2, windows[0], stride * block).movedim(-3, 0)  # (strips, ..., columns, rows)
+        return inside.unfold(-2, block + orders[0], stride * block).unfold(-2, block + orders[1], block)
 
-    strips = strips_of(frames)
-    across = torch.eye(windows[0], dtype=frames.dtype, device=frames.device).diff(orders[0], dim=0)
-
-    def residual(part: Tensor) -> Tensor:
-        differences = part @ across.T
-        for _ in range(orders[1]):
-            differences = differences.diff(dim=-2)
-        return differences
-
-    strip_size = frames[..., 0, :].numel() * block
-    blocks = [
-        residual(strips[part]).square().unflatten(-2, (-1, block)).mean((-2, -1))
-        for part in runs(len(strips), max(1, _ELEMENTS.get(frames.device.type, frames.numel()) // strip_size))
+    # energy of the differences along both axes, relative to that of white noise of variance 1
+    down, along = (
+        torch.as_tensor(np.diff(np.eye(block + order), order, axis=0), dtype=frames.dtype, device=frames.device)
+        for order in orders
+    )
+    images = frames.reshape(-1, *shape)
+    pixels = height * width // stride
+    parts = [
+        (down @ (blocks_of(images[part]) @ along.mT)).square().mean((-2, -1))
+        for part in runs(len(images), max(1, _PIXELS.get(frames.device.type, 1 << 22) // pixels))
     ]
-    energy = torch.cat(blocks) / math.prod(math.comb(2 * difference, difference) for difference in orders)
+    energy = torch.cat(parts).view(*frames.shape[:-2], *parts[0].shape[1:])
+    energy = energy / math.prod(math.comb(2 * order, order) for order in orders)
     if ignore is not None:
-        missing = strips_of(ignore.to(frames.dtype)).mean(-1).unfold(-1, windows[1], block).mean(-1)
-        energy = energy.masked_fill(~_mostly_measured(missing, (0, -1)), math.nan)
-    energy = energy.movedim(0, -1).flatten(-2)
+        missing = blocks_of(ignore.to(frames.dtype)).mean((-2, -1))
+        energy = energy.masked_fill(~_mostly_measured(missing, (-2, -1)), math.nan)
+    energy = energy.flatten(-2)
     # Means of squares of pure noise scatter, so that their low quantile lies below the true mean, by as much as that of
     # a chi-squared variable (Wilson and Hilferty 1931).
     quantile = 0.15
@@ -137,11 +126,15 @@ def _correlation_area(order: int) -> float:
 # Motion blur: it attenuates the scene, row by row, and leaves noise as it is
 
 
+# px, range of the displacement during an exposure below which its blur attenuates no frequency along any direction by
+# ``max_transfer``: at 0.7 cycles per px, the power transfer of a sinusoid of this range is 0.1
+_LEAST_BLUR = 0.8
+
+
 @torch.no_grad()
 def noise_of_blurred_frames(
     frames: Tensor,
     motion: FrameMotion,
-    stack: int,
     ignore: Tensor | None = None,
     high_pass: Tensor | None = None,
     *,
@@ -158,49 +151,56 @@ def noise_of_blurred_frames(
     with exponential distributions about their means (Whittle 1953).
 
     Args:
-        frames: As in ``ESTIMATORS``, and likewise the next four.
-        motion: Motion of the batch.
-        stack: Index in the batch.
+        frames: As in ``ESTIMATORS``, and likewise the next three.
+        motion: Motion of the frames.
         ignore: Pixels that were not measured; squares with many of them do not count.
         high_pass: Not used.
         min_frequency: Cycles per px; below, scenes are too strong to be informative about noise.
         max_transfer: T below which the blur counts as blocking the scene.
-        min_share: Share of such values of T below which the estimator does not apply.
+        min_share: Share of such values of T in a stack below which the estimator does not apply to it.
         row_step: T is computed for one of so many rows.
 
     Returns:
-        (T,), float64; NaN for a frame with fewer than four usable squares, for all frames if the estimator does not
-        apply.
+        (B, T), float64; NaN for a frame with fewer than four usable squares, for all frames of a stack to which the
+        estimator does not apply.
     """
+    num_stacks, num_frames = frames.shape[:2]
     shape, device = frames.shape[-2:], frames.device
-    nothing = torch.full((len(frames),), math.nan, dtype=torch.float64, device=device)
-    if min(shape) < 2 * _SIDE:
+    nothing = torch.full((num_stacks, num_frames), math.nan, dtype=torch.float64, device=device)
+    if min(shape) < 2 * _SIDE or np.hypot(*motion.blur_lengths.max((0, 1))) < _LEAST_BLUR:
         return nothing
     # transfer of the blur of squares spread over the frame; the estimator needs frequencies that it blocks
-    counts = _square_counts(shape, min(max(256 // len(frames), 25), 64))
-    rows, columns = _spread_squares(shape, counts, device)
+    counts = _square_counts(shape, min(max(256 // num_frames, 25), 64))
+    rows = torch.as_tensor(spread_starts(shape[0], _SIDE, counts[0])[:, None] + np.arange(_SIDE), device=device)
     u = torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=device)
     v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=device)
     used = _pooled(torch.hypot(u[:, None], v)) > min_frequency
-    times = motion.frame_starts[:, None, None] + rows * motion.timing.row_time
-    transfer = _pooled(_power_transfer(motion, stack, times[..., row_step // 2 :: row_step], u, v))[..., used]
-    if float((transfer < max_transfer).double().mean()) < min_share:
+    displacement, node_weights = motion.exposures
+    of_squares = displacement[:, :, rows]  # (B, T, n, rows, N, 2)
+    blur = _power_transfer(of_squares[:, :, :, row_step // 2 :: row_step], node_weights, u, v)
+    transfer = _pooled(blur)[..., used]
+    blocked = (transfer < max_transfer).double().mean((1, 2, 3)).cpu().numpy() >= min_share
+    stacks = blocked.nonzero()[0].tolist()
+    if not stacks:
         return nothing
     # power of the squares, mean over channels, with rows moved back by their displacement
-    squares = _tapered(_cut_squares(frames, rows, columns))  # (T, C, n, m, rows, columns)
-    mean = motion.vibration[stack].mean_displacement(times, motion.timing.exposure_time)[..., 0]
+    squares = _tapered(_cut_squares(frames[stacks], counts))  # (S, T, C, n, m, rows, columns)
+    mean = (of_squares[stacks][..., 0] * node_weights).sum(-1)
     unshift = waves(mean, -u).to(frames.dtype.to_complex())  # aligns neighbouring rows along the row axis
-    power = squared_modulus(torch.fft.fft(torch.fft.rfft(squares) * unshift[:, None, :, None], dim=-2)).mean(1)
+    spectra = torch.fft.rfft(squares) * unshift[:, :, None, :, None]
+    power = squared_modulus(torch.fft.fft(spectra, dim=-2)).mean(2)
     power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., used]
-    power, transfer = power.flatten(1, 2), transfer[:, :, None].expand_as(power).flatten(1, 2)
+    transfer = transfer[stacks][:, :, :, None].expand_as(power)
+    power, transfer = power.flatten(2, 3).flatten(0, 1), transfer.flatten(2, 3).flatten(0, 1)
     # squares that count; frames with too few of them have no estimate
     usable = (power > 0).any(-1)
     if ignore is not None:
-        missing = _cut_squares(ignore.any(1), rows, columns).double().mean((-2, -1)).flatten(1)
-        usable = usable & _mostly_measured(missing, (-1,))
+        missing = _cut_squares(ignore[stacks].any(2), counts).double().mean((-2, -1))
+        usable = usable & _mostly_measured(missing.flatten(2).flatten(0, 1), (-1,))
     enough = usable.sum(-1) >= min(4, usable.shape[-1])
     noise = fit_noise(power.where(enough[:, None, None], 1.0), transfer, usable | ~enough[:, None])
-    return noise.masked_fill(~enough, math.nan)
+    nothing[stacks] = noise.masked_fill(~enough, math.nan).view(-1, num_frames)
+    return nothing
 
 
 def fit_noise(
@@ -257,12 +257,12 @@ def _square_counts(shape: torch.Size, most: int) -> list[int]:
     return [max(1, round(count / excess)) for count in counts]
 
 
-def _power_transfer(motion: FrameMotion, stack: int, times: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Power transfer (..., U, V) of the blur of rows exposed from ``times`` (..., R) on, weighted by the window."""
-    displacement, weights = exposure_trajectory(motion.vibration[stack], times, motion.timing, "gauss")
-    along = waves(displacement[..., 0], u) * weights[:, None]
+def _power_transfer(displacement: Tensor, node_weights: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Power transfer (..., U, V) of the blur of rows with displacement (..., R, N, 2), weighted by the window."""
+    along = waves(displacement[..., 0], u) * node_weights[:, None]
     across = waves(displacement[..., 1], v)
-    window = torch.hann_window(2 * times.shape[-1] + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
+    size = displacement.shape[-3]
+    window = torch.hann_window(2 * size + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
     transfer = squared_modulus(along.transpose(-2, -1) @ across)
     return (transfer * (window / window.sum())[:, None, None]).sum(-3)
 
@@ -279,94 +279,111 @@ def _pooled(values: Tensor) -> Tensor:
 _MIN_SIDE = 64  # px that two frames must share along each axis, or the whole frame if it is smaller
 
 
+@torch.no_grad()
 def noise_of_frame_pair(
-    frames: Tensor,
-    motion: FrameMotion,
-    stack: int,
-    ignore: Tensor | None,
-    high_pass: Tensor,
-    *,
-    max_missing: float = 0.1,
+    frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor, *, max_missing: float = 0.1
 ) -> Tensor:
-    """Noise power of each frame from the two middle ones that have content.
+    """Noise power of each frame from the two middle ones of its stack that have content.
 
     The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is
     measured as the difference between that estimate and the residual, and assumed equal in all frames.
 
     Args:
-        frames: As in ``ESTIMATORS``, and likewise the next four.
-        motion: Motion of the batch.
-        stack: Index in the batch.
+        frames: As in ``ESTIMATORS``, and likewise the next three.
+        motion: Motion of the frames.
         ignore: Pixels that were not measured.
-        high_pass: (T,) noise power, texture included.
+        high_pass: (B, T) noise power, texture included.
         max_missing: Share of the compared pixels that may be missing.
 
     Returns:
-        (T,); NaN if fewer than two frames have content, or share too few pixels.
+        (B, T); NaN for stacks in which fewer than two frames have content, or share too few pixels.
     """
-    nothing = torch.full_like(high_pass, torch.nan)
-    height, width = frames.shape[-2:]
-    usable = (~high_pass.isnan()).nonzero().flatten().tolist()
-    middle = (len(usable) - 1) // 2
-    members = usable[middle : middle + 2]
-    if len(members) < 2:
-        return nothing
-    # rows and columns of the scene that both frames contain
-    x, y = (int(step) for step in (motion.shift[stack, members[1]] - motion.shift[stack, members[0]]).tolist())
-    columns, rows = width - abs(x), height - abs(y)
-    if min(columns, rows) < max(min(_MIN_SIDE, height, width), 8):
-        return nothing
-    num_rows = min(rows, 256)  # from the middle: more rows cost time and hardly lower the variance
-    first_rows = [max(-y, 0) + (rows - num_rows) // 2, max(y, 0) + (rows - num_rows) // 2]
-    first_columns = [max(-x, 0), max(x, 0)]
+    result = torch.full_like(high_pass, math.nan)
+    size = frames.shape[-2], frames.shape[-1]
+    least = max(min(_MIN_SIDE, *size), 8)
+    # the two frames of each stack, and the displacement (y, x) of the content between them
+    shifts, known = motion.shift.flip(-1).cpu().numpy().astype(int), (~high_pass.isnan()).cpu().numpy()
+    pairs = {}
+    for stack, usable in enumerate(known):
+        (numbers,) = usable.nonzero()
+        members = numbers[(len(numbers) - 1) // 2 :][:2]
+        if len(members) == 2:
+            step = shifts[stack, members[1]] - shifts[stack, members[0]]
+            if min(size - abs(step)) >= least:
+                pairs[stack] = members, step
+    if not pairs:
+        return result
+    # rows and columns of the scene that both frames contain, of all stacks or else of one stack after the other
+    common = size - np.abs([step for _, step in pairs.values()]).max(0)
+    if min(common) < least:
+        for stack in pairs:
+            missing = None if ignore is None else ignore[[stack]]
+            result[[stack]] = noise_of_frame_pair(
+                frames[[stack]], motion.of([stack]), missing, high_pass[[stack]], max_missing=max_missing
+            )
+        return result
+    num_rows, columns = min(common[0], 256), common[1]  # from the middle: more rows hardly lower the variance
+    stacks = list(pairs)
+    members = np.stack([members for members, _ in pairs.values()])  # (S, 2)
+    steps = np.stack([step for _, step in pairs.values()])
+    firsts = np.stack([(-steps).clip(0), steps.clip(0)], 1)  # (S, 2, axes)
+    tops, lefts = firsts[..., 0] + ((size[0] - abs(steps[:, :1])) - num_rows) // 2, firsts[..., 1]
 
     def shared(values: Tensor) -> Tensor:
-        places = zip(members, first_rows, first_columns, strict=True)
-        return torch.stack([values[m, :, i : i + num_rows, j : j + columns] for m, i, j in places])
+        parts = [
+            cut_parts(
+                values[stacks, members[:, k].tolist()], tops[:, k].tolist(), lefts[:, k].tolist(), (num_rows, columns)
+            )
+            for k in (0, 1)
+        ]
+        return torch.stack(parts, 1)
 
     images, ignored = shared(frames), None if ignore is None else shared(ignore)
-    measured_share = 1.0 if ignored is None else 1.0 - float(ignored.any(0).double().mean())
-    if measured_share < 1.0 - max_missing:
-        return nothing
+    measured_share = torch.ones_like(high_pass[stacks, 0])
+    if ignored is not None:
+        measured_share = 1.0 - ignored.any(1).to(images.dtype).mean((1, 2, 3))
     # noise of both frames, and texture that the high-pass estimate counts as noise
-    rows_of_both = torch.tensor(first_rows, device=frames.device)
-    noise = _residual_power(images, motion, stack, rows_of_both, members) / measured_share
+    place = (torch.as_tensor(values, device=frames.device) for values in (stacks, members, tops))
+    stack_of, member_of, top_of = place
+    rows = top_of[..., None] + torch.arange(num_rows, device=frames.device)
+    displacement, node_weights = motion.exposures
+    moved = displacement[stack_of[:, None, None], member_of[..., None], rows]
+    moved = moved - motion.shift[stack_of[:, None], member_of][:, :, None, None]
+    noise = _residual_power(images, moved, node_weights) / measured_share
     alone = estimate_noise(images, ignored).square().mean(-1)
-    texture = (alone.mean() - noise).clamp(min=0.0)
+    texture = (alone.mean(1) - noise).clamp(min=0.0)[:, None]
     # neither frame has more noise than both together; blur may leave one of them more texture than the other
-    upper = 2.0 * noise + (high_pass - alone.amax()).clamp(min=0.0)
-    return torch.maximum(high_pass - texture, 0.5 * torch.minimum(high_pass, noise)).minimum(upper)
+    known_power, noise = high_pass[stacks], noise[:, None]
+    upper = 2.0 * noise + (known_power - alone.amax(1, keepdim=True)).clamp(min=0.0)
+    estimate = torch.maximum(known_power - texture, 0.5 * torch.minimum(known_power, noise)).minimum(upper)
+    too_few = (measured_share < 1.0 - max_missing)[:, None]
+    result[stacks] = estimate.masked_fill(too_few, math.nan)
+    return result
 
 
-@torch.no_grad()
 def _residual_power(
     images: Tensor,
-    motion: FrameMotion,
-    stack: int,
-    first_rows: Tensor,
-    members: list[int],
+    displacement: Tensor,
+    node_weights: Tensor,
     *,
     num_frequencies: int = 24,
     prior_weight: float = 1e-4,
 ) -> Tensor:
-    """Residual power per degree of freedom of two images (2, C, R, W) after their least-squares scene is subtracted.
+    """Residual power (S,) per degree of freedom of pairs of images (S, 2, C, R, W) minus their least-squares scene.
 
     Only ``num_frequencies`` horizontal frequencies of the upper half are used, where scenes are weakest. A smoothness
     prior of ``prior_weight``, relative to the data, fills in rows of the scene that neither frame contains.
+    ``displacement`` (S, 2, R, N, 2) is that of the rows during their exposures, in the coordinates of the scene.
     """
-    # kernels of the rows of both frames, and their spectra at the chosen frequencies
     num_rows, width = images.shape[-2:]
-    rows = first_rows[:, None] + torch.arange(num_rows, dtype=torch.float64, device=images.device)
-    starts = motion.frame_starts[members][:, None] + rows * motion.timing.row_time
-    displacement, node_weights = exposure_trajectory(motion.vibration[stack], starts, motion.timing, "gauss")
-    displacement = displacement - motion.shift[stack, members][:, None, None]
-    kernels = row_kernels(displacement, node_weights, images.new_ones(2), num_rows, 4 * _MIN_SIDE)
+    moved = displacement.flatten(0, 1)
+    kernels = row_kernels(moved, node_weights, moved.new_ones(len(moved)), num_rows, 4 * _MIN_SIDE)
     count = min(num_frequencies, width // 4)
-    chosen = torch.linspace(width // 4, width // 2, count, device=images.device, dtype=torch.float32).long()
+    chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images, kernels, chosen)
-    explained = sample.explain([RowPrior.smooth(sample.u).precision(sample.u.new_ones(()), strength=prior_weight)])
-    power: Tensor = explained.power.sum() / (explained.count * len(chosen) - explained.freedom.sum())
-    return power.to(images.dtype)
+    explained = sample.explain([smoothness(len(images), count, prior_weight)])
+    freedom = explained.count * count - explained.freedom[0].sum(-1)
+    return torch.as_tensor(explained.power[0].sum(-1) / freedom, dtype=images.dtype, device=images.device)
 
 
 # One frame: noise is white, the spectrum of a scene falls
@@ -377,7 +394,6 @@ _SECTORS = 6  # directions, with one power law each
 def noise_of_spectral_floor(
     frames: Tensor,
     motion: FrameMotion,
-    stack: int,
     ignore: Tensor | None,
     high_pass: Tensor,
     *,
@@ -387,17 +403,16 @@ def noise_of_spectral_floor(
     """Noise power of each frame from ``noise_floor``, within bounds.
 
     Args:
-        frames: As in ``ESTIMATORS``, and likewise the next four.
+        frames: As in ``ESTIMATORS``, and likewise the next three.
         motion: Not used.
-        stack: Not used.
         ignore: Pixels that were not measured.
-        high_pass: (T,) noise power, texture included.
+        high_pass: (B, T) noise power, texture included.
         max_reduction: Largest factor between ``high_pass`` and the result; a noise level that is far too low amplifies
             noise more than one that is too high blurs.
         min_reduction: Factor below which ``high_pass`` is kept, because the floor is the less accurate of the two.
 
     Returns:
-        (T,); NaN for a frame whose floor is not clearly lower than ``high_pass``.
+        (B, T); NaN for a frame whose floor is not clearly lower than ``high_pass``.
     """
     floor = noise_floor(frames, ignore).mean(-1).to(high_pass.dtype)
     bounded = torch.maximum(floor, high_pass / max_reduction)
@@ -437,12 +452,11 @@ def noise_floor(frames: Tensor, ignore: Tensor | None = None, *, min_frequency: 
 def _spectrum(images: Tensor, ignore: Tensor | None, *, squares_per_axis: int = 6) -> Tensor:
     """Mean power (N, V, U) of squares of images (N, H, W); the power of white noise is its variance."""
     counts = [min(2 * extent // _SIDE - 1, squares_per_axis) for extent in images.shape[-2:]]
-    rows, columns = _spread_squares(images.shape[-2:], counts, images.device)
-    squares = _tapered(_cut_squares(images, rows, columns).flatten(1, 2))
+    squares = _tapered(_cut_squares(images, counts).flatten(1, 2))
     power = squared_modulus(torch.fft.rfft2(squares)).to(torch.float64)
     if ignore is None:
         return power.mean(1)
-    missing = _cut_squares(ignore, rows, columns).double().mean((-2, -1)).flatten(1)
+    missing = _cut_squares(ignore, counts).double().mean((-2, -1)).flatten(1)
     usable = _mostly_measured(missing, (-1,))
     return (power * usable[..., None, None]).sum(1) / usable.sum(1)[:, None, None]
 
@@ -504,17 +518,18 @@ def _fit_floor(
 
 # Estimators that separate noise from texture, in order of preference. An estimator is called as
 #
-#     estimator(frames, motion, stack, ignore, high_pass) -> Tensor
+#     estimator(frames, motion, ignore, high_pass) -> Tensor
 #
-#     frames: (T, C, H, W) floating point in row order; ignored pixels hold local means.
-#     motion: FrameMotion of the batch; ``stack`` is the index of these frames in it.
-#     ignore: (T, C, H, W) bool, pixels that were not measured; None for none.
-#     high_pass: (T,) noise power of ``estimate_noise``, texture included; NaN for a frame without content.
-#     returns: (T,) noise power (variance per pixel in squared units of the frames); NaN for a frame that it cannot
-#         estimate, for all frames if the estimator does not apply to the recording.
+#     frames: (B, T, C, H, W) floating point in row order; ignored pixels hold local means.
+#     motion: FrameMotion of the B stacks.
+#     ignore: (B, T, C, H, W) bool, pixels that were not measured; None for none.
+#     high_pass: (B, T) noise power of ``estimate_noise``, texture included; NaN for a frame without content.
+#     returns: (B, T) noise power (variance per pixel in squared units of the frames); NaN for a frame that it cannot
+#         estimate, for all frames of a stack to which the estimator does not apply.
 #
-# It must not change its arguments, and must not raise for small, constant or masked frames.
-Estimator = Callable[[Tensor, FrameMotion, int, Tensor | None, Tensor], Tensor]
+# It must not change its arguments, must not raise for small, constant or masked frames, and a stack must not affect
+# another one.
+Estimator = Callable[[Tensor, FrameMotion, Tensor | None, Tensor], Tensor]
 ESTIMATORS: dict[str, Estimator] = {
     "motion blur": noise_of_blurred_frames,
     "frame pair": noise_of_frame_pair,
@@ -522,32 +537,35 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def noise_levels(frames: Tensor, motion: FrameMotion, stack: int, ignore: Tensor | None = None) -> Tensor:
-    """Standard deviation of the noise of each frame of a stack.
+@torch.no_grad()
+def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = None) -> Tensor:
+    """Standard deviation of the noise of each frame of B stacks.
 
     ``estimate_noise`` counts fine texture as noise, which makes it an upper bound. The first estimator of
-    ``ESTIMATORS`` that applies to the recording lowers it. A frame without content, or with too few measured pixels,
-    is assigned the median noise power of the others.
+    ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, is
+    assigned the median noise power of the others of its stack.
 
     Args:
-        frames: (T, C, H, W) in row order; ignored pixels hold local means.
-        motion: Motion of the batch of stacks.
-        stack: Index of the stack in the batch.
+        frames: (B, T, C, H, W) in row order; ignored pixels hold local means.
+        motion: Motion of the frames.
         ignore: Boolean mask shaped like the frames of pixels that were not measured.
 
     Returns:
-        (T,), in the dtype and unit of the frames; 0 if no frame has content.
+        (B, T), in the dtype and unit of the frames; 0 if no frame of a stack has content.
     """
-    power = estimate_noise(frames, ignore).square().nanmean(-1).masked_fill(_constant(frames), torch.nan)
+    high_pass = estimate_noise(frames, ignore).square().nanmean(-1).masked_fill(_constant(frames), math.nan)
+    power, waiting = high_pass, torch.ones_like(high_pass[:, :1], dtype=torch.bool)
     for estimator in ESTIMATORS.values():
-        estimated = estimator(frames, motion, stack, ignore, power)
-        if not bool(estimated.isnan().all()):
-            power = torch.minimum(power, estimated.to(power.dtype).nan_to_num(nan=torch.inf))
+        estimated = estimator(frames, motion, ignore, high_pass).to(power.dtype)
+        lowered = torch.minimum(high_pass, estimated.nan_to_num(nan=math.inf))
+        applies = waiting & ~estimated.isnan().all(1, keepdim=True)
+        power, waiting = torch.where(applies, lowered, power), waiting & ~applies
+        if not bool(waiting.any()):
             break
-    return torch.where(power.isnan(), power.nanmedian(), power).nan_to_num(nan=0.0).sqrt()
+    return torch.where(power.isnan(), power.nanmedian(1, keepdim=True).values, power).nan_to_num(nan=0.0).sqrt()
 
 
 def _constant(frames: Tensor, row_step: int = 8, tolerance: float = 1e-6) -> Tensor:
-    """Frames (T,) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
-    low, high = frames[..., ::row_step, :].flatten(1).aminmax(dim=-1)
+    """Frames (B, T) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
+    low, high = frames[..., ::row_step, :].flatten(2).aminmax(dim=-1)
     return high - low <= tolerance * torch.maximum(-low, high)

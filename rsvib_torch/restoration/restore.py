@@ -36,8 +36,7 @@ from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.frame_motion import motion_in_row_order, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.verdict.judge import judge_prepared
-from rsvib_torch.restoration.verdict.pairs import TooLittleInCommonError
+from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = [
@@ -293,9 +292,10 @@ def restore(
         warn_of_restoration(str(reason))
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.get("joint", False), options.get("scale", 1))
-    restored = restore_prepared(prepared, vibration, method, options)
+    motion = motion_in_row_order(prepared, vibration)
+    restored = _restored(prepared, motion, method, options)
     if check:  # before frames are sharpened: the verdict compares them with raw frames, which the optics have blurred
-        _warn_if_worse(prepared, restored, vibration, options.get("joint", False))
+        _warn_if_worse(prepared, restored, motion, options.get("joint", False))
     if camera is not None:
         restored = sharpened(restored, camera, options.get("scale", 1))
     return prepared.from_row_order(restored)
@@ -319,17 +319,21 @@ def restore_prepared(
     """
     options = dict(options or {})
     check_method_options(method, options)
+    return _restored(frames, motion_in_row_order(frames, vibration), method, options)
+
+
+def _restored(frames: PreparedFrames, motion: Motion, method: str, options: Mapping[str, Any]) -> Tensor:
+    """Frames restored with a motion (B) in row order, with the masks that the method takes."""
     chosen = METHODS[method] if frames.colours is None else METHODS[method].mosaic
     if chosen is None:
         names = " or ".join(repr(name) for name, entry in METHODS.items() if entry.mosaic is not None)
         raise ValueError(f"mosaic goes with method={names}, not with method={method!r}; demosaic the frames before")
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
-    options |= {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    options = dict(options) | {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         options["colours"] = frames.colours
     if chosen.strips:
         options["strips"] = 1
-    motion = motion_in_row_order(frames, vibration)
     return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options)
 
 
@@ -348,17 +352,15 @@ def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) 
     return frames.from_row_order(enlarged(images[:, middle : middle + 1] if joint is True else images, scale))
 
 
-def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, joint: bool | int) -> None:
-    """Judge each stack of a batch that moves on a strip of 160 columns of two pairs of frames."""
+def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: Motion, joint: bool | int) -> None:
+    """Judge the stacks that move, by a motion (B) in row order, on 160 columns of two pairs of frames."""
     if frames.images.shape[1] < 2:
         return
-    moving = vibration.moving_axes().any(-1).expand(len(restored)).nonzero().flatten().tolist()
-    for stack in moving:
-        try:
-            verdict = judge_prepared(frames, restored, vibration, joint=joint, most_pairs=2, columns=160, stack=stack)
-        except TooLittleInCommonError:
-            continue  # frames that share no scene cannot be compared
-        if verdict.overall in ("partly", "worse"):
+    moves = {stack: axes for stack, axes in enumerate(motion.moving_axes().tolist()) if any(axes)}
+    verdicts = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=2, columns=160)
+    for stack, verdict in zip(moves, verdicts, strict=True):
+        # frames that share no scene cannot be compared
+        if isinstance(verdict, RestorationVerdict) and verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(restored) > 1 else ""
             warn_of_restoration(f"{where}{verdict.sentence}")
 

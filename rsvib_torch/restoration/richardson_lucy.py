@@ -48,9 +48,9 @@ def restore_richardson_lucy(
         Non-negative restored frames of the same shape, or (B, 1, C, H, W).
     """
     iterations = check_whole_number("iterations", iterations, at_least=1, at_most=_MAX_ITERATIONS)
-    B, T, _, H, W = frames.shape
+    B, T, _, _, W = frames.shape
     groups = joint_groups(T, joint)
-    psf = trajectory_psf(*motion.exposures(H), interpolation="cubic")
+    psf = trajectory_psf(*motion.exposures, interpolation="cubic")
     weights = psf.weights.to(frames.dtype)[:, :, None]
     measured = torch.ones_like(frames) if ignore is None else (~ignore).to(frames.dtype)
     counts = frames.clamp(min=0.0)

@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import extend_system, factor_banded, skew_band, solve_banded, solve_skewed
+from rsvib_torch.core.banded_solver import factor_banded, from_both_ends, skew_band, solve_banded, solve_halves
 
 
 def random_system(count, width, *, dtype=torch.complex128, batch=(3,), columns=2, seed=0):
@@ -25,29 +25,15 @@ def test_agrees_with_scipy(count, width, dtype):
         np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("width", [0, 4])
-def test_extended_systems_have_the_same_solution(width):
-    band, right_side = random_system(20, width)
-    skewed = skew_band(band)
-    skewed[20:] = torch.nan  # entries beyond the last column may have any value
-    for d in range(1, width + 1):
-        skewed[20 - d : 20, width + d] = torch.nan
-    extended = extend_system(skewed, 24, 6)
-    assert extended.shape == (30, 13, 3)
-    further = torch.ones(4, *right_side.shape[1:], dtype=right_side.dtype)
-    found = solve_skewed(extended, torch.cat([right_side, further]))
-    torch.testing.assert_close(found[:20], solve_banded(band, right_side), rtol=1e-10, atol=1e-12)
-    torch.testing.assert_close(found[20:], further)
-
-
 def test_pivots_give_the_determinant():
     band, _ = random_system(6, 2, batch=(1,))
     dense = torch.zeros(6, 6, dtype=torch.complex128)
     for d in range(3):
         for k in range(6 - d):
             dense[k + d, k], dense[k, k + d] = band[k, d, 0], band[k, d, 0].conj()
-    inverse = factor_banded(skew_band(band)).inverse
-    assert -inverse.log().sum().item() == pytest.approx(torch.logdet(dense).real.item(), rel=1e-12)
+    factor = factor_banded(from_both_ends(skew_band(band)).flatten(2), 6)
+    logarithm = -factor.ends.inverse.log().sum() - factor.middle.inverse.log().sum()
+    assert logarithm.item() == pytest.approx(torch.logdet(dense).real.item(), rel=1e-12)
 
 
 def test_single_precision_residual():
@@ -78,11 +64,11 @@ def test_gradients(dtype):
 @pytest.mark.parametrize("width", [0, 2])
 def test_stored_factors_give_the_same_solution(width):
     band, right_side = random_system(7, width)
-    factor = factor_banded(skew_band(band))
+    factor = factor_banded(from_both_ends(skew_band(band)).flatten(2), 7)
     expected = solve_banded(band, right_side)
     for _ in range(2):
-        torch.testing.assert_close(solve_skewed(factor, right_side), expected)
-    assert torch.autograd.gradcheck(lambda columns: solve_skewed(factor, columns), (right_side.requires_grad_(),))
+        torch.testing.assert_close(solve_halves(factor, right_side), expected)
+    assert torch.autograd.gradcheck(lambda columns: solve_halves(factor, columns), (right_side.requires_grad_(),))
 
 
 @pytest.mark.parametrize("width", [1, 4])

@@ -4,7 +4,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from exact_steps import FixedStrength, solved, stack_of
+from exact_steps import model_of, solved
 from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
@@ -12,11 +12,10 @@ from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
 from rsvib_torch.evaluation.scenes import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
-from rsvib_torch.restoration.exact.exact import model_stacks, solve_scenes
-from rsvib_torch.restoration.exact.filling import Extended
+from rsvib_torch.restoration.exact.exact import model_frames
 from rsvib_torch.restoration.exact.priors import PRIORS, Prior
 from rsvib_torch.restoration.exact.scene_solver import Partition
-from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
+from rsvib_torch.restoration.frame_motion import frame_motion
 
 restore = partial(restore_by_any_method, method="exact")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -104,11 +103,9 @@ def test_boundaries_are_not_periodic(short):
     other = frames.clone()
     other[:, :8] = 1.0
     other[:, :, :8] = 1.0
-    stack, changed = (stack_of(images, TIMING, motion.vibration(), noise=0.01) for images in (frames, other))
+    stack, changed = (model_of(images, TIMING, motion.vibration(), noise=0.01) for images in (frames, other))
     # with one prior, so that results depend on the frames only through the solution
-    change = solved(changed, prior=stack.prior, strength_cache=FixedStrength()) - solved(
-        stack, strength_cache=FixedStrength()
-    )
+    change = solved(changed, prior=stack.prior) - solved(stack)
     assert change[:, :4, :4].abs().max() > 0.1
     assert change[:, 64:, -32:].abs().max() < 0.01
     assert change[:, -32:, 64:].abs().max() < 0.01
@@ -141,21 +138,21 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     gaussian = PRIORS["gaussian"].function
 
     def recorded_prior(problem, regularisation):
-        parts.append((threading.current_thread(), torch.is_grad_enabled()))
+        parts.append((threading.current_thread(), torch.is_grad_enabled(), len(problem.data)))
         return gaussian(problem, regularisation)
 
-    monkeypatch.setitem(PRIORS, "gaussian", Prior(recorded_prior))  # solves one scene at a time
+    monkeypatch.setitem(PRIORS, "gaussian", Prior(recorded_prior))
     try:
-        for threads, workers in ((2, 2), (1, 1)):
+        for threads, scenes in ((2, [1, 2]), (1, [3])):
             parts.clear()
             torch.set_num_threads(threads)
             found.append(restore(stack, TIMING, motion.vibration(), **options))
-            assert len(parts) == 3
-            assert len({thread for thread, _ in parts}) == workers
+            assert sorted(number for *_, number in parts) == scenes
+            assert len({thread for thread, *_ in parts}) == threads
         parts.clear()
-        torch.set_num_threads(2)
+        torch.set_num_threads(1)
         found.append(restore(stack.requires_grad_(), TIMING, motion.vibration(), **options))
-        assert parts == [(threading.current_thread(), True)] * 3
+        assert parts == [(threading.current_thread(), True, 3)]
     finally:
         torch.set_num_threads(allowed)
     torch.testing.assert_close(found[1], found[0], rtol=0, atol=1e-9)
@@ -292,7 +289,9 @@ def test_segments_are_used_only_without_blur(exposure):
     vibration = Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
     scene = city_and_fields(1200 + 96, 64 + 96, seed=4)
     frames = simulate_frames(scene, timing, vibration, 1, frame_size=(1200, 64))
-    blurred = stack_of(frames, timing, vibration, noise=0.01).kernels([0], 0).blurred
+    model = model_of(frames, timing, vibration, noise=0.01)
+    scenes = model.scenes([([0], 0)])
+    blurred = model.kernels(scenes, scenes.contributes).blurred
     assert blurred == (exposure == 300)
     whole = restore(frames, timing, vibration, segments=1, check=False)
     for segments, windows in ((1, 1), (None, 2), (4, 4)):
@@ -326,43 +325,33 @@ def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
     scene = city_and_fields(256, 400, seed=5)
     noise = 0.005 * torch.randn(192, 336, generator=torch.Generator().manual_seed(5))
     frame, expected = (simulate_frames(scene, timing, each, 1, frame_size=(192, 336)) for each in (motion, still))
-    stack = stack_of(frame + noise, timing, motion, noise=0.005)
+    model = model_of(frame + noise, timing, motion, noise=0.005)
 
     def at_ends(images):
         return torch.cat([images[..., 24:-24, :24], images[..., 24:-24, -24:]], -1)
 
-    filled, not_filled = (
-        psnr(at_ends(solved(stack, fills_ends=fills)), at_ends(expected), 1.0) for fills in (True, False)
-    )
+    # the inner one of three strips ends where it has no weight
+    of_three = frame_motion(motion.expanded(3), timing.in_row_order(), 1, 192)
+    inner = model_frames((frame + noise).expand(3, 1, 1, -1, -1), of_three, noise=0.005, strips=3)
+    filled, not_filled = (psnr(at_ends(image), at_ends(expected[0]), 1.0) for image in solved(inner)[:2])
     assert filled > not_filled + 0.5
-    of_frames = frame_motion(motion.expanded(5), timing.in_row_order(), 1, 192)
-    strips = (frame + noise).unfold(-1, 80, 64).movedim(-2, 0)[:, :, None]  # (5, 1, 1, 192, 80)
-    problems = [
-        scene.problem(Partition())
-        for strip in model_stacks(strips, of_frames, noise=0.005, strips=5)
-        for scene in strip.tasks([([0], 0)], 1.0)
-    ]
-    assert [isinstance(problem, Extended) for problem in problems] == [True, False, False, False, True]
+    assert inner.kinds(inner.scenes([([0], 0)])) == ["extension", "nothing", "extension"]
+    torch.testing.assert_close(solved(model)[0], solved(inner)[0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(("amplitude", "shapes"), [(3.0, 1), (8.0, 2)])
-def test_scenes_filled_together_equal_single_ones(amplitude, shapes):
-    """Two stacks of three frames; larger amplitudes need longer periods."""
-    timing = SensorTiming(row_time=1e-4, exposure_rows=75, frame_rows=200)
-    motions = [Vibration([size, 1.2], [53.0, 65.0], [0.4, 1.3]) for size in (3.0, amplitude)]
+@pytest.mark.parametrize("joint", [False, 2])
+@pytest.mark.parametrize("rows", [20, 75])
+def test_a_batch_equals_single_stacks(rows, joint):
+    """Two stacks of three frames of one period, one with a missing pixel."""
+    timing = SensorTiming(row_time=1e-4, exposure_rows=rows, frame_rows=200)
+    motions = [Vibration([size, 1.2], [53.0, 65.0], [0.4, 1.3]) for size in (3.0, 2.9)]
     scene = city_and_fields(176, 176, seed=5)
     frames = torch.stack([simulate_frames(scene, timing, motion, 3, frame_size=(96, 96)) for motion in motions])
     frames = frames + 0.01 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(5))
-    scenes = [
-        scene
-        for images, motion in zip(frames, motions, strict=True)
-        for scene in stack_of(images, timing, motion, noise=0.01).tasks(joint_groups(3, False), 1.0)
-    ]
-    assert len({scene.problem(Partition()).problem.data.shape for scene in scenes}) == shapes
-    found, single = (
-        solve_scenes(scenes, PRIORS["gaussian"], 1.0, Partition(), filled_together=count)[0] for count in (6, 1)
-    )
-    torch.testing.assert_close(found, single, rtol=0, atol=2e-5)
+    frames[1, 0, 40, 40] = float("nan")
+    together = restore(frames[:, :, None], timing, Vibration.stacked(motions), joint=joint, check=False)
+    for images, motion, found in zip(frames, motions, together[:, :, 0], strict=True):
+        torch.testing.assert_close(found, restore(images, timing, motion, joint=joint, check=False), rtol=0, atol=1e-4)
 
 
 def test_prior_added_to_the_table(short, monkeypatch):
@@ -373,7 +362,7 @@ def test_prior_added_to_the_table(short, monkeypatch):
     def toy(problem, regularisation):
         """A restoration that contains only the mean brightness."""
         factors.append(regularisation)
-        return torch.zeros_like(problem.data[0])
+        return torch.zeros_like(problem.data[:, 0])
 
     monkeypatch.setitem(PRIORS, "toy", Prior(toy))
     restored = restore(frames, TIMING, motion.vibration(), prior="toy", regularisation=2.0)

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from exact_steps import solved, stack_of
+from exact_steps import model_of, solved
 from field_truth import FieldMotion, take_field_frames
 from finer_truth import (
     FINER,
@@ -148,10 +148,10 @@ def test_image_motion(scene):
 def test_gradients(frames):
     """Of frames whose prior is a constant."""
     images = frames[:2, :32, :40].double()
-    prior = stack_of(images, TIMING, VIBRATION, noise=0.01, scale=2).prior
+    prior = model_of(images, TIMING, VIBRATION, noise=0.01, scale=2).prior
 
     def energy(values):
-        stack = stack_of(values, TIMING, VIBRATION, noise=0.01, scale=2)
+        stack = model_of(values, TIMING, VIBRATION, noise=0.01, scale=2)
         return solved(stack, joint=True, prior=prior).square().mean()
 
     check_gradient(energy, images, rel=0.02)

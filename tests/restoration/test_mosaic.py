@@ -165,7 +165,7 @@ def test_gradient_of_the_least_squares_solution():
     """Of conjugate gradients with weights that couple the colours."""
     generator = torch.Generator().manual_seed(1)
     motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), 2, 24)
-    displacement, node_weights = motion.exposures(24)
+    displacement, node_weights = motion.exposures
     kernels = finer_kernels(displacement[0], node_weights, torch.ones(2), 24)
     observation = FinerObservation(kernels, 24, 32, torch.float64)
     prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64), 32)

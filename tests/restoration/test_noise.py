@@ -29,7 +29,7 @@ DEFAULT_MOTION = Motion()
 
 def levels(frames, motion):
     rowwise = frame_motion(motion.vibration().expanded(1), TIMING, len(frames), frames.shape[-2])
-    return noise_levels(torch.as_tensor(frames)[:, None], rowwise, 0)
+    return noise_levels(torch.as_tensor(frames)[None, :, None], rowwise)[0]
 
 
 @pytest.mark.parametrize("shape", [(512, 512), (300, 64), (64, 64), (1300, 1500)])
@@ -79,16 +79,16 @@ def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 3, 0.01)).float()[:, None]
     motion = frame_motion(Motion().vibration().expanded(1), timing, 3, frames.shape[-2])
-    whole = noise_levels(frames, motion, 0)
+    whole = noise_levels(frames[None], motion)[0]
     ignore = None
     if dead == "not measured":
         ignore = torch.zeros(frames.shape, dtype=torch.bool)
         ignore[1] = True
     frames[1] = {"black": 0.0, "constant": 0.3, "not measured": 0.5}[dead]
-    found = noise_levels(frames, motion, 0, ignore)
+    found = noise_levels(frames[None], motion, None if ignore is None else ignore[None])[0]
     torch.testing.assert_close(found[[0, 2]], whole[[0, 2]], rtol=0.1, atol=0)
     assert found[0].item() * 0.9 < found[1].item() < found[0].item() * 1.1
-    assert (noise_levels(torch.zeros_like(frames), motion, 0) == 0).all()
+    assert (noise_levels(torch.zeros_like(frames[None]), motion) == 0).all()
 
 
 @pytest.mark.parametrize("rows", [20, 100])
@@ -99,7 +99,7 @@ def test_missing_pixels_do_not_affect_the_level(rows, share):
     motion = frame_motion(Motion().vibration().expanded(1), timing, 2, frames.shape[-2])
     hidden = torch.zeros(frames.shape, dtype=torch.bool)
     hidden[..., : round(share * frames.shape[-1])] = True
-    found = noise_levels(frames.masked_fill(hidden, 0.4), motion, 0, hidden)
+    found = noise_levels(frames.masked_fill(hidden, 0.4)[None], motion, hidden[None])[0]
     torch.testing.assert_close(found, torch.full((2,), 0.01), rtol=0.12, atol=0)
 
 
@@ -119,10 +119,10 @@ def test_estimators_return_nan_where_they_cannot_estimate(name, case):
     )
     ignore = torch.ones(frames.shape, dtype=torch.bool) if case == "all missing" else None
     motion = frame_motion(Motion().vibration().expanded(1), TIMING.in_row_order(), 2, frames.shape[-2])
-    high_pass = torch.full((2,), float("nan"))
+    high_pass = torch.full((1, 2), float("nan"))
     before = frames.clone()
-    power = ESTIMATORS[name](frames, motion, 0, ignore, high_pass)
-    assert power.shape == (2,)
+    power = ESTIMATORS[name](frames[None], motion, None if ignore is None else ignore[None], high_pass)
+    assert power.shape == (1, 2)
     assert power.isnan().all() or (power >= 0).all()
     assert torch.equal(frames, before)
 
@@ -213,12 +213,12 @@ def blurred_frames(scene, rows, noise, count=1, motion=DEFAULT_MOTION):
 def test_motion_blur_separates_dense_texture_from_noise(rows, noise, texture_adds):
     frames, motion = blurred_frames(texture(420, 0.7), rows, noise)
     assert estimate_noise(frames[0])[0] > texture_adds * noise
-    assert noise_of_blurred_frames(frames, motion, 0)[0].sqrt().item() == pytest.approx(noise, rel=0.12)
+    assert noise_of_blurred_frames(frames[None], motion)[0, 0].sqrt().item() == pytest.approx(noise, rel=0.12)
 
 
 def test_motion_blur_with_edges_and_flat_ground():
     frames, motion = blurred_frames(draw_scene(420, 420, 14), 100, 0.005)
-    assert noise_of_blurred_frames(frames, motion, 0)[0].sqrt().item() == pytest.approx(0.005, rel=0.1)
+    assert noise_of_blurred_frames(frames[None], motion)[0, 0].sqrt().item() == pytest.approx(0.005, rel=0.1)
 
 
 def test_motion_blur_measures_every_frame_independently():
@@ -226,23 +226,25 @@ def test_motion_blur_measures_every_frame_independently():
     levels = torch.tensor([0.002, 0.006])
     noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
     frames = frames + levels[:, None, None, None] * noise
-    found = noise_of_blurred_frames(frames, motion, 0).sqrt().float()
+    found = noise_of_blurred_frames((frames)[None], motion)[0].sqrt().float()
     torch.testing.assert_close(found, levels, rtol=0.12, atol=0)
-    wrong = noise_of_blurred_frames(frames.flip(0), motion, 0).sqrt().float().flip(0)
+    wrong = noise_of_blurred_frames((frames.flip(0))[None], motion)[0].sqrt().float().flip(0)
     assert (wrong / levels - 1).abs().max() > 0.5
 
 
 def test_motion_blur_averages_channels():
     (one, motion), (two, _) = (blurred_frames(texture(420, 0.7, seed), 400, 0.003) for seed in (1, 2))
     colour = torch.cat([one, two], dim=1)
-    assert noise_of_blurred_frames(colour, motion, 0).sqrt().item() == pytest.approx(0.003, rel=0.1)
-    torch.testing.assert_close(noise_of_blurred_frames(3 * one, motion, 0), 9 * noise_of_blurred_frames(one, motion, 0))
+    assert noise_of_blurred_frames((colour)[None], motion)[0].sqrt().item() == pytest.approx(0.003, rel=0.1)
+    torch.testing.assert_close(
+        noise_of_blurred_frames((3 * one)[None], motion)[0], 9 * noise_of_blurred_frames((one)[None], motion)[0]
+    )
 
 
 @pytest.mark.parametrize(("rows", "size"), [(20, 420), (100, 180)])
 def test_motion_blur_does_not_apply_without_blur_or_to_small_frames(rows, size):
     frames, motion = blurred_frames(texture(size, 0.7), rows, 0.004)
-    assert noise_of_blurred_frames(frames, motion, 0).isnan().all()
+    assert noise_of_blurred_frames((frames)[None], motion)[0].isnan().all()
 
 
 def test_kernel_between_rows():

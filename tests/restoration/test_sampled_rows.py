@@ -6,9 +6,8 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.cross_validation import Explained, sample_rows, select_strength
+from rsvib_torch.restoration.scene_model.cross_validation import Explained, sample_rows, select_strengths
 from rsvib_torch.restoration.scene_model.observation import row_kernels
 from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
@@ -23,12 +22,11 @@ def slab_data(request):
     noise = NOISE * np.random.default_rng(2).standard_normal(clean.shape)
     frames = torch.from_numpy(clean + noise).float()[:, None]
     motion = frame_motion(Motion().vibration().expanded(1), timing, 2, NUM_ROWS)
-    starts = motion.row_starts(torch.arange(NUM_ROWS, dtype=torch.float64))
-    displacement, weights = exposure_trajectory(motion.vibration[0], starts, timing, "gauss")
-    kernels = row_kernels(displacement, weights, torch.ones(2), NUM_ROWS)
-    prior = fit_prior(frames, motion, 0, torch.full((2,), NOISE), WIDTH).of([0, 1])
-    chosen = torch.arange(8, 120, 8)
-    precision = prior.precision(torch.tensor(NOISE**2), blur_reach=kernels.blur_reach)[..., chosen]
+    displacement, weights = motion.exposures
+    kernels = row_kernels(displacement[0], weights, torch.ones(2), NUM_ROWS)
+    prior = fit_prior(frames[None], motion, torch.full((1, 2), NOISE), WIDTH)
+    chosen = np.arange(8, 120, 8)
+    precision = prior.precision(torch.tensor([[NOISE**2]]), blur_reach=kernels.blur_reach)[..., chosen].numpy()
     assert frames.shape == (2, 1, NUM_ROWS, WIDTH)
     return frames, kernels, chosen, precision
 
@@ -63,13 +61,13 @@ def dense(frames, kernels, u, products, rows):
 @pytest.mark.parametrize("slab", [1000, 128, 80])
 def test_slabs_are_fitted_independently(slab_data, slab):
     frames, kernels, chosen, precision = slab_data
-    found = sample_rows(frames, kernels, chosen, slab).explain([precision, 0.25 * precision])
+    found = sample_rows(frames[None], kernels, chosen, slab).explain([precision, 0.25 * precision])
     number = max(1, NUM_ROWS // slab)
     height = NUM_ROWS // number
-    assert found.count == 2 * number * height
+    assert found.count.tolist() == [2 * number * height]
     for place in (1, 6, 13):
         for index, factor in enumerate((1.0, 0.25)):
-            products = factor * precision[..., place].double().numpy()
+            products = factor * precision[..., 0, place]
             power, freedom = np.sum(
                 [
                     dense(frames, kernels, float(chosen[place]) / WIDTH, products, slice(k * height, (k + 1) * height))
@@ -77,8 +75,8 @@ def test_slabs_are_fitted_independently(slab_data, slab):
                 ],
                 axis=0,
             )
-            assert found.power[index, place].item() == pytest.approx(power, rel=0.01)
-            assert found.freedom[index, place].item() == pytest.approx(freedom, rel=0.01)
+            assert found.power[index, 0, place] == pytest.approx(power, rel=0.01)
+            assert found.freedom[index, 0, place] == pytest.approx(freedom, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -89,14 +87,13 @@ def test_slabs_are_fitted_independently(slab_data, slab):
     ],
 )
 def test_weak_priors_are_tried_only_if_the_third_is_selected(errors, expected, calls):
-    strengths = [2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03]
-    precisions = list(torch.arange(7))
+    precisions = np.arange(7).reshape(7, 1, 1, 1, 1)
     tried = []
 
     def explain(some):
         tried.append(len(some))
-        power = torch.tensor([errors[int(number)] for number in some], dtype=torch.float64)[:, None].exp()
-        return Explained(power, torch.zeros_like(power), 100)
+        power = np.exp([errors[number.item()] for number in some])[:, None, None]
+        return Explained(power, np.zeros_like(power), np.array([100]))
 
-    assert select_strength(strengths, precisions, explain) == expected
+    assert select_strengths(precisions, np.array([True]), explain).tolist() == [expected]
     assert tried == calls

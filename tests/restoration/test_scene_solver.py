@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import skew_band, solve_skewed
+from rsvib_torch.core.banded_solver import from_both_ends, skew_band, solve_halves
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
@@ -18,7 +18,9 @@ def solved_in_windows(windows, band, right_side):
     parts = torch.stack([skew_band(band)[window] for window in windows], dim=-2).flatten(-2)
     full = torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])])
     right = torch.stack([right_side[window] for window in windows], dim=-2).flatten(-2)
-    return join_windows(solve_skewed(full, right).unflatten(-1, (-1, band.shape[-1])), windows)
+    return join_windows(
+        solve_halves(from_both_ends(full).flatten(2), right).unflatten(-1, (-1, band.shape[-1])), windows
+    )
 
 
 @pytest.mark.parametrize("count", [2, 3, 7])
@@ -56,6 +58,12 @@ def test_windows_of_one_size_cover_all_rows(rows, count, overlap):
     assert torch.equal(join_windows(parts, windows), values)
 
 
+def smooth_prior(u):
+    """Correlation 0.9 of neighbouring rows at all frequencies (1, U), and innovations of variance 1."""
+    reflections = torch.stack([torch.full_like(u, 0.9), torch.zeros_like(u)])
+    return RowPrior(1 / (1 - reflections[0].square()), reflections, torch.zeros_like(u)[None])
+
+
 @pytest.mark.parametrize("first", [torch.arange(90) // 2 * 2, torch.arange(90).clamp(min=85) * 4 - 340])
 def test_observation_operator_is_a_sum_over_taps_and_has_this_adjoint(first):
     generator = torch.Generator().manual_seed(3)
@@ -67,14 +75,14 @@ def test_observation_operator_is_a_sum_over_taps_and_has_this_adjoint(first):
     part, length = slice(2, 13), 40
     observation = Observation(kernels, 90, length, torch.float64)
     u = torch.arange(part.start, part.stop, dtype=torch.float64) / length
-    data = torch.randn(1, 2, 90, 11, dtype=torch.complex128, generator=generator)
-    coefficients = torch.randn(observation.count, 2, 11, dtype=torch.complex128, generator=generator)
+    data = torch.randn(1, 1, 2, 90, 11, dtype=torch.complex128, generator=generator)
+    coefficients = torch.randn(observation.count, 2, 1, 11, dtype=torch.complex128, generator=generator)
     observed = observation.forward(coefficients, part)
     turned = kernels.at(u)[0] * torch.exp(-2j * torch.pi * u * middle[0, :, :1])[:, None]
     for row in (0, 8, 44, 89):
         place = int(first[row]) - observation.top
-        expected = (turned[row, :, None] * coefficients[place : place + 6]).sum(0)
-        torch.testing.assert_close(observed[0, :, row], expected, rtol=1e-9, atol=1e-9)
+        expected = (turned[row, :, None] * coefficients[place : place + 6, :, 0]).sum(0)
+        torch.testing.assert_close(observed[0, 0, :, row], expected, rtol=1e-9, atol=1e-9)
     back = observation.adjoint(data, part)
     left = (weight[:, None, :, None] * observed.conj() * data).sum()
     torch.testing.assert_close(left, (coefficients.conj() * back).sum(), rtol=1e-9, atol=1e-9)
@@ -90,9 +98,9 @@ def test_fast_path_agrees_with_the_plain_path(reach):
     first = torch.arange(rows)[None] - 2
     kernels = RowKernels(first, taps, torch.zeros(1, rows, dtype=torch.float64), along, torch.ones_like(first).double())
     observation = Observation(kernels, rows, length, torch.float64)
-    u = torch.fft.rfftfreq(length, dtype=torch.float64)
-    precision = RowPrior.smooth(u).precision(0.01 * (1 + (10 * u).square()))
-    data = torch.randn(1, 1, rows, length, dtype=torch.float64, generator=generator)
+    u = torch.fft.rfftfreq(length, dtype=torch.float64)[None]
+    precision = smooth_prior(u).precision(0.01 * (1 + (10 * u).square()))
+    data = torch.randn(1, 1, 1, rows, length, dtype=torch.float64, generator=generator)
     fast = SceneSolver(observation, precision, Partition(chunk=100)).fit(data)
     plain = SceneSolver(observation, precision.clone().requires_grad_(), Partition(chunk=100)).fit(data)
     assert plain.requires_grad
@@ -110,11 +118,11 @@ def test_gradient_of_the_data_through_interpolated_factors():
     zeros = torch.zeros(1, rows, dtype=torch.float64)
     kernels = RowKernels(torch.arange(rows)[None] - 2, taps, zeros, zeros[..., None], zeros + 1)
     observation = Observation(kernels, rows, length, torch.float64)
-    u = torch.fft.rfftfreq(length, dtype=torch.float64)
-    precision = RowPrior.smooth(u).precision(torch.full_like(u, 0.01))
+    u = torch.fft.rfftfreq(length, dtype=torch.float64)[None]
+    precision = smooth_prior(u).precision(torch.full_like(u, 0.01))
     solver = SceneSolver(observation, precision, Partition(chunk=90))
     generator = torch.Generator().manual_seed(5)
-    data, other = torch.randn(2, 1, 1, rows, length, dtype=torch.float64, generator=generator)
+    data, other = torch.randn(2, 1, 1, 1, rows, length, dtype=torch.float64, generator=generator)
     data.requires_grad_()
     solution = solver.fit(data)
     weights = torch.randn(solution.shape, dtype=torch.complex128, generator=generator)

@@ -1,19 +1,18 @@
 """Strength of the prior estimated from the data, compared with the best of several strengths."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from exact_steps import FixedStrength, solved, stack_of
+from exact_steps import model_of, solved
 from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore as restore_by_any_method
+from rsvib_torch.restoration.exact import exact
 from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
-from rsvib_torch.restoration.scene_model.cross_validation import StrengthCache
 from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
@@ -34,21 +33,6 @@ SCENES = {
 }
 
 
-class CountedStrengthCache(StrengthCache):
-    """Counts the strengths that are selected from the frames."""
-
-    def __init__(self):
-        super().__init__()
-        self.selected = 0
-
-    def of(self, noise, choose):
-        def counted():
-            self.selected += 1
-            return choose()
-
-        return super().of(noise, counted)
-
-
 @pytest.mark.parametrize(
     ("name", "rows", "noise", "given", "joint", "least", "within"),
     [
@@ -67,11 +51,9 @@ def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint
     clean = take_frames(scene, timing, MOTION, 2, samples=64)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()[:given]
     found = decibel(restore(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
-    stack = stack_of(frames, timing, MOTION.vibration())
+    stack = model_of(frames, timing, MOTION.vibration())
     by_hand = {
-        factor: decibel(
-            solved(stack, joint=joint, regularisation=factor, strength_cache=FixedStrength())[0], crop(scene)
-        )
+        factor: decibel(solved(stack, joint=joint, regularisation=factor)[0], crop(scene))
         for factor in (0.03, 0.1, 0.3, 1.0, 3.0)
     }
     assert found > max(by_hand.values()) - within
@@ -84,38 +66,39 @@ def test_interpolation_error_depends_on_the_blur_of_each_frame():
     frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001, samples=100)).float()[:, None]
     height = frames.shape[-2]
     motion = frame_motion(MOTION.vibration().expanded(1), timing, 2, height)
-    prior = fit_prior(frames, motion, 0, torch.full((2,), 0.001), 256)
-    assert prior.interpolation_power.shape == (2, 129)
+    prior = fit_prior(frames[None], motion, torch.full((1, 2), 0.001), 256)
+    assert prior.interpolation_power.shape == (1, 2, 129)
     times = (2048 * np.arange(2)[:, None, None] + np.arange(height)[:, None] + np.arange(0, 200, 5)) * timing.row_time
     across = MOTION.displacement(times)[..., 1]
     path = (across.max(-1) - across.min(-1)).mean(-1)  # px, length of the blur of the rows in each frame
     assert path[0] < 0.8 * path[1]
-    assert prior.interpolation_power[0].mean() > 3 * prior.interpolation_power[1].mean()
-    torch.testing.assert_close(prior.of([0, 1]).interpolation_power, prior.interpolation_power.mean(0))
-    torch.testing.assert_close(prior.of([1]).interpolation_power, prior.interpolation_power[1])
+    assert prior.interpolation_power[0, 0].mean() > 3 * prior.interpolation_power[0, 1].mean()
+    later = prior.of(torch.tensor([0]), torch.tensor([[1]]))
+    torch.testing.assert_close(later.interpolation_power[0, 0], prior.interpolation_power[0, 1])
 
 
 @pytest.mark.parametrize(
     ("name", "rows", "noise", "choices"), [("buildings", 20, 0.005, 1), ("dense texture", 100, 0.001, 2)]
 )
-def test_frames_of_the_same_noise_share_a_strength(name, rows, noise, choices):
+def test_frames_of_the_same_noise_share_a_strength(name, rows, noise, choices, monkeypatch):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     clean = take_frames(SCENES[name](), timing, MOTION, 2, samples=48)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
-    stack = stack_of(frames, timing, MOTION.vibration())
+    model = model_of(frames, timing, MOTION.vibration())
+    numbers = []
+    monkeypatch.setattr(exact, "prior_strengths", lambda images, *_, **__: numbers.append(len(images)) or 1.0)
     for joint, expected in ((False, choices), (True, 1)):
-        counted = replace(stack, strength_cache=CountedStrengthCache())
-        counted.tasks(joint_groups(2, joint), 1.0)
-        assert counted.strength_cache.selected == expected
+        model.strengths(model.scenes(joint_groups(2, joint)))
+        assert numbers[-1] == expected
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_power_of_pure_noise_is_close_to_zero(count):
     noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))
     motion = frame_motion(MOTION.vibration().expanded(1), TIMING, count, 512)
-    prior = fit_prior(0.5 + 0.02 * noise, motion, 0, torch.full((count,), 0.02), 576)
+    prior = fit_prior((0.5 + 0.02 * noise)[None], motion, torch.full((1, count), 0.02), 576)
     assert prior.power.mean() < 0.08 * 0.02**2
-    assert fit_prior(0.5 + 0.04 * noise, motion, 0, torch.full((count,), 0.02), 576).power.mean() > 2 * 0.02**2
+    assert fit_prior((0.5 + 0.04 * noise)[None], motion, torch.full((1, count), 0.02), 576).power.mean() > 2 * 0.02**2
 
 
 @pytest.mark.parametrize(("across", "along"), [(0.2, 0.05), (0.02, 0.1)])

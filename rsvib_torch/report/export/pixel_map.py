@@ -78,7 +78,7 @@ def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], frames: r
     if not motion.same_for_all_columns:
         ends = x[[0, -1]] - 0.5 * (columns - 1)
         bounding = ColumnMotion.of_columns(bounding, ends, row_timing, frames.stop, rows)
-    frame_motion(bounding, row_timing, frames.stop, rows).check_fits(rows, columns)
+    frame_motion(bounding, row_timing, frames.stop, rows).check_fits(columns)
     starts = row_timing.frame_starts(frames.stop, motion.device)
     y = torch.arange(rows, dtype=torch.float64, device=motion.device)
     # where all columns are displaced alike, one is enough

@@ -1,13 +1,18 @@
 """Exact restoration: all rows of a frame, each with its own PSF, solved together.
 
+Every step treats all stacks of a batch, and all scenes that are restored from them, at a time.
+
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+import math
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number
@@ -15,14 +20,19 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
-from rsvib_torch.restoration.exact.filling import FILLED_BLUR_REACH, Extended, Incomplete, filled, measured_values
+from rsvib_torch.restoration.exact.filling import (
+    FILLED_BLUR_REACH,
+    measured_values,
+    with_extension,
+    with_missing_values,
+)
 from rsvib_torch.restoration.exact.finer_scene import FrameDifference, finer_scene, warn_of_frames
 from rsvib_torch.restoration.exact.priors import PRIORS, Prior, check_prior
-from rsvib_torch.restoration.exact.scene_solver import SIDE_BY_SIDE, Partition, SceneProblem, SolversSideBySide
+from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
-from rsvib_torch.restoration.scene_model.cross_validation import StrengthCache, prior_strength
-from rsvib_torch.restoration.scene_model.observation import GRIDS, SCALE, RowKernels
+from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
+from rsvib_torch.restoration.scene_model.observation import GRIDS, SCALE, SCENE_REACH, TAPS, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import (
     PolynomialPrior,
     RowPrior,
@@ -31,7 +41,7 @@ from rsvib_torch.restoration.scene_model.scene_prior import (
     fit_prior,
 )
 
-__all__ = ["SceneTask", "StackModel", "given_level", "model_stacks", "restore_exact", "scene_periods", "solve_scenes"]
+__all__ = ["FrameModel", "Scenes", "given_level", "model_frames", "restore_exact", "scene_period", "solve_scenes"]
 
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 
@@ -89,7 +99,7 @@ def restore_exact(
             a polynomial in the Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which detail
             the restored frames contain.
         strips: Number of neighbouring stacks of the batch that are strips of columns of the same frames. They have one
-            period, one noise level, and one strength of the prior for each level.
+            noise level, and one strength of the prior for each level.
 
     Returns:
         Restored frames of the same shape, or (B, 1, C, H, W); with ``scale=2``, of twice the rows and columns, point
@@ -102,97 +112,244 @@ def restore_exact(
     groups = joint_groups(frames.shape[1], joint)
     partition = Partition.of_options(chunk_frequencies, segments)
 
-    # 2. Estimate what all scenes of a stack have in common: displacement, period, noise levels and prior.
-    stacks = model_stacks(frames, motion, noise=noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips)
+    # 2. Estimate what all scenes of a stack have in common: noise levels and prior.
+    model = model_frames(frames, motion, noise=noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips)
 
-    # 3. Select the strength of the prior of each scene, by cross-validation.
-    tasks = [task for stack in stacks for task in stack.tasks(groups, factor)]
+    # 3. Select the frames of each scene, and the strength of its prior by cross-validation.
+    scenes = model.scenes(groups)
+    scenes = replace(scenes, strength=factor * model.strengths(scenes))
 
     # 4. Fill missing values, and solve the banded systems of all frequencies.
-    images, differences = solve_scenes(tasks, PRIORS[prior], factor, partition, motion.neglected)
+    images, differences = solve_scenes(model, scenes, PRIORS[prior], factor, partition)
 
     # 5. On the finer grid, frames that contradict their scene show that the motion is wrong.
     if scale != 1:
-        warn_of_frames(differences, (task.stack.places(task.members) for task in tasks))
+        warn_of_frames(differences, model.places(scenes))
     restored: Tensor = images.unflatten(0, (len(frames), -1))
     return restored
 
 
+def given_level(noise: float) -> float:
+    """A stated noise level, at least the lowest that single precision supports."""
+    return max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL)
+
+
+def scene_period(motion: FrameMotion, width: int) -> int:
+    """Period in px of the scenes of all stacks with frames of ``width`` px."""
+    # the boundary extension of blurred rows is filled; that of others is longer
+    is_filled = motion.blur_lengths[..., 0].max(1) > 2 * FILLED_BLUR_REACH
+    # px beyond the displacement that influence the ends
+    margins = [8 + math.ceil(bounds[0] + 0.5) for bounds in motion.bounds]
+    return max(
+        fast_length(width + 2 * margin) if filled else extended_length(width, margin)
+        for filled, margin in zip(is_filled, margins, strict=True)
+    )
+
+
 @dataclass(frozen=True, eq=False)
-class StackModel:
-    """One stack of frames, and the quantities that the scenes restored from it have in common.
+class Scenes:
+    """N scenes, each restored from M frames of a stack.
 
     Attributes:
-        frames: (T, C, H, W).
-        displacement: (T, H, N, 2) during the exposures, at N nodes with weights ``node_weights``.
-        node_weights: (N,).
-        shift: (T, 2) reference shifts of the frames.
-        weights: (T,) weights of the frames.
-        level: Standard deviation of the noise of a frame of weight 1.
+        stack: (N,) number of the stack.
+        members: (N, M) numbers of the frames.
+        reference: (N,) the frame in whose coordinates a scene is restored.
+        contributes: (N, M) whether the frame has enough measured pixels.
+        strength: (N,) factor on the prior.
+    """
+
+    stack: NDArray[np.int64]
+    members: NDArray[np.int64]
+    reference: NDArray[np.int64]
+    contributes: NDArray[np.bool_]
+    strength: NDArray[np.float64]
+
+    def of(self, numbers: list[int]) -> "Scenes":
+        """Some of the scenes."""
+        return Scenes(
+            self.stack[numbers],
+            self.members[numbers],
+            self.reference[numbers],
+            self.contributes[numbers],
+            self.strength[numbers],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameModel:
+    """The frames of B stacks, and the quantities that the scenes restored from them have in common.
+
+    Attributes:
+        frames: (B, T, C, H, W).
+        motion: Motion of the frames.
+        weights: (B, T) weights of the frames.
+        level: (B,) standard deviation of the noise of a frame of weight 1.
         level_is_certain: Whether it is given or estimated from several frames.
-        mean: (C, 1, 1) brightness; the prior is for deviations from it.
-        prior: Of all frames.
-        strength_cache: Factors on the prior that were already selected.
+        mean: (B, C, 1, 1) brightness; the prior is for deviations from it.
+        prior: Of all frames; on the finer grid, one for each stack.
         period: L, the period of the restored scenes in px.
         scale: Points of the restored scenes per px.
-        unknown: (T, C, H, W) bool, pixels without data and saturated ones; None for none.
-        clipped: (T, C, H, W) bool, the saturated ones.
-        fills_ends: Whether the boundary extension may be filled: not that of inner strips of columns, which end where
-            they have no weight (half the time, 0.00 dB).
+        unknown: (B, T, C, H, W) bool, pixels without data and saturated ones; None for none.
+        clipped: (B, T, C, H, W) bool, the saturated ones.
+        strips: Number of neighbouring stacks that are strips of columns of the same frames.
     """
 
     frames: Tensor
-    displacement: Tensor
-    node_weights: Tensor
-    shift: Tensor
+    motion: FrameMotion
     weights: Tensor
     level: Tensor
     level_is_certain: bool
     mean: Tensor
-    prior: RowPrior | PolynomialPrior
-    strength_cache: StrengthCache
+    prior: RowPrior | list[PolynomialPrior]
     period: int
     scale: int
     unknown: Tensor | None
     clipped: Tensor | None
-    fills_ends: bool
+    strips: int
 
-    def kernels(self, members: list[int], reference: int) -> RowKernels:
-        """Kernels of some frames, in the coordinates of one of them."""
-        moved = self.displacement[members] - self.shift[reference]
-        return GRIDS[self.scale][0](moved, self.node_weights, self.weights[members], self.frames.shape[-2])
+    @cached_property
+    def measured(self) -> NDArray[np.float64]:
+        """Share (B, T) of the pixels of each frame that are measured."""
+        if self.unknown is None:
+            return np.ones(self.frames.shape[:2])
+        shares: NDArray[np.float64] = 1.0 - self.unknown.double().flatten(2).mean(2).cpu().numpy()
+        return shares
 
-    def places(self, members: list[int]) -> Tensor:
-        """Mean displacement (M, R, 2) of the rows of some frames."""
-        return (self.displacement[members].detach() * self.node_weights[:, None]).sum(-2)
-
-    def tasks(self, groups: list[tuple[list[int], int]], regularisation: float) -> list["SceneTask"]:
-        """The scenes that are restored from groups of frames (``joint_groups``), with the strengths of their priors."""
+    def scenes(self, groups: list[tuple[list[int], int]]) -> Scenes:
+        """The scenes that are restored from groups of frames (``joint_groups``), stack after stack."""
+        stack = np.arange(len(self.frames)).repeat(len(groups))
+        members = np.tile([members for members, _ in groups], (len(self.frames), 1))
+        reference = np.tile([reference for _, reference in groups], len(self.frames))
+        contributes = np.ones(members.shape, dtype=bool)
         if self.unknown is not None:
             # frames with at most 5 % measured pixels do not contribute, unless there are no others
-            share = (~self.unknown).double().flatten(1).mean(1).tolist()
-            groups = [([m for m in members if share[m] > 0.05] or members, reference) for members, reference in groups]
-        return [
-            SceneTask(self, members, reference, regularisation * self.strength_of(members, reference))
-            for members, reference in groups
-        ]
+            contributes = self.measured[stack[:, None], members] > 0.05
+            contributes |= ~contributes.any(1, keepdims=True)
+        return Scenes(stack, members, reference, contributes, np.ones(len(stack)))
 
-    def strength_of(self, members: list[int], reference: int) -> float:
-        """Factor on the prior, estimated from those frames whose columns are the same as in the restored one."""
-        if isinstance(self.prior, PolynomialPrior):
-            return 1.0  # its strength is not selected
-        same_columns = [frame for frame in members if torch.equal(self.shift[frame], self.shift[reference])]
-        prior, power = self.prior.of(members), self.level.square()
+    def _indices(self, scenes: Scenes) -> tuple[Tensor, Tensor]:
+        """Stack (N, 1) and members (N, M), to index frames."""
+        device = self.frames.device
+        return torch.as_tensor(scenes.stack[:, None], device=device), torch.as_tensor(scenes.members, device=device)
 
-        def choose() -> float:
-            kernels = self.kernels(same_columns, reference)
-            return prior_strength(self.frames[same_columns], kernels, prior, power, certain=self.level_is_certain)
+    def _moved_along(self, scenes: Scenes) -> NDArray[np.float64]:
+        """(N, M) px by which the frames are moved along the rows relative to the restored one."""
+        along = self.motion.shift[..., 0].cpu().numpy()
+        moved: NDArray[np.float64] = along[scenes.stack[:, None], scenes.members]
+        moved -= along[scenes.stack, scenes.reference][:, None]
+        return moved
 
-        noise = power / self.weights[same_columns].mean() + prior.interpolation_power.mean()
-        return self.strength_cache.of(noise, choose)
+    def kernels(self, scenes: Scenes, contributes: NDArray[np.bool_]) -> RowKernels:
+        """Kernels of the frames of scenes, in the coordinates of their reference; of weight 0 where stated."""
+        index = self._indices(scenes)
+        displacement, node_weights = self.motion.exposures
+        shift = self.motion.shift[scenes.stack, scenes.reference]
+        moved = displacement[index] - shift[:, None, None, None]
+        weights = self.weights[index] * torch.as_tensor(contributes, device=self.frames.device)
+        return GRIDS[self.scale][0](moved.flatten(0, 1), node_weights, weights.flatten(), self.frames.shape[-2])
+
+    def places(self, scenes: Scenes) -> list[Tensor]:
+        """Mean displacement (M, R, 2) of the rows of the frames of each scene."""
+        displacement, node_weights = self.motion.exposures
+        mean = (displacement.detach() * node_weights[:, None]).sum(-2)
+        return [mean[stack, members] for stack, members in zip(scenes.stack, scenes.members, strict=True)]
+
+    def _blur_reaches(self, scenes: Scenes) -> NDArray[np.float64]:
+        """Largest distance (N,) along the row in px during an exposure from its middle."""
+        reaches: NDArray[np.float64] = 0.5 * self.motion.blur_lengths[scenes.stack[:, None], scenes.members, 0].max(1)
+        return reaches
+
+    def strengths(self, scenes: Scenes) -> NDArray[np.float64]:
+        """Factors (N,) on the priors, estimated from those frames whose columns are the same as in the restored one."""
+        if not isinstance(self.prior, RowPrior):
+            return np.ones(len(scenes.stack))  # the strength of other priors is not selected
+        index = self._indices(scenes)
+        same = scenes.contributes & (self._moved_along(scenes) == 0)
+        same_shift = self.motion.shift[..., 1].cpu().numpy()
+        same &= same_shift[scenes.stack[:, None], scenes.members] == same_shift[scenes.stack, scenes.reference][:, None]
+        # frames of the same stack, and of strips of the same frames, with the same noise to 20 % have one strength
+        used = torch.as_tensor(same, device=self.frames.device)
+        weights = (self.weights[index] * used).sum(1) / used.sum(1)
+        interpolation = self.prior.interpolation_power.mean(-1)[index].mean(1)
+        noise = (self.level[index[0][:, 0]].square() / weights + interpolation).detach().log().tolist()
+        chosen: list[int] = []
+        representative = []
+        for number, stack in enumerate(scenes.stack // self.strips):
+            alike = (one for one in chosen if scenes.stack[one] // self.strips == stack)
+            found = next((one for one in alike if abs(noise[one] - noise[number]) < 0.2), number)
+            chosen += [found] if found == number else []
+            representative.append(found)
+        # cross-validation of as many scenes at a time as the memory allows
+        values = self.frames[0, 0].numel() * scenes.members.shape[1]
+        strengths = np.ones(len(scenes.stack))
+        for part in runs(len(chosen), max(1, _SAMPLED.get(self.frames.device.type, 1 << 23) // values)):
+            some = scenes.of(chosen[part])
+            stack_of, member_of = self._indices(some)
+            strengths[chosen[part]] = prior_strengths(
+                self.frames.detach()[stack_of, member_of],
+                self.kernels(some, same[chosen[part]]),
+                self.prior.of(stack_of[:, 0], member_of),
+                self.level[stack_of].square(),
+                self._blur_reaches(some)[:, None],
+                certain=self.level_is_certain,
+            )
+        return strengths[representative]
+
+    def kinds(self, scenes: Scenes) -> list[str]:
+        """What is missing in the data of each scene: ``"pixels"``, only the ``"extension"``, or ``"nothing"``.
+
+        The boundary extension of blurred rows is missing, but not that of inner strips of columns, which end where they
+        have no weight (half the time, 0.00 dB). On the finer grid, extensions of different frames contradict each other
+        beyond half a cycle per px: filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002).
+        """
+        outer = np.isin(scenes.stack % self.strips, (0, self.strips - 1))
+        ends = (outer & (self._blur_reaches(scenes) > FILLED_BLUR_REACH)) | (self.scale > 1)
+        incomplete = (self.measured[scenes.stack[:, None], scenes.members] < 1).any(1)
+        moved = self._moved_along(scenes).any(1)
+        kinds = np.where(moved | incomplete, "pixels", np.where(ends, "extension", "nothing"))
+        return [kind + (" and ends" if kind == "pixels" and end else "") for kind, end in zip(kinds, ends, strict=True)]
+
+    def problem(self, scenes: Scenes, kind: str, partition: Partition) -> SceneProblem:
+        """The least-squares problem of scenes of one kind, with its missing values filled."""
+        index = self._indices(scenes)
+        stack_of, width = index[0][:, 0], self.frames.shape[-1]
+
+        # Data with zero mean, rows extended to a period.
+        data = extend_rows(self.frames[index] - self.mean[stack_of][:, None], self.period)
+
+        # Observation operator, and precision of the prior.
+        kernels = self.kernels(scenes, scenes.contributes)
+        operator = GRIDS[self.scale][1]
+        observation = operator(kernels, self.frames.shape[-2], self.period, data.dtype, len(data))
+        level = self.level[stack_of]
+        if isinstance(self.prior, RowPrior):
+            strength, reach = (
+                torch.as_tensor(values[:, None], dtype=data.dtype, device=data.device)
+                for values in (scenes.strength, self._blur_reaches(scenes))
+            )
+            prior = self.prior.of(stack_of, index[1])
+            precision = prior.precision(level[:, None].square(), strength, reach)
+        else:
+            polynomial = self.prior[int(scenes.stack[0])]
+            precision = polynomial.precision(level[0].square(), float(scenes.strength[0]), kernels.blur_reach)
+        problem = SceneProblem(data, observation, precision, level, partition)
+
+        # Values that are missing: the boundary extension of blurred rows, and pixels without data.
+        if kind == "nothing":
+            return problem
+        if kind == "extension":
+            return with_extension(problem, width)
+        along = torch.as_tensor(self._moved_along(scenes), device=data.device)
+        unknown = None if self.unknown is None else self.unknown[index]
+        measured = measured_values(along, unknown, data.shape, width, ends=kind.endswith("ends"))
+        floor = None
+        if self.clipped is not None:  # saturated pixels are at least as bright as their value
+            floor = torch.full_like(data, -torch.inf)
+            floor[..., :width] = torch.where(self.clipped[index], data[..., :width], -torch.inf)
+        return with_missing_values(problem, measured, floor)
 
 
-def model_stacks(
+def model_frames(
     frames: Tensor,
     motion: FrameMotion,
     *,
@@ -201,223 +358,128 @@ def model_stacks(
     clipped: Tensor | None = None,
     scale: int = 1,
     strips: int = 1,
-) -> list[StackModel]:
-    """Displacement, period, noise levels and prior of each stack; arguments as in ``restore_exact``."""
-    B, T, _, H, W = frames.shape
+) -> FrameModel:
+    """Noise levels, period and prior of the frames of B stacks; arguments as in ``restore_exact``."""
+    B, T, _, _, W = frames.shape
     unknown = ignore if clipped is None else clipped if ignore is None else ignore | clipped
-    mean = brightness(frames).mean(1)[..., None, None]
 
-    # Displacement of each row during its exposure, and the period of the scene that it requires.
-    displacement, node_weights = motion.exposures(H)
-    periods = scene_periods(motion, displacement, W)
-
-    # Noise level of each frame. That of a single frame may include texture.
-    given = None if noise == "auto" else given_level(noise)
-    powers = frames.new_full((B, T), 1.0 if given is None else given**2)
-    if given is None:
-        # Two strips of the same frames give their noise as well as all of them, in a fraction of the time. Saturated
-        # pixels have no noise: with a quarter of a frame saturated, the level was 0, and the PSNR 4 dB lower.
+    # Noise level of each frame. That of a single frame may include texture. Two strips of the same frames give their
+    # noise as well as all of them, in a fraction of the time. Saturated pixels have no noise: with a quarter of a frame
+    # saturated, the level was 0, and the PSNR 4 dB lower.
+    if noise == "auto":
         chosen = sorted({strips // 4, strips - 1 - strips // 4})
-        for first in range(0, B, strips):
-            measured = [
-                noise_levels(frames[index].detach(), motion, index, None if unknown is None else unknown[index])
-                for index in (first + strip for strip in chosen)
-            ]
-            powers[first : first + strips] = torch.stack(measured).square().mean(0)
-    levels = powers.sqrt().clamp(min=_MIN_LEVEL)
-    frame_weights = levels.square().reciprocal()
+        parts = [first + strip for first in range(0, B, strips) for strip in chosen]
+        every = strips == 1
+        measured = noise_levels(
+            frames.detach() if every else frames.detach()[parts],
+            motion if every else motion.of(parts),
+            unknown if every or unknown is None else unknown[parts],
+        )
+        powers = measured.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
+    else:
+        powers = frames.new_full((B, T), given_level(noise) ** 2)
+    powers = powers.clamp(min=_MIN_LEVEL**2)
+    frame_weights = powers.reciprocal()
     unit_variance = frame_weights.mean(1).reciprocal()
 
-    # Prior of each stack, fitted to its frames.
-    fit = fit_prior if scale == 1 else fit_polynomial_prior
-    stacks: list[StackModel] = []
-    for index in range(B):
-        strip = index % strips
-        period = max(periods[index - strip : index - strip + strips])
-        stacks.append(
-            StackModel(
-                frames=frames[index],
-                displacement=displacement[index],
-                node_weights=node_weights,
-                shift=motion.shift[index],
-                weights=frame_weights[index] * unit_variance[index],
-                level=unit_variance[index].sqrt(),
-                level_is_certain=given is not None or T > 1,
-                mean=mean[index],
-                prior=fit(frames[index], motion, index, levels[index], period),
-                strength_cache=stacks[-1].strength_cache if strip else StrengthCache(),
-                period=period,
-                scale=scale,
-                unknown=None if unknown is None else unknown[index],
-                clipped=None if clipped is None else clipped[index],
-                fills_ends=strip in (0, strips - 1),
-            )
-        )
-    return stacks
+    # Prior, fitted to the frames.
+    levels, period = powers.sqrt(), scene_period(motion, W)
+    prior: RowPrior | list[PolynomialPrior]
+    if scale == 1:
+        prior = fit_prior(frames, motion, levels, period)
+    else:
+        prior = [
+            fit_polynomial_prior(frames[[stack]], motion.of([stack]), levels[[stack]], period) for stack in range(B)
+        ]
+    return FrameModel(
+        frames=frames,
+        motion=motion,
+        weights=frame_weights * unit_variance[:, None],
+        level=unit_variance.sqrt(),
+        level_is_certain=noise != "auto" or T > 1,
+        mean=brightness(frames).mean(1)[..., None, None],
+        prior=prior,
+        period=period,
+        scale=scale,
+        unknown=unknown,
+        clipped=clipped,
+        strips=strips,
+    )
 
 
-def scene_periods(motion: FrameMotion, displacement: Tensor, width: int) -> list[int]:
-    """Period of the scenes of each stack of ``width`` px with displacement (B, T, R, N, 2) during the exposures."""
-    along = displacement[..., 0].detach()
-    # the boundary extension of blurred rows is filled; that of others is longer
-    filled = ((along.amax(-1) - along.amin(-1)).amax((1, 2)) > 2 * FILLED_BLUR_REACH).tolist()
-    # px beyond the displacement that influence the ends
-    margins = [8 + bound for bound in motion.displacement_bounds(displacement.shape[2])]
-    return [
-        fast_length(width + 2 * margin) if is_filled else extended_length(width, margin)
-        for is_filled, margin in zip(filled, margins, strict=True)
-    ]
-
-
-def given_level(noise: float) -> float:
-    """A stated noise level, at least the lowest that single precision supports."""
-    return max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL)
-
-
-@dataclass(frozen=True, eq=False)
-class SceneTask:
-    """A scene that is to be restored from frames of one stack.
-
-    Attributes:
-        stack: The stack.
-        members: Its frames that contribute.
-        reference: The frame in whose coordinates the scene is restored.
-        strength: Factor on the prior.
-    """
-
-    stack: StackModel
-    members: list[int]
-    reference: int
-    strength: float
-
-    def problem(self, partition: Partition) -> SceneProblem | Incomplete | Extended:
-        """The least-squares problem of the scene, with the values that are missing."""
-        stack, members = self.stack, self.members
-        height, width = stack.frames.shape[-2:]
-
-        # Data with zero mean, rows extended to a period.
-        data = extend_rows(stack.frames[members] - stack.mean, stack.period)
-
-        # Observation operator, and precision of the prior.
-        kernels = stack.kernels(members, self.reference)
-        observation = GRIDS[stack.scale][1](kernels, height, stack.period, data.dtype)
-        precision = stack.prior.of(members).precision(
-            stack.level.square(), strength=self.strength, blur_reach=kernels.blur_reach
-        )
-        problem = SceneProblem(data, observation, precision, stack.level, partition)
-
-        # Values that are missing: the boundary extension of blurred rows, and pixels without data.
-        along = stack.shift[members, 0] - stack.shift[self.reference, 0]
-        unknown = None if stack.unknown is None else stack.unknown[members]
-        ends = (kernels.blur_reach > FILLED_BLUR_REACH and stack.fills_ends) or stack.scale > 1
-        if unknown is None and ends and not bool(along.any()):
-            # on the finer grid, extensions of different frames contradict each other beyond half a cycle per px:
-            # filled, 49.9 dB become 53.9 dB (8 frames of 256 px, noise 0.002)
-            return Extended(problem, width)
-        measured = measured_values(along, unknown, data.shape, width, ends=ends)
-        if measured is None:
-            return problem
-        floor = None
-        if stack.clipped is not None:  # saturated pixels are at least as bright as their value
-            floor = torch.full_like(data, -torch.inf)
-            floor[..., :width] = torch.where(stack.clipped[members], data[..., :width], -torch.inf)
-        return Incomplete(problem, measured, floor)
-
-
-_FILLED_TOGETHER = 8  # batches; four frames of 1024 rows take 0.79 s together, 1.19 s two by two in two threads
+# values of frames of scenes that are treated at a time, beside the systems: 64 MB and 1 GB
+_SAMPLED = {"cpu": 1 << 24, "cuda": 1 << 28}
 
 
 def solve_scenes(
-    tasks: list[SceneTask],
-    prior: Prior,
-    regularisation: float,
-    partition: Partition,
-    neglected: float = 0.0,
-    filled_together: int = _FILLED_TOGETHER,
+    model: FrameModel, scenes: Scenes, prior: Prior, regularisation: float, partition: Partition
 ) -> tuple[Tensor, list[FrameDifference]]:
-    """Images of scenes of one size.
+    """Images of scenes.
 
     Args:
-        tasks: The scenes.
+        model: The frames.
+        scenes: The scenes.
         prior: Prior of all scenes.
         regularisation: Factor on the strength of the prior.
         partition: Parts solved at a time.
-        neglected: As in ``FrameMotion``.
-        filled_together: Batches whose missing values are filled together: more are faster and need more memory.
 
     Returns:
         Images (N, C, S H, S W), and, on the finer grid, the differences of the frames of each scene.
     """
-    stack = tasks[0].stack
-    device, (_, channels, height, width) = stack.frames.device, stack.frames.shape
-    solve = partial(_solutions, stack=stack, prior=prior, regularisation=regularisation, neglected=neglected)
-
-    # With gradients, one scene after the other.
-    inputs = (value for task in tasks for value in (task.stack.frames, task.stack.displacement))
-    if torch.is_grad_enabled() and any(value.requires_grad for value in inputs):
-        solutions = [solution for task in tasks for solution in solve(filled([task.problem(partition)]))]
-        restored = torch.stack([image + task.stack.mean for task, (image, _) in zip(tasks, solutions, strict=True)])
-        return restored, [difference for _, difference in solutions if difference is not None]
-
-    batches = _batches(tasks, together=prior.is_precision and stack.scale == 1)
-    threads = min(Partition.threads(device), len(batches))
-    # each thread has its own memory
-    partitions = [partition, *(Partition(partition.chunk, partition.segments) for _ in range(threads - 1))]
-    images = stack.frames.new_empty(len(tasks), channels, stack.scale * height, stack.scale * width)
+    frames, width = model.frames, model.frames.shape[-1]
+    blocks = _blocks(model, scenes)
+    threads = min(Partition.threads(frames.device), len(blocks))
+    inputs = (frames, model.motion.exposures[0])
+    differentiates = torch.is_grad_enabled() and any(value.requires_grad for value in inputs)
+    found: dict[int, Tensor] = {}
     differences: list[FrameDifference] = []
-    advance = steps(len(batches), "frames")
+    advance = steps(len(scenes.stack), "frames")
 
-    def solve_share(block: list[list[int]], problems: dict[int, SceneProblem], thread: int) -> None:
-        """Solve the batches of a block that a thread takes."""
-        for batch in block[thread::threads]:
-            solutions = solve([replace(problems[number], partition=partitions[thread]) for number in batch])
-            for number, (image, difference) in zip(batch, solutions, strict=True):
-                images[number] = image + tasks[number].stack.mean
-                if difference is not None:
-                    differences.append(difference)
-            advance()
+    def solve(block: tuple[str, list[int]], partition: Partition) -> None:
+        """Solve the scenes of a block."""
+        kind, numbers = block
+        some = scenes.of(numbers)
+        problem = model.problem(some, kind, partition)
+        if model.scale == 1:
+            deviations = prior.function(problem, regularisation)
+        else:
+            deviations, difference = finer_scene(problem, width, model.motion.neglected)
+            differences.append(difference)
+        found.update(zip(numbers, deviations[..., : model.scale * width] + model.mean[some.stack], strict=True))
+        advance(len(numbers))
 
-    for place in runs(len(batches), filled_together):
-        # Build the problems of a block of batches.
-        numbers = [number for batch in batches[place] for number in batch]
-        incomplete = in_parallel(lambda number: tasks[number].problem(partition), numbers, device)
-        # Fill missing values before the threads share the block: the extensions of all its scenes are solved together.
-        with torch.no_grad():
-            problems = dict(zip(numbers, filled(incomplete), strict=True))
-        # Solve the systems of the complete data.
-        in_parallel(partial(solve_share, batches[place], problems), range(threads), device)
-    return images, differences
-
-
-def _batches(tasks: list[SceneTask], *, together: bool) -> list[list[int]]:
-    """Numbers of the scenes whose systems are solved in one batch, or of single scenes.
-
-    Scenes of few frequencies are solved together, as many as two threads leave for each. Those in the coordinates of
-    the same frame have systems of about one size, and need no extension.
-    """
-    size = 1
-    if together:
-        frequencies = max(task.stack.period for task in tasks) // 2 + 1
-        threads = Partition.threads(tasks[0].stack.frames.device)
-        size = max(1, min(SIDE_BY_SIDE // frequencies, -(-len(tasks) // threads)))
-    batches: list[list[int]] = []
-    for reference in sorted({task.reference for task in tasks}):
-        numbers = [number for number, task in enumerate(tasks) if task.reference == reference]
-        batches += [numbers[place] for place in runs(len(numbers), size)]
-    return batches
-
-
-def _solutions(
-    problems: list[SceneProblem], stack: StackModel, prior: Prior, regularisation: float, neglected: float
-) -> list[tuple[Tensor, FrameDifference | None]]:
-    """Deviations (C, S H, S W) of scenes from their brightness for complete data, and differences on the finer grid."""
-    width = stack.frames.shape[-1]
-    solutions: list[tuple[Tensor, FrameDifference | None]]
-    if stack.scale != 1:
-        solutions = [finer_scene(problem, width, neglected) for problem in problems]
-    elif prior.is_precision and len(problems) > 1:
-        images = SolversSideBySide(problems).images([problem.data for problem in problems])
-        solutions = [(image, None) for image in images]
+    if differentiates:
+        for block in blocks:
+            solve(block, partition)
     else:
-        solutions = [(prior.function(problem, regularisation), None) for problem in problems]
-    return [(image[..., : stack.scale * width], difference) for image, difference in solutions]
+        # each thread has its own memory
+        partitions = [partition, *(Partition(partition.chunk, partition.segments) for _ in range(threads - 1))]
+
+        def share(thread: int) -> None:
+            for block in blocks[thread::threads]:
+                solve(block, partitions[thread])
+
+        in_parallel(share, range(threads), frames.device)
+    return torch.stack([found[number] for number in range(len(scenes.stack))]), differences
+
+
+def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
+    """Kinds and numbers of the scenes that are solved together: as many as memory and threads allow."""
+    kinds = model.kinds(scenes)
+    of_kind = {kind: [number for number, other in enumerate(kinds) if other == kind] for kind in dict.fromkeys(kinds)}
+    if model.scale != 1:
+        return [(kind, [number]) for kind, numbers in of_kind.items() for number in numbers]
+    # values of the systems and of the data of a scene
+    height, device = model.frames.shape[-2], model.frames.device
+    frequencies, rows = model.period // 2 + 1, height + 2 * SCENE_REACH
+    across = math.ceil(float(model.motion.blur_lengths[..., 1].max()))
+    systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
+    most = Partition.most_values(rows, frequencies, device, blurred=False, single=False) // systems
+    data = scenes.members.shape[1] * model.frames.shape[2] * height * model.period
+    most = max(1, min(most, _SAMPLED.get(device.type, 1 << 24) // data))
+    threads = Partition.threads(device)
+    return [
+        (kind, numbers[part])
+        for kind, numbers in of_kind.items()
+        for part in runs(len(numbers), max(1, min(most, -(-len(numbers) // threads))))
+    ]

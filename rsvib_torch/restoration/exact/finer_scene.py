@@ -64,14 +64,15 @@ def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected:
     residual. The variance that noise of the residual causes in it is subtracted.
 
     Args:
-        problem: The scene.
+        problem: One scene.
         predicted: (M, C, R, L) prediction of the data.
         width: Columns of the frames.
         neglected: As in ``finer_scene``.
     """
-    level, weight, rows = problem.level, problem.observation.kernels.weight, problem.data.shape[-2]
+    data, level = problem.data[0], problem.level[0]
+    weight, rows = problem.observation.kernels.weight, data.shape[-2]
     inner = slice(min(16, rows // 4), -min(16, rows // 4)), slice(min(16, width // 4), width - min(16, width // 4))
-    residual = problem.data - predicted
+    residual = data - predicted
     gradients = [0.5 * (predicted.roll(-1, axis) - predicted.roll(1, axis)) for axis in (-1, -2)]
     scale = (weight / weight[:, inner[0]].mean()).sqrt()[:, None, :, None]
     values = torch.stack([residual, *gradients]).to(torch.float64).mul_(scale)[..., *inner]
@@ -97,14 +98,14 @@ def _excess(problem: SceneProblem, predicted: Tensor, width: int) -> Tensor:
     weight, rows = problem.observation.kernels.weight, predicted.shape[-2]
     inner = slice(min(16, rows // 4), -min(16, rows // 4))
     taper = torch.hann_window(width + 2, periodic=False, dtype=predicted.dtype, device=predicted.device)[1:-1]
-    residual = (problem.data - predicted)[..., inner, :width] * (taper / taper.square().sum().sqrt())
+    residual = (problem.data[0] - predicted)[..., inner, :width] * (taper / taper.square().sum().sqrt())
     power = squared_modulus(torch.fft.rfft(residual, n=predicted.shape[-1])).mean(1)
     mean = (power * weight[:, inner, None]).mean((0, 1)) / weight[:, inner].mean()
-    return (mean / problem.level.square()).to(problem.precision.dtype)
+    return (mean / problem.level[0].square()).to(problem.precision.dtype)
 
 
 def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Tensor, FrameDifference]:
-    """Scene on the finer grid, and the differences of its frames of ``width`` px.
+    """Scene (1, C, 2 R, 2 L) on the finer grid, and the differences of its frames of ``width`` px.
 
     A fine pattern in a scene with otherwise little detail is far above the spectrum of the prior, and remains in the
     residual at its horizontal frequencies. The prior is weakened there by the power of the residual: gratings at 0.75
@@ -116,7 +117,7 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     (34.7 dB on pixels).
 
     Args:
-        problem: The scene.
+        problem: One scene.
         width: Columns of the frames.
         neglected: Standard deviation in px of displacements that the problem neglects. They count as noise, but do not
             contradict the motion.
@@ -126,7 +127,7 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     for _ in range(_SOLUTIONS):
         solver = replace(problem, precision=factor / relaxed * problem.precision).solver()
         coefficients = solver.fit(problem.data)
-        predicted = solver.predict(coefficients.detach())
+        predicted = solver.predict(coefficients.detach())[0]
         difference, excess = _difference(problem, predicted, width, neglected), _excess(problem, predicted, width)
         before, largest = largest, float(excess.amax())
         # a pattern leaves a tenth of its effect, a wrong motion at least a fifth

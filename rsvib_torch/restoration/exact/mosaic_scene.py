@@ -14,7 +14,7 @@ from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
-from rsvib_torch.restoration.exact.exact import given_level, scene_periods
+from rsvib_torch.restoration.exact.exact import given_level, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
@@ -76,10 +76,10 @@ class MosaicSolver:
 
     def predict(self, coefficients: Tensor) -> Tensor:
         """Colours (M, 3, R, L) of noiseless frames of a scene with coefficients (K, 3, U)."""
-        return _colours(self._observation.A(coefficients))
+        return _colours(self._observation.A(coefficients[:, :, None])[0])
 
     def _adjoint(self, colours: Tensor) -> Tensor:
-        return self._observation.A_adjoint(_components(colours))
+        return self._observation.A_adjoint(_components(colours)[None])[:, :, 0]
 
     def _normal(self, coefficients: Tensor) -> Tensor:
         data = self._adjoint(self._weights * self.predict(coefficients))
@@ -96,7 +96,9 @@ class MosaicSolver:
         return total.flatten(0, 1)
 
     def _preconditioned(self, right: Tensor) -> Tensor:
-        return torch.cat([solver.solve(right[:, k : k + 1]) for k, solver in enumerate(self._solvers)], dim=1)
+        return torch.cat(
+            [solver.solve(right[:, k : k + 1, None])[:, :, 0] for k, solver in enumerate(self._solvers)], dim=1
+        )
 
     def _dot(self, one: Tensor, other: Tensor) -> Tensor:
         """Inner product of the real scenes."""
@@ -136,7 +138,7 @@ class MosaicSolver:
 
     def image(self, coefficients: Tensor) -> Tensor:
         """Colours (3, 2 R, 2 L) of the scene at half pixels."""
-        return _colours(self._observation.image(coefficients)[None])[0]
+        return _colours(self._observation.image(coefficients[:, :, None]))[0]
 
 
 def restore_mosaic(
@@ -187,8 +189,8 @@ def restore_mosaic(
     partition = Partition.of_options(chunk_frequencies, segments)
     stated = None if noise == "auto" else given_level(noise)
     # displacement of each row during its exposure, and the period that it requires
-    displacement, node_weights = motion.exposures(height)
-    lengths = scene_periods(motion, displacement, width)
+    displacement, node_weights = motion.exposures
+    length = scene_period(motion, width)
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
     for stack, mosaic in enumerate(frames):
@@ -200,7 +202,7 @@ def restore_mosaic(
         if ignore is not None:
             measured = measured & ~ignore[stack]
         if stated is None:  # of colours whose noise was halved by interpolation
-            level = 2 * noise_levels(linear.detach(), motion, stack).square().mean().sqrt()
+            level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
             level = torch.as_tensor(stated, dtype=frames.dtype, device=frames.device)
         for members, reference in groups:
@@ -211,14 +213,13 @@ def restore_mosaic(
                 measured[members],
                 None if floor is None else floor[members],
                 level,
-                replace(motion, frame_starts=motion.frame_starts[members], shift=motion.shift[:, members]),
-                stack,
-                lengths[stack],
+                motion.of([stack], members),
+                length,
             )
             if len(members) == 1 or _same_colours(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
             kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height)
-            observation = FinerObservation(kernels, height, lengths[stack], frames.dtype)
+            observation = FinerObservation(kernels, height, length, frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
     restored: Tensor = torch.stack(images).unflatten(0, (-1, len(groups)))
@@ -234,8 +235,7 @@ class _Frames:
         measured: (M, 3, H, W) bool.
         floor: (M, 3, H, W) lower bounds of saturated colours, else -inf; None for none.
         level: Standard deviation of the noise.
-        motion: Motion of these frames, of a batch of stacks.
-        stack: Index of the stack in the batch.
+        motion: Motion of these frames, a batch of one.
         length: L, the period of the rows in px.
     """
 
@@ -244,7 +244,6 @@ class _Frames:
     floor: Tensor | None
     level: Tensor
     motion: FrameMotion
-    stack: int
     length: int
 
     def demosaiced(self, mosaic: Tensor, pattern: Tensor) -> "_Frames":
@@ -281,8 +280,7 @@ class _Frames:
         count, width, level = len(self.images), self.images.shape[-1], self.level
         mean = self.images.mean((0, 2, 3))[:, None, None]
         data = extend_rows(self.images - mean, self.length)
-        inside = measured_values(along, None, data.shape, width, ends=True)
-        assert inside is not None
+        inside = measured_values(along[None], None, data[None].shape, width, ends=True)[0]
         nowhere = ~self.measured.any(1, keepdim=True)
         measured, filled = (pad(mask, (0, self.length - width)) & inside for mask in (self.measured, nowhere))
         full = self.images.detach()
@@ -338,7 +336,7 @@ class _Frames:
         """Precision of the prior of each component, fitted to frames (M, 3, H, W)."""
         levels = level.expand(len(images))
         return [
-            fit_polynomial_prior(image[:, None], self.motion, self.stack, levels, self.length).precision(
+            fit_polynomial_prior(image[None, :, None], self.motion, levels[None], self.length).precision(
                 level.square(), strength=regularisation, blur_reach=observation.kernels.blur_reach
             )
             for image in _components(images).unbind(1)

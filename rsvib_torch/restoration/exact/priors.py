@@ -12,7 +12,7 @@ from torch.nn import functional
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
-from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
+from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.scene_model.observation import KERNEL_REACH, kernel_samples
 
 __all__ = ["PRIORS", "Prior", "check_prior", "shrink_patches"]
@@ -28,8 +28,6 @@ class Prior:
 
     Attributes:
         function: The prior, see the contract above ``PRIORS``.
-        is_precision: Whether the precision of the problem is the whole prior. Scenes are then solved without the
-            function where several, as the strips of a frame, are solved together.
         finer_grid: Whether it exists with ``scale=2``, whose solution does not call the function.
         mosaic: Whether it exists for colour mosaics, whose solution does not call the function.
         pixel_bytes: Memory in bytes per pixel and channel of the frames beyond that of the Gaussian prior; measured by
@@ -37,7 +35,6 @@ class Prior:
     """
 
     function: Callable[[SceneProblem, float], Tensor]
-    is_precision: bool = False
     finer_grid: bool = False
     mosaic: bool = False
     pixel_bytes: int = 12
@@ -59,7 +56,8 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     solver = replace(problem, precision=0.3 * problem.precision).solver()
     right_side = solver.right_side(problem.data)
     coefficients = solver.solve(right_side)
-    weight = float(kernels.weight.detach().mean(-1).sum())
+    # total weight of the frames of each scene
+    weight = kernels.weight.detach().mean(-1).unflatten(0, (len(problem.data), -1)).sum(-1)
     # strength s in units of the weight of the data and threshold level in units of the noise: best on scenes of four
     # kinds at noise 0.02
     stages = [(1.0, 1.0), (3.0, 0.7), (10.0, 0.5)]
@@ -70,9 +68,12 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     offsets = itertools.cycle([(0, 0), (1, 1)])
     for (relative, threshold), offset in zip(stages, offsets, strict=False):
         strength = relative * weight * regularisation
-        level = threshold * regularisation**0.5 * problem.level / weight**0.5
-        spectra = torch.fft.rfft(shrink_patches(_sampled_scene(solver, coefficients), level, offset))
-        expected = strength * _sampled(spectra.movedim(0, 1))
+        level = threshold * regularisation**0.5 * problem.level / weight.sqrt()
+        scenes = torch.fft.irfft(_sampled(coefficients).permute(2, 1, 0, 3), n=problem.observation.period)
+        levels = level.to(scenes.dtype).repeat_interleave(scenes.shape[1])[:, None, None]
+        shrunk = shrink_patches(scenes.flatten(0, 1), levels, offset).view_as(scenes)
+        strength = strength.to(scenes.dtype)[:, None]
+        expected = strength * _sampled(torch.fft.rfft(shrunk).permute(2, 1, 0, 3))
         precision = _sampling_precision(strength, problem.precision)
         order = len(problem.precision)
         precision[:order, :order] += 0.03 * problem.precision
@@ -81,17 +82,18 @@ def edges(problem: SceneProblem, regularisation: float) -> Tensor:
     return solver.image(coefficients)
 
 
-# The function of a prior is called as function(problem, regularisation) -> scene, with the factor > 0 on its strength
-# that the precision of the problem already includes. It returns the deviation of the scene from
-# the mean brightness of the frames, (C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L the
-# period of problem.data, in units of full scale. problem.data (M, C, R, L) are complete (missing values are filled) and
-# have zero mean brightness. It may solve with problem.solver(), and with replace(problem, precision=...).solver():
-# products (p + 1, p + 1, U) as from RowPrior.precision define P in c^H P c, which is added to
+# The function of a prior is called as function(problem, regularisation) -> scenes, with the factor > 0 on its strength
+# that the precision of the problem already includes. It returns the deviations of N scenes from
+# the mean brightness of their frames, (N, C, R, L) real: rows 0 ... R - 1 in the coordinates of the restored frame, L
+# the period of problem.data, in units of full scale. problem.data (N, M, C, R, L) are complete (missing values are
+# filled) and have zero mean brightness. It may solve with problem.solver(), and with
+# replace(problem, precision=...).solver(): products (p + 1, p + 1, N, U) as from RowPrior.precision define P in
+# c^H P c, which is added to
 # sum_m w_m |g_m - K_m c|^2, so in units of the noise power of data of weight 1 (standard deviation problem.level). It
 # must be differentiable with respect to the data and the precision, must not write to its arguments, and is called from
 # several threads at a time.
 PRIORS: dict[str, Prior] = {
-    "gaussian": Prior(gaussian, is_precision=True, finer_grid=True, mosaic=True, pixel_bytes=0),
+    "gaussian": Prior(gaussian, finer_grid=True, mosaic=True, pixel_bytes=0),
     "edges": Prior(edges),
 }
 
@@ -126,7 +128,7 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
 
     Args:
         images: The images.
-        level: Standard deviation of white noise in them.
+        level: Standard deviation of white noise in them, one number or (N, 1, 1).
         offset: Row and column at which patches begin, 0 or 1.
     """
     cosines, shared = _cosines_of_neighbours(images), _PATCH - _STEP
@@ -140,7 +142,7 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
         """Sums of the patches of some lines of neighbours, and the weights of the patches."""
         rows = slice(_PATCH * part.start, _PATCH * part.stop + shared)
         # cosines along the rows, then across them, in units of the threshold
-        along = (padded[:, rows].unfold(-1, len(cosines[0]), _PATCH) @ (cosines / (2.0 * level)).mT).flatten(-2)
+        along = (padded[:, rows].unfold(-1, len(cosines[0]), _PATCH) @ cosines.mT).flatten(-2) / (2.0 * level)
         lines, weights = torch.zeros_like(along), []
         for line in range(part.stop - part.start):
             place = slice(_PATCH * line, _PATCH * line + len(cosines[0]))
@@ -150,7 +152,7 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
             weight = 1.0 / strong.detach().abs().clamp_(max=1.0).sum(2).sum(-1)  # (N, patches, patches)
             strong[:, :, 0, :, 0] = values[:, :, 0, :, 0]
             strong *= weight[:, :, None, :, None]
-            lines[:, place] += (2.0 * level * cosines).mT @ strong.view(len(along), len(cosines), -1)
+            lines[:, place] += (2.0 * level) * (cosines.mT @ strong.view(len(along), len(cosines), -1))
             weights.append(weight)
         pixels = lines.unflatten(-1, (counts[1], -1)) @ cosines
         total = functional.pad(pixels[..., :_PATCH].flatten(-2), (0, shared))
@@ -172,7 +174,7 @@ def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int
 
 
 def _sampled(values: Tensor) -> Tensor:
-    """The scene ``E c`` on the rows of its coefficients (K, C, U), zero outside; E is symmetric.
+    """The scenes ``E c`` on the rows of their coefficients (K, C, N, U), zero outside; E is symmetric.
 
     With the samples of the kernel: the more numerous ``scene_weights`` would widen the band of ``E^T E``.
     """
@@ -183,17 +185,11 @@ def _sampled(values: Tensor) -> Tensor:
     return total
 
 
-def _sampled_scene(solver: SceneSolver, coefficients: Tensor) -> Tensor:
-    """``E c`` as an image (C, K, L)."""
-    scene: Tensor = torch.fft.irfft(_sampled(coefficients).movedim(1, 0), n=solver.observation.period)
-    return scene
-
-
-def _sampling_precision(strength: float, like: Tensor) -> Tensor:
-    """Products (5, 5, U) as of ``RowPrior.precision``: the bands of ``strength E^T E``."""
+def _sampling_precision(strength: Tensor, like: Tensor) -> Tensor:
+    """Products (5, 5, N, U) as of ``RowPrior.precision``: the bands of ``strength E^T E``, with ``strength`` (N, 1)."""
     samples = torch.tensor(kernel_samples(), dtype=like.dtype, device=like.device)
     count = len(samples)
-    products = like.new_zeros(count, count, like.shape[-1])
+    products = like.new_zeros(count, count, *like.shape[-2:])
     for d in range(count):
         products[d, 0] = strength * (samples[: count - d] * samples[d:]).sum()
     return products

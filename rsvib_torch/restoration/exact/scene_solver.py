@@ -1,17 +1,17 @@
-"""One scene and its frames: regularised least squares, one banded system per horizontal frequency.
+"""Scenes and their frames: regularised least squares, one banded system per scene and horizontal frequency.
 
-The coefficients c of the scene minimise ``sum_m w_m |g_m - K_m c|^2 + c^H P c`` with the data g_m, the observation
+The coefficients c of a scene minimise ``sum_m w_m |g_m - K_m c|^2 + c^H P c`` with the data g_m, the observation
 operators K_m, the weights w_m and the precision matrix P of a prior. The normal equations
 
     (sum_m K_m^H w_m K_m + P) c = sum_m K_m^H w_m g_m
 
-are banded, Hermitian and positive definite for every horizontal frequency.
+are banded, Hermitian and positive definite for every horizontal frequency. The systems of N scenes are solved together.
 
 The plain path factors the system of every frequency, and is differentiable. The fast path factors the systems of some
 frequencies and interpolates the factors for all others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -19,30 +19,20 @@ from math import prod
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from rsvib_torch.core.banded_solver import (
     BandedFactor,
     InterpolatedFactors,
-    extend_system,
     factor_banded,
     node_frequencies,
-    solve_skewed,
+    solve_halves,
 )
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
-__all__ = [
-    "SIDE_BY_SIDE",
-    "Partition",
-    "SceneProblem",
-    "SceneSolver",
-    "SolversSideBySide",
-    "join_windows",
-    "row_windows",
-]
+__all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
 
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
@@ -98,29 +88,46 @@ class Partition:
         """Chunks that are solved side by side; more than two threads wait for each other's calls from Python."""
         return min(torch.get_num_threads(), 2) if device.type == "cpu" else 1
 
+    @staticmethod
+    def most_values(rows: int, frequencies: int, device: torch.device, *, blurred: bool, single: bool) -> int:
+        """Values of the bands in memory at a time: 128 MB on a CPU, 2 GB on a GPU, for several scenes.
+
+        A single scene takes 32 MB, or 4 times the memory of its spectrum, for each of two chunks at a time on a CPU, so
+        that results do not depend on the number of threads. Where exposures blur, the rows are not divided, and a step
+        of the elimination has fewer values: twice the memory saves 18 % of the time for frames of 1024 and 2048 rows,
+        four times the memory 30 %.
+        """
+        if device.type == "cpu":
+            values = max(1 << 22, 4 * rows * frequencies) if single else 1 << 24
+        else:
+            values = max(1 << 28, 8 * rows * frequencies)
+        return 2 * values if blurred else values
+
     def divide(
-        self, rows: int, width: int, frequencies: int, device: torch.device, *, blurred: bool, keep: bool
+        self,
+        rows: int,
+        width: int,
+        frequencies: int,
+        device: torch.device,
+        *,
+        blurred: bool,
+        keep: bool,
+        num_scenes: int = 1,
     ) -> tuple[list[slice], list[slice]]:
-        """Chunks of the frequencies, and windows of the rows of a scene.
+        """Chunks of the frequencies, and windows of the rows of scenes.
 
         Args:
-            rows: Rows of the scene.
+            rows: Rows of a scene.
             width: Half-width of the band.
             frequencies: Number of frequencies.
             device: Device of the data.
             blurred: Whether exposures blur: frequencies that many neighbouring rows do not observe then depend on
                 distant rows, and the rows are not divided.
             keep: Whether the factors of all frequencies are kept.
+            num_scenes: Scenes solved together.
         """
-        cpu = device.type == "cpu"
-        # values of the bands in memory: 64 MB on a CPU, 2 GB on a GPU, or 8 times the spectrum of a large scene,
-        # for two chunks at a time on a CPU, so that results do not depend on the number of threads
-        values = max(1 << (23 if cpu else 28), 8 * rows * frequencies) // (2 if cpu else 1)
-        if blurred:
-            # the rows are not divided, and a step of the elimination has fewer values: twice the memory saves 18 % of
-            # the time for frames of 1024 and 2048 rows, four times the memory 30 %
-            values *= 2
-        most = frequencies if keep else max(1, values // (rows * (2 * width + 1)))
+        values = self.most_values(rows, frequencies, device, blurred=blurred, single=num_scenes == 1)
+        most = frequencies if keep else max(1, values // (num_scenes * rows * (2 * width + 1)))
         rounds = -(-frequencies // most)
         chunk = self.chunk or -(-frequencies // (8 * rounds)) * 8  # rows begin at full cache lines
         chunk = min(chunk, frequencies)
@@ -128,7 +135,7 @@ class Partition:
             return runs(frequencies, chunk), [slice(0, rows)]
         # rows of a window, of which the overlap is a part: twice as fast as one window for 2048 rows, because a step of
         # the elimination then has more values than its call from Python costs
-        count = self.segments or max(1, rows // (512 if cpu else 256))
+        count = self.segments or max(1, rows // (512 if device.type == "cpu" else 256))
         return runs(frequencies, chunk), row_windows(rows, count)
 
     def buffer(self, thread: int, shape: tuple[int, ...], like: Tensor) -> Tensor:
@@ -141,11 +148,11 @@ class Partition:
 
 
 class SceneSolver:
-    """Solver of the normal equations of one scene.
+    """Solver of the normal equations of N scenes.
 
     Args:
-        observation: Observation operator of M frames of R rows.
-        precision: P, products (p + 1, p + 1, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
+        observation: Observation operator of the scenes.
+        precision: P, products (p + 1, p + 1, N, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
         partition: Parts solved at a time.
         keep: Keep the factors, for solving several times.
 
@@ -166,19 +173,15 @@ class SceneSolver:
             precision.device,
             blurred=observation.kernels.blurred,
             keep=keep,
+            num_scenes=observation.num_scenes,
         )
         self._normal = normal.in_windows(self._windows)
-        self._keep = keep
+        self._keep, self._num_rows = keep, self._windows[0].stop - self._windows[0].start
         self._interpolated: InterpolatedFactors | None = None
         nodes = None if keep or self._differentiates() else self._nodes()
         if nodes is not None:
             systems = self._normal.at(self.u[nodes], precision[..., nodes])
-            self._interpolated = InterpolatedFactors.of(systems, nodes)
-
-    @property
-    def num_systems(self) -> int:
-        """Number of systems: that of the frequencies of all windows of rows."""
-        return len(self._windows) * len(self.u)
+            self._interpolated = InterpolatedFactors.of(systems, nodes, self._num_rows)
 
     @property
     def interpolates(self) -> bool:
@@ -188,7 +191,7 @@ class SceneSolver:
     @cached_property
     def _factors(self) -> list[BandedFactor]:
         """Factors of all parts, where they are kept."""
-        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p])) for p in self.parts]
+        return [factor_banded(self._normal.at(self.u[p], self.precision[..., p]), self._num_rows) for p in self.parts]
 
     def _nodes(self) -> Tensor | None:
         """Frequencies whose systems are factored; None: all.
@@ -198,7 +201,7 @@ class SceneSolver:
         """
         blur_reach = self.observation.kernels.blur_reach
         step = self.observation.period * min(1 / 64, 1 / (140 * max(blur_reach, 1e-9)))
-        nodes = node_frequencies(len(self.u), step, self.precision.device)
+        nodes = node_frequencies(len(self.u), step, self.u.device)
         # above a fifth of the frequencies, interpolation takes as long as factoring
         return nodes if blur_reach <= 1.5 and 5 * len(nodes) <= len(self.u) else None
 
@@ -207,12 +210,12 @@ class SceneSolver:
         return torch.is_grad_enabled() and any(value.requires_grad for value in values)
 
     def fit(self, data: Tensor) -> Tensor:
-        """Coefficients (K, C, U) of the scene for data (M, C, R, L), whose rows are extended to a period."""
+        """Coefficients (K, C, N, U) of the scenes for data (N, M, C, R, L), whose rows are extended to a period."""
         spectra: Tensor = torch.fft.rfft(data)
         return self._solution(lambda part: self._right_side(spectra, part), spectra)
 
     def right_side(self, data: Tensor) -> Tensor:
-        """Right sides (K, C, U) of the normal equations for data (M, C, R, L)."""
+        """Right sides (K, C, N, U) of the normal equations for data (N, M, C, R, L)."""
         spectra = torch.fft.rfft(data)
         return torch.cat([self._right_side(spectra, part) for part in self.parts], dim=-1)
 
@@ -220,43 +223,39 @@ class SceneSolver:
         return self.observation.adjoint(spectra[..., part], part)
 
     def solve(self, right: Tensor) -> Tensor:
-        """Solution (K, C, U) of the normal equations for right sides (K, C, U)."""
+        """Solution (K, C, N, U) of the normal equations for right sides (K, C, N, U)."""
         return self._solution(lambda part: right[..., part], right)
 
-    def in_windows(self, values: Tensor) -> Tensor:
-        """Windows (R, C, n S) of the rows of values (K, C, S)."""
-        return torch.stack([values[window] for window in self._windows], dim=-2).flatten(-2)
-
-    def joined(self, values: Tensor) -> Tensor:
-        """The opposite of ``in_windows``."""
-        return join_windows(values.unflatten(-1, (len(self._windows), -1)), self._windows)
-
     def _solution(self, right_side: Callable[[slice], Tensor], given: Tensor) -> Tensor:
-        """Solution (K, C, U) for right sides (K, C, S) of parts of the frequencies, computed from ``given``."""
+        """Solution (K, C, N, U) for right sides (K, C, N, S) of parts of the frequencies, computed from ``given``."""
         interpolated: dict[int, BandedFactor] = {}  # of each thread, in memory that is used again
         factors = self._factors if self._keep and not self._differentiates(given) else []
+        scenes, windows = self.observation.num_scenes, self._windows
 
         def solve(number: int, thread: int | None = None) -> Tensor:
             part = self.parts[number]
             u = self.u[part]
-            right = self.in_windows(right_side(part))
+            # windows of the rows, (R, C, N W S)
+            whole = right_side(part)
+            right = torch.stack([whole[window] for window in windows], dim=3).flatten(2)
             if self._interpolated is not None:
                 factor = self._interpolated.at(part, None if thread is None else interpolated.get(thread))
                 if thread is not None:
                     interpolated[thread] = factor
-                solution = solve_skewed(factor, right)
+                solution = solve_halves(factor, right)
             elif factors:
-                solution = solve_skewed(factors[number], right)
+                solution = solve_halves(factors[number], right)
             else:
                 left = self._normal.left
-                shape = (*left.shape[:2], len(self._windows) * len(u))
+                shape = (*left.shape[:4], len(u))
                 out = None if thread is None else self._partition.buffer(thread, shape, given)
-                solution = solve_skewed(self._normal.at(u, self.precision[..., part], out), right)
-            return self.joined(solution)
+                solution = solve_halves(self._normal.at(u, self.precision[..., part], out), right)
+            return join_windows(solution.unflatten(-1, (scenes, len(windows), -1)), windows)
 
         if self._differentiates(given):
             return torch.cat([solve(number) for number in range(len(self.parts))], dim=-1)
-        coefficients: Tensor = given.new_empty(self.observation.count, given.shape[1], len(self.u))
+        channels = given.shape[-3 if given.ndim == 5 else 1]
+        coefficients: Tensor = given.new_empty(self.observation.count, channels, scenes, len(self.u))
         threads = min(Partition.threads(given.device), len(self.parts))
 
         def share(thread: int) -> None:
@@ -266,34 +265,26 @@ class SceneSolver:
         in_parallel(share, range(threads), given.device)
         return coefficients
 
-    def whole_system(self) -> Tensor:
-        """Skewed bands (R + b, 2 b + 1, n U) of all windows and frequencies."""
-        return self._normal.at(self.u, self.precision)
-
-    def whole_right_side(self, data: Tensor) -> Tensor:
-        """Their right sides (R, C, n U), for data as in ``fit``."""
-        return self.in_windows(self.right_side(data))
-
     def predict(self, coefficients: Tensor) -> Tensor:
-        """Noiseless frames (M, C, R, L) of a scene, ``K c``."""
+        """Noiseless frames (N, M, C, R, L) of the scenes, ``K c``."""
         spectra = [self.observation.forward(coefficients[..., part], part) for part in self.parts]  # less memory
         images: Tensor = torch.fft.irfft(torch.cat(spectra, dim=-1), n=self.observation.period)
         return images
 
     def image(self, coefficients: Tensor) -> Tensor:
-        """Rows of the scene where the frame at rest would observe them, (C, R, L); twice as many on the finer grid."""
+        """Rows of the scenes where the frame at rest would observe them, (N, C, R, L); twice as many if finer."""
         return self.observation.image(coefficients)
 
 
 @dataclass(frozen=True, eq=False)
 class SceneProblem:
-    """One scene, observed by M frames.
+    """N scenes, each observed by M frames.
 
     Attributes:
-        data: (M, C, R, L) rows extended to a period.
+        data: (N, M, C, R, L), rows of period L, mean brightness 0.
         observation: Observation operator of the frames.
         precision: Precision of the row prior, products as from ``RowPrior.precision``.
-        level: Standard deviation of the noise of data of weight 1.
+        level: (N,) standard deviation of the noise of data of weight 1.
         partition: Parts solved at a time.
     """
 
@@ -306,72 +297,3 @@ class SceneProblem:
     def solver(self, *, keep: bool = False) -> SceneSolver:
         """The solver for complete data; ``keep`` its factors, for solving several times."""
         return SceneSolver(self.observation, self.precision, self.partition, keep=keep)
-
-
-SIDE_BY_SIDE = 512  # frequencies from which a step of the elimination takes longer than its call
-
-
-class SolversSideBySide:
-    """Solvers of scenes of few columns, whose systems are solved together.
-
-    A step of the elimination for the frequencies of few columns takes less time than its call: seven strips of 384 rows
-    and 112 columns take 0.4 of the time together.
-
-    Args:
-        problems: The scenes, with as many channels each.
-        keep: Keep the factors, for solving several times.
-
-    Attributes:
-        solvers: The solver of each scene.
-    """
-
-    def __init__(self, problems: Sequence[SceneProblem], *, keep: bool = False) -> None:
-        self.solvers = [problem.solver(keep=keep) for problem in problems]
-        self._groups: list[list[int]] = []
-        room = 0
-        for number, solver in enumerate(self.solvers):
-            alone = len(solver.parts) > 1 or solver.interpolates
-            if alone or solver.num_systems > room:
-                self._groups.append([])
-                room = SIDE_BY_SIDE
-            self._groups[-1].append(number)
-            room = 0 if alone else room - solver.num_systems
-        # a scene alone is solved by its solver
-        self._factors = {
-            number: factor_banded(self._system(group))
-            for number, group in enumerate(self._groups)
-            if keep and len(group) > 1
-        }
-
-    def _system(self, group: list[int]) -> Tensor:
-        """Systems of scenes behind each other, extended to equal numbers of rows."""
-        bands = [self.solvers[number].whole_system() for number in group]
-        width = max(band.shape[1] // 2 for band in bands)
-        rows = max(len(band) - band.shape[1] // 2 for band in bands)
-        return torch.cat([extend_system(band, rows, width) for band in bands], -1)
-
-    def fit(self, data: Sequence[Tensor] | Tensor) -> list[Tensor]:
-        """Coefficients of every scene for its data, as from ``SceneSolver.fit``."""
-        coefficients: list[Tensor] = []
-        for place, group in enumerate(self._groups):
-            solvers = [self.solvers[number] for number in group]
-            if len(group) == 1:
-                coefficients.append(solvers[0].fit(data[group[0]]))
-                continue
-            rights = [solver.whole_right_side(data[number]) for solver, number in zip(solvers, group, strict=True)]
-            rows = max(map(len, rights))
-            right = torch.cat([functional.pad(side, (0, 0, 0, 0, 0, rows - len(side))) for side in rights], -1)
-            solutions = solve_skewed(self._factors.get(place) or self._system(group), right)
-            parts = solutions.split([solver.num_systems for solver in solvers], -1)
-            coefficients += [
-                solver.joined(part[: len(side)]) for solver, part, side in zip(solvers, parts, rights, strict=True)
-            ]
-        return coefficients
-
-    def images(self, data: Sequence[Tensor]) -> list[Tensor]:
-        """Images (C, R, L) of the scenes for their data."""
-        return [solver.image(fitted) for solver, fitted in zip(self.solvers, self.fit(data), strict=True)]
-
-    def predictions(self, data: Sequence[Tensor] | Tensor) -> list[Tensor]:
-        """Noiseless frames of the scenes for their data."""
-        return [solver.predict(fitted) for solver, fitted in zip(self.solvers, self.fit(data), strict=True)]

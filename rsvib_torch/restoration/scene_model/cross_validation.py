@@ -1,230 +1,341 @@
-"""Strength of the prior by generalised cross-validation, at a sample of the rows and frequencies of the frames."""
+"""Strength of the prior by generalised cross-validation, at a sample of the rows and frequencies of the frames.
+
+The spectra of the sampled rows are computed on the device of the frames. All else are small tables, of all scenes
+together, in NumPy on the CPU.
+"""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import BandedFactor, factor_banded
-from rsvib_torch.core.fourier import squared_modulus, waves
-from rsvib_torch.restoration.scene_model.observation import RowKernels, SmoothBand, smooth_band, smooth_kernels
-from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior
+from rsvib_torch.restoration.scene_model.observation import RowKernels
+from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 
-__all__ = ["Explained", "SampledRows", "StrengthCache", "prior_strength", "sample_rows", "select_strength"]
+__all__ = ["Explained", "SampledRows", "prior_strengths", "sample_rows", "select_strengths", "smoothness"]
+
+Array = NDArray[Any]
 
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
 
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """Residuals of fits with n priors, frequency by frequency.
+    """Residuals of fits with n priors to S scenes, frequency by frequency.
 
     Attributes:
-        power: (n, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel.
-        freedom: (n, F) degrees of freedom of the fit.
-        count: Rows with a weight above 0.
+        power: (n, S, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel.
+        freedom: (n, S, F) degrees of freedom of the fit.
+        count: (S,) rows with a weight above 0.
     """
 
-    power: Tensor
-    freedom: Tensor
-    count: int
-
-    def joined(self, other: "Explained") -> "Explained":
-        """These and the residuals of fits of the same rows with other priors."""
-        power, freedom = (torch.cat(pair) for pair in ((self.power, other.power), (self.freedom, other.freedom)))
-        return Explained(power, freedom, self.count)
+    power: NDArray[np.float64]
+    freedom: NDArray[np.float64]
+    count: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class SampledRows:
-    """Rows of M images at F frequencies, in n slabs with K coefficients of the scene each.
+    """Rows of S scenes of M images at F frequencies, in G = S n slabs of rows with K coefficients of the scene each.
 
-    Slabs are fitted independently and in one batch, which takes little longer than one slab.
+    Slabs are fitted independently and together, which takes little longer than one slab.
 
     Attributes:
         u: (F,) frequencies in cycles per px.
-        spectra: (M R, C, F), the phase of each row's middle taken off.
-        taps: Kernels (M R, 1, F), one tap after the other.
-        base: (M R,) first coefficient of each row's kernel, of n K: one slab after the other.
-        weight: (M R, 1, 1) weight of each row.
-        normal: The normal matrices, one window for each slab.
+        spectra: (G, M R, C, F), the phase of each row's middle taken off.
+        taps: Kernels (G, M R, J, F).
+        base: (G, M R) first coefficient of each row's kernel, of the K of its slab.
+        weight: (G, M R) weight of each row, in the precision of the spectra.
+        count: K.
+        slabs: n.
         energy: Squared norm of the taper, times the number of channels; powers are divided by it.
     """
 
-    u: Tensor
-    spectra: Tensor
-    taps: list[Tensor]
-    base: Tensor
-    weight: Tensor
-    normal: SmoothBand
-    energy: Tensor
+    u: NDArray[np.float64]
+    spectra: Array
+    taps: Array
+    base: NDArray[np.int64]
+    weight: Array
+    count: int
+    slabs: int
+    energy: float
 
-    def explain(self, precisions: Sequence[Tensor]) -> Explained:
-        """Fit the scene with each of n priors, products (p + 1, p + 1, F) as from ``RowPrior.precision``."""
-        number, many = len(precisions), len(precisions) * len(self.u)
-        slabs, rows = self.normal.left.shape[2], len(self.normal.left) - self.normal.width
+    @cached_property
+    def _selection(self) -> Any:
+        """Sparse matrix (G K, G M R) that adds up rows with the same first coefficient."""
+        place = (self.base + self.count * np.arange(len(self.base))[:, None]).ravel()
+        ones = np.ones(place.size, self.taps.real.dtype)
+        return csr_array((ones, (place, np.arange(place.size))), shape=(len(self.base) * self.count, place.size))
+
+    def _selected(self, values: Array) -> Array:
+        """Sums (K, G, ...) of values (G, M R, ...) over the rows with the same first coefficient."""
+        total = self._selection @ values.reshape(self.base.size, -1)
+        sums: Array = total.reshape(len(self.base), self.count, *values.shape[2:]).swapaxes(0, 1)
+        return sums
+
+    def _normal(self, width: int) -> Array:
+        """Skewed bands (K + b, 2 b + 1, G, F) of the normal matrices without prior."""
+        bands = np.zeros((self.count + width, 2 * width + 1, len(self.base), len(self.u)), self.taps.dtype)
+        weighted = self.weight[..., None, None] * self.taps.conj()
+        for tap in range(self.taps.shape[2]):
+            # A[k, k + d] of all d
+            side = self._selected(weighted[:, :, tap, None] * self.taps[:, :, tap:])[: self.count - tap]
+            bands[tap : self.count, width : width + side.shape[2]] += side.swapaxes(1, 2)
+        for d in range(1, self.taps.shape[2]):
+            bands[d : self.count, width - d] = bands[: self.count - d, width + d].conj()
+        return bands
+
+    def explain(self, precisions: list[Array]) -> Explained:
+        """Fit the scenes with each of n priors, products (p + 1, p + 1, S, F) as from ``RowPrior.precision``."""
+        number, groups, frequencies = len(precisions), len(self.base), len(self.u)
+        width = max(self.taps.shape[2] - 1, len(precisions[0]) - 1)
         # n - d log det A / d log s are the degrees of freedom, with the strength s of the prior: a difference quotient
         step = 1.2
-        products = torch.cat([*precisions, *(step * products for products in precisions)], dim=-1)
-        factor = factor_banded(self.normal.at(self.u.repeat(2 * number), products))
-        logs = factor.inverse.log().to(torch.float64).sum(0).neg().unflatten(-1, (slabs, -1)).sum(0)
-        growth = (logs[many:] - logs[:many]) / math.log(step)
-        right = self.spectra.new_zeros(slabs * rows, *self.spectra.shape[1:])
-        for i, tap in enumerate(self.taps):
-            right.index_add_(0, self.base + i, tap.conj() * self.spectra * self.weight)
-        sides = right.unflatten(0, (slabs, rows)).movedim(0, 2).repeat(1, 1, 1, number).flatten(-2)
-        unchanged = (
-            values.unflatten(-1, (slabs, -1))[..., :many].flatten(-2) for values in (factor.upper, factor.inverse)
-        )
-        solved = BandedFactor(*unchanged).solve(sides).unflatten(-1, (slabs, -1))
-        fitted = solved.movedim(2, 0).flatten(0, 1).unflatten(-1, (number, -1))
-        residual = self.spectra[..., None, :] - sum(
-            tap[..., None, :] * fitted[self.base + i] for i, tap in enumerate(self.taps)
-        )
-        power = (self.weight[..., None] * squared_modulus(residual)).sum((0, 1)).to(torch.float64) / self.energy
-        freedom = (slabs * rows - growth).unflatten(-1, (number, -1))
-        return Explained(power, freedom, int((self.weight > 0).sum()))
+        products = np.stack([*precisions, *(step * products for products in precisions)], 2).repeat(self.slabs, 3)
+        bands = np.repeat(self._normal(width)[:, :, None], 2 * number, 2)  # (K + b, 2 b + 1, 2 n, G, F)
+        merged = products.reshape(*products.shape[:2], -1, frequencies)
+        _add_row_prior(bands.reshape(*bands.shape[:2], -1, frequencies), merged, self.count, width)
+        upper, pivots = _factored(bands.reshape(*bands.shape[:2], -1), self.count)
+        logs = np.log(pivots.astype(np.float64)).sum(0).reshape(2, number, groups, frequencies)
+        growth = (logs[1] - logs[0]) / math.log(step)
+        # right sides, the same for all priors
+        right = np.zeros((self.count, *self.spectra.shape[2:3], groups, frequencies), self.spectra.dtype)
+        for tap in range(self.taps.shape[2]):
+            rows = self.taps[:, :, tap, None].conj() * self.spectra * self.weight[..., None, None]
+            side = self._selected(rows)[: self.count - tap].swapaxes(1, 2)
+            right[tap : tap + len(side)] += side
+        chosen = slice(0, number * groups * frequencies)
+        sides = np.repeat(right[:, :, None], number, 2).reshape(*right.shape[:2], -1)
+        fitted = _solved(upper[..., chosen], pivots[:, chosen], sides)
+        fitted = fitted.reshape(*right.shape[:2], number, groups, frequencies)
+        # residuals of the rows of all priors
+        group = np.arange(groups)[:, None]
+        predicted = sum(
+            self.taps[:, :, tap, None, None] * fitted[self.base + tap, :, :, group] for tap in range(self.taps.shape[2])
+        )  # (G, M R, C, n, F)
+        residual = self.spectra[:, :, :, None] - predicted
+        power = residual.real.astype(np.float64) ** 2 + residual.imag.astype(np.float64) ** 2
+        power = (self.weight[..., None, None, None] * power).sum((1, 2)) / self.energy
+        freedom = (self.count - growth).reshape(number, -1, self.slabs, frequencies).sum(2)
+        power = np.moveaxis(power, 1, 0).reshape(number, -1, self.slabs, frequencies).sum(2)
+        return Explained(power, freedom, (self.weight > 0).reshape(power.shape[1], -1).sum(1))
 
 
-def sample_rows(images: Tensor, kernels: RowKernels, chosen: Tensor, slab_rows: int = _SLAB_ROWS) -> SampledRows:
+def _add_row_prior(bands: Array, precision: Array, rows: int, width: int) -> None:
+    """Add the precision of an autoregressive prior to skewed bands, in their memory.
+
+    Args:
+        bands: (rows + width, 2 width + 1, N, U), of N scenes.
+        precision: Products (p + 1, p + 1, N, U) as from ``RowPrior.precision``.
+        rows: Rows of a scene.
+        width: Half-width of the band.
+    """
+    for d in range(len(precision)):
+        for side in {d, -d}:
+            # rows of the scene: the sum of the products; the first and the last ones are predicted from fewer rows
+            top, bottom = max(0, -side), rows - max(0, side)
+            inner = bands[top:bottom, width + side]
+            inner += precision[d].sum(0)
+            for k in range(1, len(precision) - d):
+                first = bands[top : top + k, width + side]
+                first -= precision[d, k]
+                last = bands[bottom - k : bottom, width + side]
+                last -= precision[d, k]
+
+
+def _factored(skewed: Array, count: int) -> tuple[Array, Array]:
+    """U (K, b, S) right of the diagonal and D (K, S) of ``A = U^H D U``, as ``core.banded_solver.factor_banded``.
+
+    A step of the elimination takes a fifth of the time of the calls of PyTorch for the few systems of a sample.
+    """
+    width = skewed.shape[1] // 2
+    line, entry, item = skewed.strides
+    upper = skewed[:count, width + 1 :]
+    shape = (width, width, skewed.shape[2])
+    for j in range(count):
+        row = upper[j]
+        row /= skewed[j, width]  # its imaginary part, of the size of rounding, would grow from row to row
+        # A[i, j] and A[i, k] of the rows below, each of which begins one column further right
+        column = as_strided(skewed[j + 1 :, width - 1 :], (width, 1, shape[2]), (line - entry, entry, item))
+        rest = as_strided(skewed[j + 1 :, width:], shape, (line - entry, entry, item))
+        rest -= column * row
+    return upper, skewed[:count, width].real
+
+
+def _solved(upper: Array, pivots: Array, right: Array) -> Array:
+    """Solutions (K, M, S) of ``U^H D U x = right`` for right sides (K, M, S), in the memory of ``right``."""
+    count, width = upper.shape[:2]
+    x = np.concatenate([right, np.zeros_like(right[:1]).repeat(width, 0)])
+    for j in range(count):
+        x[j + 1 : j + 1 + width] -= upper[j].conj()[:, None] * x[j]
+    x[:count] /= pivots[:, None]
+    x[count:] = 0
+    for j in range(count - 1, -1, -1):
+        x[j] -= (upper[j][:, None] * x[j + 1 : j + 1 + width]).sum(0)
+    return x[:count]
+
+
+@torch.no_grad()
+def sample_rows(
+    images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64], slab_rows: int = _SLAB_ROWS
+) -> SampledRows:
     """Spectra of tapered rows at a few frequencies, in slabs of rows.
 
     Args:
-        images: (M, C, R, W); of up to n - 1 rows more than n slabs of equal height have, none is used.
-        kernels: Kernels of their rows.
+        images: (S, M, C, R, W); of up to n - 1 rows more than n slabs of equal height have, none is used.
+        kernels: Kernels of the rows of S M images, those of a scene one after the other.
         chosen: (F,) whole numbers of cycles in W px.
         slab_rows: Rows of a slab.
     """
+    scenes, members, channels = images.shape[:3]
     slabs = max(1, images.shape[-2] // slab_rows)
     height, width = images.shape[-2] // slabs, images.shape[-1]
-    count = slabs * height
-    images, kernels = images[..., :count, :], kernels.rows(0, count)
-    taper = torch.hann_window(width + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
-    u = chosen.to(torch.float32) / width
-    cycles = torch.arange(width, device=u.device)[:, None] * chosen % width
-    angle = (-2 * torch.pi) * cycles.to(torch.float32) / width
-    angle = angle.to(torch.float64)
-    tapered = (taper[:, None] * torch.cat([angle.cos(), angle.sin()], dim=-1)).to(images.dtype)
+    # spectra of the rows, minus the mean of the image
+    taper = np.hanning(width + 2)[1:-1]
+    angles = -2 * np.pi * (np.arange(width)[:, None] * chosen % width) / width
+    tapered = torch.as_tensor(taper[:, None] * np.concatenate([np.cos(angles), np.sin(angles)], 1), dtype=images.dtype)
+    tapered = tapered.to(images.device)
     mean = images.mean((-2, -1), keepdim=True)
-    spectra = images @ tapered - mean * tapered.sum(0)
-    spectra = torch.complex(*spectra.chunk(2, dim=-1)).transpose(1, 2)  # (M, R, C, F)
-    spectra = spectra * waves(kernels.middle, -u).to(spectra.dtype)[:, :, None]
-    taps = [tap[:, None] for tap in smooth_kernels(kernels, images.dtype).taps(u)]
-    slab = torch.arange(count, device=u.device) // height
-    place = kernels.first - slab * height
-    rows = int(place.amax() - place.amin()) + len(taps)
-    apart = replace(kernels, first=place - place.amin() + slab * rows)
-    normal = smooth_band(apart, 0, slabs * rows, ORDER, images.dtype)
+    transformed = (images[..., : slabs * height, :] @ tapered - mean * tapered.sum(0)).cpu().numpy()
+    spectra = transformed[..., : len(chosen)] + 1j * transformed[..., len(chosen) :]
+    # kernels of the rows at these frequencies
+    tables = (kernels.first, kernels.taps, kernels.middle, kernels.along, kernels.weight)
+    first, taps, middle, along, weight = (table[:, : slabs * height].cpu().numpy() for table in tables)
+    u = chosen / width
+    waves = np.exp(-2j * np.pi * along[..., None] * u)
+    kernel = (taps @ waves).astype(spectra.dtype)  # (S M, R, J, F)
+    phase = np.exp(2j * np.pi * middle[..., None] * u).astype(spectra.dtype)
+    spectra = spectra * phase.reshape(scenes, members, 1, -1, len(u))
+
+    def in_slabs(values: Array) -> Array:
+        """(S, M, n height, ...) as (S n, M height, ...)."""
+        parts = values.reshape(scenes, members, slabs, height, *values.shape[3:])
+        return np.moveaxis(parts, 2, 1).reshape(scenes * slabs, members * height, *values.shape[3:])
+
+    kernel, first, weight = (
+        in_slabs(values.reshape(scenes, members, *values.shape[1:])) for values in (kernel, first, weight)
+    )
+    # coefficients of a slab count from the first one of its rows
+    place = first - height * np.tile(np.arange(slabs), scenes)[:, None]
+    base = place - place.min()
+    spectra = in_slabs(np.moveaxis(spectra, 2, 3))
+    energy = channels * float((taper**2).sum())
     return SampledRows(
-        u,
-        spectra.flatten(0, 1),
-        taps,
-        apart.first.flatten(),
-        kernels.weight.to(images.dtype).flatten()[:, None, None],
-        normal.apart(slabs),
-        images.shape[1] * taper.square().sum().to(torch.float64),
+        u, spectra, kernel, base, weight.astype(spectra.real.dtype), int(base.max()) + kernel.shape[2], slabs, energy
     )
 
 
+def smoothness(scenes: int, frequencies: int, strength: float) -> NDArray[np.float64]:
+    """Products (3, 3, S, F) as from ``RowPrior.precision``: correlation 0.9 of neighbouring rows, innovations of 1."""
+    products = np.zeros((ORDER + 1, ORDER + 1, scenes, frequencies))
+    products[0, 0], products[0, 1], products[1, 0] = strength, strength * 0.9**2, -0.9 * strength
+    return products
+
+
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # factors on the prior, from strong to weak
+_FREQUENCIES = 24  # at which rows are sampled
+_ROWS = 512  # sampled, from the middle of the frames
 
 
-def _cross_validation(explained: Explained, strengths: Tensor) -> int:
-    """Index of the strength, of those from strong to weak, selected by generalised cross-validation.
+def _cross_validation(explained: Explained, strengths: tuple[float, ...], allowed: NDArray[np.bool_]) -> Array:
+    """Index (S,) of the strength, of those from strong to weak and allowed (n, S), selected by cross-validation.
 
     ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from all
     others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives all the
     same weight. The weaker of the two selected priors is used, because one that is too weak has the smaller error.
     """
-    residual_freedom = explained.count - explained.freedom
-    of_sum = explained.power.sum(-1).log() - 2 * residual_freedom.sum(-1).log()
-    geometric = (explained.power.log() - 2 * residual_freedom.log()).mean(-1)
-    octaves = strengths.log2()
+    residual_freedom = explained.count[:, None] - explained.freedom
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_sum = np.log(explained.power.sum(-1)) - 2 * np.log(residual_freedom.sum(-1))
+        geometric = (np.log(explained.power) - 2 * np.log(residual_freedom)).mean(-1)
+    octaves = np.log2(strengths)[:, None]
     # strength 1 follows from the noise level: another must reduce the logarithm by this much per octave, weaker or
     # stronger
-    handicap = torch.maximum(-0.014 * octaves, 0.002 * octaves)
-    return int(torch.maximum((of_sum + handicap).argmin(), (geometric + handicap).argmin()))
+    handicap = np.maximum(-0.014 * octaves, 0.002 * octaves)
+    criteria = [np.where(allowed, criterion + handicap, np.inf) for criterion in (of_sum, geometric)]
+    index: Array = np.maximum(*(criterion.argmin(0) for criterion in criteria))
+    return index
 
 
 @torch.no_grad()
-def prior_strength(
-    images: Tensor, kernels: RowKernels, prior: RowPrior, noise_power: Tensor, *, certain: bool = True
-) -> float:
-    """Factor on the prior for restoring one scene.
+def prior_strengths(
+    images: Tensor,
+    kernels: RowKernels,
+    prior: RowPrior,
+    noise_power: Tensor,
+    blur_reach: Array,
+    *,
+    certain: bool = True,
+) -> NDArray[np.float64]:
+    """Factors (S,) on the prior for restoring S scenes.
 
     The prior is fitted to the power spectrum of the frames minus that of the noise. A weaker one predicts pixels better
     where dense texture is taken for noise, or where the scene differs from its mean spectrum.
 
     Args:
-        images: (M, C, R, W) of one scene, in row order.
-        kernels: Kernels of the images.
+        images: (S, M, C, R, W) of each scene, in row order.
+        kernels: Kernels of the rows of S M images.
         prior: Fitted to them.
-        noise_power: Variance of the noise of images of weight 1.
+        noise_power: (S, 1) variance of the noise of images of weight 1.
+        blur_reach: (S, 1), of ``RowPrior.precision``.
         certain: Whether the noise level is given or estimated from several frames. That of a single frame includes
             texture, so that the prior cannot be too weak.
 
     Returns:
-        One of a few factors.
+        One of a few factors for each scene.
     """
     height, width = images.shape[-2:]
     if min(height, width) < 64:  # too few values for a choice
-        return 1.0
-    count = min(height, 512)  # rows from the middle
+        return np.ones(len(images))
+    count = min(height, _ROWS)
     top = (height - count) // 2
-    part = kernels.rows(top, count)
     # 24 frequencies from 0.02 cycles per px, below which the taper mixes them
-    chosen = torch.linspace(
-        0.02 * width, width // 2, min(24, width // 4), device=images.device, dtype=torch.float32
-    ).long()
-    place = (chosen.to(torch.float32) / width * 2 * (prior.power.shape[-1] - 1)).round().long()
-    sample = sample_rows(images[..., top : top + count, :], part, chosen)
+    number = min(_FREQUENCIES, width // 4)
+    chosen = np.linspace(0.02 * width, width // 2, number, dtype=np.float32).astype(np.int64)
+    sample = sample_rows(images[..., top : top + count, :], kernels.rows(top, count), chosen)
+    place = torch.as_tensor(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
+    at = RowPrior(
+        *(table[..., place.to(table.device)] for table in (prior.power, prior.reflections, prior.interpolation_power))
+    )
     # less noise than 200 times the interpolation error of the kernel cannot be distinguished from it
-    certain = certain and bool(noise_power > 200.0 * prior.interpolation_power.mean())
-    strengths = [strength for strength in _STRENGTHS if certain or strength <= 1]
-    precisions = [
-        prior.precision(noise_power, strength=strength, blur_reach=kernels.blur_reach)[..., place]
-        for strength in strengths
-    ]
-    return select_strength(strengths, precisions, sample.explain)
+    above = noise_power[:, 0] > 200.0 * prior.interpolation_power.mean((1, 2))
+    products, ratio = at.products().cpu().numpy(), at.ratio(noise_power).cpu().numpy()
+    precisions = np.stack([products * bounded_ratio(ratio * strength, blur_reach) for strength in _STRENGTHS])
+    return select_strengths(precisions, above.cpu().numpy() & certain, sample.explain)
 
 
-def select_strength(
-    strengths: list[float], precisions: list[Tensor], explain: Callable[[list[Tensor]], Explained]
-) -> float:
-    """The strength that cross-validation selects.
+def select_strengths(
+    products: Array, certain: NDArray[np.bool_], explain: Callable[[list[Array]], Explained]
+) -> NDArray[np.float64]:
+    """The strengths (S,) that cross-validation selects.
 
     Args:
-        strengths: From strong to weak.
-        precisions: Of the prior with each strength.
+        products: (n, p + 1, p + 1, S, F) precision of the prior with each of the strengths from strong to weak.
+        certain: (S,) whether the noise level is certain, so that the prior may be stronger than it states.
         explain: Residual power and degrees of freedom of the data for some of the precisions.
     """
-    first = 3  # weaker priors are rarely selected: they are tried only if the weakest of these is
-    tried = explain(precisions[:first])
-    choice = _cross_validation(tried, tried.power.new_tensor(strengths[:first]))
-    if choice == first - 1:
-        tried = tried.joined(explain(precisions[first:]))
-        choice = _cross_validation(tried, tried.power.new_tensor(strengths))
-    return strengths[choice]
-
-
-class StrengthCache:
-    """Strengths of the prior for the scenes of a stack: those with about the same noise share one."""
-
-    def __init__(self) -> None:
-        self._chosen: list[tuple[float, float]] = []
-
-    def of(self, noise: Tensor, choose: Callable[[], float]) -> float:
-        """The strength for one scene.
-
-        Args:
-            noise: Power of the noise and of the interpolation error.
-            choose: Returns the strength; called unless that of a scene with the same power, to 20 %, was chosen before.
-        """
-        logarithm = float(noise.detach().log())
-        for earlier, strength in self._chosen:
-            if abs(logarithm - earlier) < 0.2:
-                return strength
-        self._chosen.append((logarithm, choose()))
-        return self._chosen[-1][1]
+    # a stronger prior is allowed only if the noise level is certain; of those allowed, the three strongest are tried
+    # first, and all others only if the weakest of them is selected, which is rare
+    order = np.arange(len(products))[:, None]
+    allowed = certain | (np.array(_STRENGTHS)[:, None] <= 1.0)
+    last = np.where(certain, 2, 3)
+    first = int(last.max()) + 1
+    tried = explain(list(products[:first]))
+    choice = _cross_validation(tried, _STRENGTHS[:first], (allowed & (order <= last))[:first])
+    if bool((choice == last).any()):
+        others = explain(list(products[first:]))
+        power, freedom = (
+            np.concatenate([getattr(tried, name), getattr(others, name)]) for name in ("power", "freedom")
+        )
+        of_all = _cross_validation(Explained(power, freedom, tried.count), _STRENGTHS, allowed)
+        choice = np.where(choice == last, of_all, choice)
+    strengths: NDArray[np.float64] = np.array(_STRENGTHS)[choice]
+    return strengths

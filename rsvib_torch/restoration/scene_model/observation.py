@@ -24,9 +24,11 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.banded_solver import from_both_ends
 from rsvib_torch.core.fourier import shift_phases
 from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
@@ -50,7 +52,6 @@ __all__ = [
     "normal_matrices",
     "row_kernels",
     "scene_weights",
-    "smooth_band",
     "smooth_kernels",
     "spline_transfer",
 ]
@@ -145,7 +146,7 @@ def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1
 
 @dataclass(frozen=True, eq=False)
 class RowKernels:
-    """Kernels of the rows of M frames, which act on the coefficients of the scene.
+    """Kernels of the rows of M frames, which act on the coefficients of their scene.
 
     Attributes:
         first: (M, R) first scene row of the kernel of each row.
@@ -210,8 +211,10 @@ def _about_middle(along: Tensor) -> tuple[Tensor, Tensor]:
     return middle, along - middle[..., None]
 
 
-def interpolation_matrix(reach: float, u: Tensor, dtype: torch.dtype, *, symmetric: bool) -> tuple[Tensor, Tensor]:
-    """Nodes (Q,) in 0 ... 1/2 cycles per px, and the matrix (2 Q, 2 U) to frequencies ``u``.
+def interpolation_matrix(
+    reach: float, u: Tensor | None, dtype: torch.dtype, *, symmetric: bool
+) -> tuple[Tensor, Tensor]:
+    """Nodes (Q,) in 0 ... 1/2 cycles per px, and the matrix (2 Q, 2 U) to frequencies ``u`` (U,) on the CPU.
 
     Sums of waves of up to ``reach`` px are interpolated from real and imaginary parts at the nodes to interleaved real
     and imaginary parts at ``u`` by Chebyshev series: with ``f(-u) = conj f(u)`` even and odd ones, else in 0 ... 1/2.
@@ -222,26 +225,27 @@ def interpolation_matrix(reach: float, u: Tensor, dtype: torch.dtype, *, symmetr
     while bound > precision or degree < half:
         degree += 1
         bound *= 0.5 * half / degree if half else 0.0
-    if not symmetric:
-        order = torch.arange(degree + 1, dtype=torch.float64, device=u.device)
-        angles = math.pi * (order + 0.5) / len(order)
-        series = torch.cos(angles[:, None] * order) * torch.where(order > 0, 2.0, 1.0) / len(order)
-        values = series @ torch.cos(order[:, None] * torch.acos((4 * u - 1).clamp(-1, 1)))
-        matrix = u.new_zeros(2, len(order), len(u), 2)
-        matrix[0, ..., 0] = matrix[1, ..., 1] = values
-        return 0.25 * (1 + torch.cos(angles)), matrix.flatten(0, 1).flatten(1)
-    count = degree // 2 + 1
-    k = torch.arange(count, dtype=torch.float64, device=u.device)
-    angles = math.pi * (2 * k + 1) / (4 * count)
-    at = torch.acos((2 * u).clamp(-1, 1))
-    matrix = u.new_zeros(2 * count, len(u), 2)
-    for odd in (0, 1):
-        order = 2 * k + odd
-        series = torch.cos(angles[:, None] * order) * (2 / count)
-        if not odd:
-            series[:, 0] *= 0.5
-        matrix[odd * count : (odd + 1) * count, :, odd] = series @ torch.cos(order[:, None] * at)
-    return 0.5 * torch.cos(angles), matrix.flatten(1)
+    places = np.zeros(0) if u is None else u.numpy()
+    count = degree // 2 + 1 if symmetric else degree + 1
+    order = np.arange(count)
+    if symmetric:
+        angles = np.pi * (2 * order + 1) / (4 * count)
+        at = np.arccos((2 * places).clip(-1, 1))
+        matrix = np.zeros((2, count, len(places), 2))
+        for odd in (0, 1):
+            series = np.cos(angles[:, None] * (2 * order + odd)) * (2 / count)
+            if not odd:
+                series[:, 0] *= 0.5
+            matrix[odd, :, :, odd] = series @ np.cos((2 * order[:, None] + odd) * at)
+        nodes = 0.5 * np.cos(angles)
+    else:
+        angles = np.pi * (order + 0.5) / count
+        at = np.arccos((4 * places - 1).clip(-1, 1))
+        series = np.cos(angles[:, None] * order) * np.where(order > 0, 2.0, 1.0) / count
+        matrix = np.zeros((2, count, len(places), 2))
+        matrix[0, ..., 0] = matrix[1, ..., 1] = series @ np.cos(order[:, None] * at)
+        nodes = 0.25 * (1 + np.cos(angles))
+    return torch.from_numpy(nodes), torch.from_numpy(matrix.reshape(2 * count, 2 * len(places)))
 
 
 def _stacked(values: Tensor) -> Tensor:
@@ -264,36 +268,37 @@ class SmoothKernels:
 
     def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[Tensor]:
         """Kernels (M R, U), or their conjugates, without the phase of their middles, one tap after the other."""
-        right = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=self.symmetric)[1].to(self.left.dtype)
+        right = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=self.symmetric)[1]
         if conjugate:
             right[:, 1::2] *= -1
+        right = right.to(self.left)
         for tap in self.left:
             yield torch.view_as_complex((tap @ right).unflatten(-1, (-1, 2)))
 
 
 def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
     """Kernels of all rows at the Chebyshev nodes."""
-    nodes, _ = interpolation_matrix(kernels.blur_reach, kernels.middle.new_zeros(1), dtype, symmetric=kernels.symmetric)
-    left = _stacked(kernels.at(nodes)).to(dtype).flatten(0, 1).transpose(0, 1).contiguous()
+    nodes, _ = interpolation_matrix(kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
+    left = _stacked(kernels.at(nodes.to(kernels.middle.device))).to(dtype).flatten(0, 1).transpose(0, 1).contiguous()
     return SmoothKernels(left, kernels.blur_reach, kernels.symmetric)
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothBand:
-    """Normal matrices at any frequencies, prior included, by one matrix product.
+    """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added.
 
     Attributes:
-        left: (R + b, 2 b + 1, n, 2 Q + p + 1) real and imaginary parts at Q nodes, and the entries of each lag of the
-            prior, for n windows of R rows; the last b rows are 0.
+        left: (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows; the last b rows are 0.
+            In windows the halves (H + b, 2 b + 1, 2, N W, 2 Q) as from ``from_both_ends`` of W windows of each scene.
         reach: Largest distance along the rows in px of the products of kernels.
-        order: Order p of the prior.
-        systems: Whether the windows are separate systems instead of parts of one.
+        windows: W.
+        rows: R, in windows.
     """
 
     left: Tensor
     reach: float
-    order: int
-    systems: bool = False
+    windows: int = 1
+    rows: int = 0
 
     @property
     def width(self) -> int:
@@ -301,183 +306,180 @@ class SmoothBand:
         return self.left.shape[1] // 2
 
     def in_windows(self, windows: list[slice]) -> "SmoothBand":
-        """The matrix of all rows as those of windows of rows."""
-        if len(windows) == 1:
-            return self
-        parts = torch.stack([self.left[window, :, 0] for window in windows], dim=2)
-        return replace(self, left=torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
-
-    def apart(self, count: int) -> "SmoothBand":
-        """The matrix of ``count`` systems of one size, one after the other and not coupled by data, as windows."""
-        rows = self.left[: len(self.left) - self.width, :, 0].unflatten(0, (count, -1)).movedim(0, 2)
-        return replace(self, left=torch.cat([rows, rows.new_zeros(self.width, *rows.shape[1:])]), systems=True)
+        """The matrices of all rows as those of windows of rows, eliminated from both ends."""
+        parts = torch.stack([self.left[window] for window in windows], dim=3).flatten(2, 3)
+        left = from_both_ends(torch.cat([parts, parts.new_zeros(self.width, *parts.shape[1:])]))
+        return replace(self, left=left, windows=len(windows), rows=len(parts))
 
     def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
-        """Skewed bands (R + b, 2 b + 1, n U), complex.
+        """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex.
 
         Args:
-            u: Frequencies in cycles per px.
-            precision: Products (p + 1, p + 1, U) of the prior there.
+            u: (U,) frequencies in cycles per px.
+            precision: Products (p + 1, p + 1, N, U) of the prior there.
             out: Memory for them; page faults in fresh memory take as long as the product that fills it.
         """
-        lags = torch.stack([precision.sum(1), torch.zeros_like(precision[:, 0])], dim=-1).flatten(1)
-        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], lags, out)
-        width, real = self.width, bands[..., 0]
-        count = len(self.left) - width
-        first, last = (slice(None), slice(None)) if self.systems else (slice(1), slice(-1, None))
-        for d in range(self.order + 1):
+        bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], out)
+        real = bands[..., 0].unflatten(3, (-1, self.windows))
+        halves = real[:, :, 0], real[:, :, 1]  # (H + b, 2 b + 1, N, W, U) each
+        precision = precision[:, :, :, None].to(bands.dtype)
+        width, half = self.width, len(self.left) - self.width
+        for d in range(len(precision)):
             for side in {d, -d}:
-                for k in range(1, self.order + 1 - d):
-                    top = max(0, -side)
-                    real[top : top + k, width + side, first] -= precision[d, k]
-                    bottom = count - max(0, side)
-                    real[bottom - k : bottom, width + side, last] -= precision[d, k]
+                # rows of the scene: the sum of the products; the middle rows in the first half only
+                top, total = max(0, -side), precision[d].sum(0)
+                halves[0][top : half - max(0, side), width + side].add_(total)
+                halves[1][top : self.rows - half + top, width + side].add_(total)
+                # rows at the ends of the scene are predicted from fewer rows
+                for k in range(1, len(precision) - d):
+                    halves[0][top : top + k, width + side, :, :1].sub_(precision[d, k])
+                    halves[1][top : top + k, width + side, :, -1:].sub_(precision[d, k])
         return torch.view_as_complex(bands).flatten(2)
 
-    def _product(self, interpolation: Tensor, prior: Tensor, out: Tensor | None) -> Tensor:
-        """Bands (R + b, 2 b + 1, n, U, 2) of the matrices at the nodes and of those of the prior."""
-        right = torch.cat([interpolation, prior]).to(self.left.dtype)
-        rows = self.left.flatten(0, 2)
+    def _product(self, right: Tensor, out: Tensor | None) -> Tensor:
+        """Products (H + b, 2 b + 1, 2, n, U, 2) with a matrix."""
+        rows, right = self.left.flatten(0, 3), right.to(self.left)
         if out is None:
             product = rows @ right
         else:
             product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
-        return product.view(*self.left.shape[:3], -1, 2)
+        return product.view(*self.left.shape[:4], -1, 2)
 
 
-def smooth_band(kernels: RowKernels, top: int, count: int, order: int, dtype: torch.dtype) -> SmoothBand:
-    """Normal matrices ``sum_m w_m K_m^H K_m`` of all frames of one scene, to which a prior can be added.
-
-    Args:
-        kernels: Kernels of the frames.
-        top: First row of the scene.
-        count: Rows of the scene.
-        order: Order of the prior. The half-width of the band is that or the number of taps less 1.
-        dtype: dtype of the frames.
-    """
-    width = max(kernels.taps.shape[-2] - 1, order)
-    matrices = normal_matrices(kernels, top, count, width, dtype)
-    lags = kernels.middle.new_zeros(len(matrices), 2 * width + 1, order + 1)
-    for d in range(order + 1):
-        lags[: count - d, width + d, d] = 1
-        lags[d:count, width - d, d] = 1
-    matrix = torch.cat([matrices, lags], dim=-1)
-    return SmoothBand(matrix.to(dtype)[:, :, None], 2 * kernels.blur_reach, order)
-
-
-def normal_matrices(kernels: RowKernels, top: int, count: int, width: int, dtype: torch.dtype) -> Tensor:
-    """Bands (K + b, 2 b + 1, 2 Q) of ``sum_m w_m K_m^H K_m`` at the Chebyshev nodes, float64.
+def normal_matrices(
+    kernels: RowKernels, top: int, count: int, width: int, dtype: torch.dtype, num_scenes: int = 1
+) -> Tensor:
+    """Bands (K + b, 2 b + 1, N, 2 Q) of ``sum_m w_m K_m^H K_m`` of N scenes at the Chebyshev nodes, float64.
 
     Args:
-        kernels: Kernels of the frames.
-        top: First coefficient of the scene.
+        kernels: Kernels of the frames, those of a scene one after the other.
+        top: First coefficient of the scenes.
         count: K.
         width: Half-width b of the band.
         dtype: dtype of the frames, which determines the number of nodes.
+        num_scenes: N.
     """
-    zero = kernels.middle.new_zeros(1)
-    nodes, _ = interpolation_matrix(2 * kernels.blur_reach, zero, dtype, symmetric=kernels.symmetric)
+    nodes, _ = interpolation_matrix(2 * kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
+    nodes = nodes.to(kernels.middle.device)
     values = kernels.at(nodes)
     weighted = values * kernels.weight[..., None, None]
-    base = (kernels.first - top).flatten()
-    sides: list[Tensor] = []
-    taps = values.shape[-2]
-    for d in range(taps):
-        entry = base[:, None] + torch.arange(taps - d, device=base.device)
-        products = weighted[..., : taps - d, :].conj() * values[..., d:, :]
-        entries = values.new_zeros(count + width, len(nodes))
-        sides.append(entries.index_add(0, entry.flatten(), products.flatten(0, 2)))  # A[k, k + d]
-    absent = torch.zeros_like(sides[0])
-    right = [sides[d] if d < len(sides) else absent for d in range(width + 1)]
-    left = [torch.cat([absent[:d], right[d][: len(absent) - d].conj()]) for d in range(width, 0, -1)]
-    return _stacked(torch.stack(left + right, dim=1))
+    # entry of A[k, k + d] of a scene, whose rows are followed by b rows that are 0
+    diagonals, taps = 2 * width + 1, values.shape[-2]
+    scene = torch.arange(num_scenes, device=nodes.device).repeat_interleave(len(kernels.first) // num_scenes)
+    row = kernels.first - top + (count + width) * scene[:, None]
+    columns = torch.arange(taps, device=nodes.device)
+    bands = values.new_zeros(num_scenes * (count + width) * diagonals, len(nodes))
+    for tap in range(taps):  # one at a time: less memory
+        entry = (diagonals * (row + tap) + width - tap)[..., None] + columns
+        products = weighted[..., tap, None, :].conj() * values
+        bands = bands.index_add_(0, entry.flatten(), products.flatten(0, 2))
+    normal: Tensor = _stacked(bands).view(num_scenes, count + width, diagonals, -1).permute(1, 2, 0, 3)
+    return normal
 
 
 class Observation:
-    """The observation operator K of M frames of R rows, whose rows have the period L, and its normal matrices.
+    """The observation operator K of N scenes, each observed by M frames of R rows of period L, and its normal matrices.
 
     ``A`` and ``A_adjoint`` have images of whole frames; ``forward`` and ``adjoint`` have spectra of some frequencies.
 
     Args:
-        kernels: Kernels of the rows.
+        kernels: Kernels of the rows of N M frames, those of a scene one after the other.
         num_rows: R.
         period: L in px.
         dtype: dtype of the data.
+        num_scenes: N.
 
     Attributes:
-        u: (U,) frequencies along the rows in cycles per px.
-        top: First scene row that is observed or needed to evaluate the scene, in frame coordinates.
+        u: (U,) frequencies along the rows in cycles per px, on the CPU.
+        top: First scene row that is observed or needed to evaluate a scene, in frame coordinates.
         count: Number of such scene rows, K.
     """
 
-    def __init__(self, kernels: RowKernels, num_rows: int, period: int, dtype: torch.dtype) -> None:
+    def __init__(
+        self, kernels: RowKernels, num_rows: int, period: int, dtype: torch.dtype, num_scenes: int = 1
+    ) -> None:
         self.kernels, self.num_rows, self.period, self.dtype = kernels, num_rows, period, dtype
-        self.u = torch.fft.rfftfreq(period, dtype=torch.float64, device=kernels.middle.device)
+        self.num_scenes, self.u = num_scenes, _frequencies(period)
         first, last = kernels.needed(num_rows)
-        self.top = min(int(kernels.first.amin()), first)
-        last = max(int(kernels.first.amax()) + kernels.taps.shape[-2], last)
-        self.count = last - self.top
+        lowest, highest = torch.stack(kernels.first.aminmax()).tolist()
+        self.top = min(lowest, first)
+        self.count = max(highest + kernels.taps.shape[-2], last) - self.top
         self._smooth = smooth_kernels(kernels, dtype)
-        self._first = (kernels.first - self.top).flatten()
+        scene = torch.arange(num_scenes, device=kernels.first.device)[:, None, None]
+        place = kernels.first.unflatten(0, (num_scenes, -1)) - self.top + self.count * scene
+        self._first = place.flatten()  # of the coefficients of all scenes, one scene after the other
         self._normal: dict[int, SmoothBand] = {}
 
     def normal(self, order: int) -> SmoothBand:
         """Normal matrices ``K^H W K``, with room for a prior of an order across rows."""
         if order not in self._normal:
-            self._normal[order] = smooth_band(self.kernels, self.top, self.count, order, self.dtype)
+            width = max(self.kernels.taps.shape[-2] - 1, order)
+            matrices = normal_matrices(self.kernels, self.top, self.count, width, self.dtype, self.num_scenes)
+            left = matrices.to(self.dtype).contiguous()
+            self._normal[order] = SmoothBand(left, 2 * self.kernels.blur_reach)
         return self._normal[order]
 
     def weighted(self, weight: Tensor) -> "Observation":
-        """The same with other weights (M, R) of the rows."""
-        return type(self)(replace(self.kernels, weight=weight), self.num_rows, self.period, self.dtype)
+        """The same with other weights (N M, R) of the rows."""
+        kernels = replace(self.kernels, weight=weight)
+        return type(self)(kernels, self.num_rows, self.period, self.dtype, self.num_scenes)
 
     def with_period(self, period: int) -> "Observation":
         """The same for rows of another period."""
         other = copy(self)
-        other.period, other.u = period, torch.fft.rfftfreq(period, dtype=torch.float64, device=self.u.device)
+        other.period, other.u = period, _frequencies(period)
         return other
 
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
-        """Frames ``K c`` (M, C, R, L) of a scene with coefficients (K, C, U)."""
+        """Frames ``K c`` (N, M, C, R, L) of scenes with coefficients (K, C, N, U)."""
         frames: Tensor = torch.fft.irfft(self.forward(coefficients, slice(0, len(self.u))), n=self.period)
         return frames
 
     def A_adjoint(self, frames: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
-        """``K^H W g`` (K, C, U) of frames (M, C, R, L)."""
+        """``K^H W g`` (K, C, N, U) of frames (N, M, C, R, L)."""
         return self.adjoint(torch.fft.rfft(frames), slice(0, len(self.u)))
 
     def forward(self, coefficients: Tensor, part: slice) -> Tensor:
-        """``K c``, (M, C, R, S), of coefficients (K, C, S) at the frequencies ``part``."""
+        """``K c``, (N, M, C, R, S), of coefficients (K, C, N, S) at the frequencies ``part``."""
         # sum over the taps of each row of all frames
-        rows = coefficients.new_zeros(len(self._first), *coefficients.shape[1:])
+        flat = coefficients.movedim(2, 0).flatten(0, 1)
+        rows = flat.new_zeros(len(self._first), *flat.shape[1:])
         for tap, kernel in enumerate(self._smooth.taps(self.u[part])):
-            rows = rows + kernel[:, None] * coefficients[self._first + tap]
+            rows = rows + kernel[:, None] * flat[self._first + tap]
         # displacement of the middle of each row
-        phases = shift_phases(self.kernels.middle, self.period, part, coefficients.dtype).conj()
-        observed: Tensor = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
-        return observed
+        phases = shift_phases(self.kernels.middle, self.period, part, flat.dtype).conj()
+        observed = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
+        of_scenes: Tensor = observed.unflatten(0, (self.num_scenes, -1))
+        return of_scenes
 
     def adjoint(self, spectra: Tensor, part: slice) -> Tensor:
-        """``K^H W g``, (K, C, S), of the spectra (M, C, R, S) of rows at the frequencies ``part``."""
+        """``K^H W g``, (K, C, N, S), of the spectra (N, M, C, R, S) of rows at the frequencies ``part``."""
         # displacement of the middle of each row
         phases = shift_phases(self.kernels.middle, self.period, part, spectra.dtype)
-        rows = (spectra * (phases * self.kernels.weight.to(self.dtype)[..., None])[:, None]).transpose(1, 2)
-        rows = rows.flatten(0, 1)
+        phases = phases * self.kernels.weight.to(self.dtype)[..., None]
+        rows = (spectra.flatten(0, 1) * phases[:, None]).transpose(1, 2).flatten(0, 1)
         # each row contributes to the scene rows of its taps
-        total = rows.new_zeros(self.count, *rows.shape[1:])
+        total = rows.new_zeros(self.num_scenes * self.count, *rows.shape[1:])
         for tap, kernel in enumerate(self._smooth.taps(self.u[part], conjugate=True)):
             total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
-        return total
+        of_scenes: Tensor = total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
+        return of_scenes
 
     def image(self, coefficients: Tensor) -> Tensor:
-        """Rows of the scene where the frame at rest would observe them, (C, R, L)."""
+        """Rows of the scenes where the frame at rest would observe them, (N, C, R, L)."""
         first = -SCENE_REACH - self.top
         near = coefficients[first : first + self.num_rows + 2 * SCENE_REACH]
         weights = torch.tensor([scene_weights()], dtype=near.real.dtype, device=near.device)
         sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
         spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
-        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=self.period)
-        return scene
+        scenes: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=self.period)
+        return scenes
+
+
+def _frequencies(period: int) -> Tensor:
+    """Frequencies (U,) of rows of a period in cycles per px, on the CPU."""
+    frequencies: Tensor = torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")
+    return frequencies
 
 
 class FinerKernels(RowKernels):
@@ -546,7 +548,8 @@ class FinerBand(SmoothBand):
         """Skewed bands as in ``SmoothBand.at``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
         prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
         interpolation = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=False)[1]
-        return torch.view_as_complex(self._product(interpolation, prior, out)).flatten(2)
+        right = torch.cat([interpolation.to(prior), prior])
+        return torch.view_as_complex(self._product(right, out)).flatten(2)
 
 
 def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
@@ -564,24 +567,24 @@ def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
 
 
 class FinerObservation(Observation):
-    """``Observation`` of a scene on the grid of half pixels; all values count unknowns 2 j + a."""
+    """``Observation`` of one scene on the grid of half pixels; all values count unknowns 2 j + a."""
 
     def normal(self, order: int) -> SmoothBand:
         """Normal matrices ``K^H W K``, with room for a polynomial of an order in the Laplacian across rows."""
         if order not in self._normal:
             width = max(self.kernels.taps.shape[-2] - 1, SCALE * order)
-            matrices = normal_matrices(self.kernels, self.top, self.count, width, self.dtype)
+            matrices = normal_matrices(self.kernels, self.top, self.count, width, self.dtype)[:, :, 0]
             powers = _laplacian_powers(self.count // SCALE, order, matrices.device)
             prior = matrices.new_zeros(*matrices.shape[:2], order + 1, SCALE)
             for alias in range(SCALE):
                 place = slice(width - SCALE * order, width + SCALE * order + 1, SCALE)
                 prior[alias : self.count : SCALE, place, :, alias] = powers
             left = torch.cat([matrices, prior.flatten(2)], dim=-1).to(self.dtype)
-            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.blur_reach, order)
+            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.blur_reach)
         return self._normal[order]
 
     def image(self, coefficients: Tensor) -> Tensor:
-        """The scene at half pixels, (C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
+        """The scene at half pixels, (1, C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
         first = -SCALE * _FINER_SCENE_REACH - self.top
         count = SCALE * self.num_rows
         rows = coefficients[first : first + SCALE * (count + 2 * _FINER_SCENE_REACH)].unflatten(0, (-1, SCALE))
@@ -590,7 +593,7 @@ class FinerObservation(Observation):
         )
         low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
         spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
-        scene: Tensor = torch.fft.irfft(spectra.movedim(1, 0), n=SCALE * self.period) * SCALE
+        scene: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
         return scene
 
 

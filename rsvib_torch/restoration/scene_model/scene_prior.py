@@ -8,16 +8,18 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import pi
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.core.splines import mirrored
-from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import SCALE, interpolation_error, kernel_spectrum, spline_transfer
 
@@ -27,27 +29,31 @@ __all__ = [
     "PolynomialPrior",
     "RowPrior",
     "autoregressive_prior",
+    "bounded_ratio",
     "brightness",
+    "cut_pieces",
     "fit_polynomial_prior",
     "fit_prior",
     "observed_spectrum",
     "smeared",
+    "spread_starts",
 ]
 
 ORDER = 2  # rows that a row is predicted from
+_TINY = float(np.finfo(np.float32).tiny)  # smallest power
 
 
 @dataclass(frozen=True, eq=False)
 class RowPrior:
-    """Autoregressive model of the coefficients of the scene rows s, one for each horizontal frequency.
+    """Autoregressive model of the coefficients of the scene rows s, one for each horizontal frequency of N scenes.
 
     ``c(s) = - a_1 c(s - 1) - ... - a_p c(s - p) + e(s)`` with white ``e``: a stationary process, whose precision
     matrix is banded.
 
     Attributes:
-        power: (U,) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1.
-        reflections: (p, U) partial correlations, within -1 ... 1.
-        interpolation_power: (U,) power of the interpolation error between rows, which counts as noise; (T, U) of each
+        power: (N, U) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1.
+        reflections: (p, N, U) partial correlations, within -1 ... 1.
+        interpolation_power: (N, T, U) power of the interpolation error between rows, which counts as noise, of each
             frame.
     """
 
@@ -55,148 +61,158 @@ class RowPrior:
     reflections: Tensor
     interpolation_power: Tensor
 
-    @classmethod
-    def smooth(cls, u: Tensor) -> "RowPrior":
-        """Correlation 0.9 of neighbouring rows at all frequencies (U,), and innovations of variance 1."""
-        reflections = torch.stack([torch.full_like(u, 0.9), torch.zeros_like(u)])
-        return cls(1 / (1 - reflections[0].square()), reflections, torch.zeros_like(u))
-
-    def of(self, members: list[int]) -> "RowPrior":
-        """The prior for restoring a scene from some of the frames; the interpolation error depends on their blur."""
-        return replace(self, interpolation_power=self.interpolation_power[members].mean(0))
-
-    def filter(self) -> Tensor:
-        """Coefficients 1, a_1 ... a_p of the whitening filter, (p + 1, U)."""
-        filter_ = torch.ones_like(self.power)[None]
-        for reflection in self.reflections:
-            padded = torch.cat([filter_, torch.zeros_like(filter_[:1])])
-            filter_ = padded - reflection * padded.flip(0)
-        return filter_
-
-    def innovation(self) -> Tensor:
-        """Variance (U,) of e."""
-        return self.power * (1 - self.reflections.square()).prod(0)
-
-    def resampled(self, count: int) -> "RowPrior":
-        """The prior at ``count`` frequencies spread over the same range."""
-        parts = [self.power.log()[None], self.reflections, torch.atleast_2d(self.interpolation_power).log()]
-        stacked = torch.nn.functional.interpolate(torch.cat(parts)[None], count, mode="linear", align_corners=True)[0]
-        power, reflections, interpolation = stacked.split([len(part) for part in parts])
+    def of(self, stacks: Tensor, members: Tensor) -> "RowPrior":
+        """The priors of scenes restored from frames ``members`` (S, M) of ``stacks`` (S,)."""
         return RowPrior(
-            power[0].exp(), reflections, interpolation.exp().reshape(*self.interpolation_power.shape[:-1], count)
+            self.power[stacks], self.reflections[:, stacks], self.interpolation_power[stacks[:, None], members]
         )
 
-    def precision(self, noise_power: Tensor, *, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
-        """Products ``a_k a_(k + d)`` of the filter in units of the data's noise, (p + 1, p + 1, U), 0 for k + d > p.
+    def products(self) -> Tensor:
+        """Products ``a_k a_(k + d)`` of the whitening filter 1, a_1 ... a_p, (p + 1, p + 1, N, U), 0 for k + d > p.
 
         The precision of interior rows at distance d is the sum over k. The first and the last rows are predicted from
         fewer rows: for row j it is the sum of the first j + 1 products.
+        """
+        a = torch.ones_like(self.power)[None]
+        for reflection in self.reflections:
+            padded = torch.cat([a, torch.zeros_like(a[:1])])
+            a = padded - reflection * padded.flip(0)
+        lags = [a[: len(a) - d] * a[d:] for d in range(len(a))]
+        return torch.stack([torch.cat([lag, torch.zeros_like(a[: len(a) - len(lag)])]) for lag in lags])
+
+    def ratio(self, noise_power: Tensor) -> Tensor:
+        """Noise power over the variance of e, (N, U), for noise of power (N, 1) in data of weight 1."""
+        innovation = self.power * (1 - self.reflections.square()).prod(0)
+        return (noise_power + self.interpolation_power.mean(1)) / innovation
+
+    def resampled(self, count: int) -> "RowPrior":
+        """The prior at ``count`` frequencies spread over the same range."""
+        parts = [self.power.log()[:, None], self.reflections.movedim(0, 1), self.interpolation_power.log()]
+        stacked = torch.nn.functional.interpolate(torch.cat(parts, 1), count, mode="linear", align_corners=True)
+        power, reflections, interpolation = stacked.split([part.shape[1] for part in parts], 1)
+        return RowPrior(power[:, 0].exp(), reflections.movedim(1, 0), interpolation.exp())
+
+    def precision(
+        self, noise_power: Tensor, strength: Tensor | float = 1.0, blur_reach: Tensor | float = 0.0
+    ) -> Tensor:
+        """``products`` in units of the data's noise.
 
         Args:
-            noise_power: Variance of the noise of data of weight 1, () or (U,).
-            strength: Factor on the precision.
-            blur_reach: Of ``RowKernels``.
+            noise_power: (N, 1) variance of the noise of data of weight 1.
+            strength: Factor on the precision, a number or (N, 1).
+            blur_reach: Largest distance along the row in px during an exposure from its middle, a number or (N, 1).
         """
-        a = self.filter()
-        ratio = (noise_power + self.interpolation_power) * strength / self.innovation()
-        # noise power over variance of e. Above 1e3, the systems lose digits in single precision without a gain; below
-        # 1e-4, rows displaced by half a pixel lose them. Long exposures observe every place from many rows, and allow
-        # a bound lower by the length of the blur in px.
-        ratio = ratio.clamp(1e-4 / (1 + blur_reach), 1e3)
-        count = len(a)
-        products = a.new_zeros(count, count, a.shape[1])
-        for d in range(count):
-            products[d, : count - d] = a[: count - d] * a[d:] * ratio
-        return products
+        precision: Tensor = self.products() * bounded_ratio(self.ratio(noise_power) * strength, blur_reach)
+        return precision
 
 
-def _levinson(moments: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor], Tensor]:
-    """Levinson recursion for p + 1 autocovariances (U,): partial correlations, filter, variance of the innovation."""
-    variance = moments[0].clamp(min=torch.finfo(moments[0].dtype).tiny)
-    filter_, reflections = [torch.ones_like(variance)], []
+def bounded_ratio(ratio: "Table", blur_reach: "Table") -> "Table":
+    """A ratio of noise power and variance of e for which systems can be solved in single precision.
+
+    Above 1e3, the systems lose digits without a gain; below 1e-4, rows displaced by half a pixel lose them. Long
+    exposures observe every place from many rows, and allow a bound lower by the length of the blur in px.
+    """
+    lowest = 1e-4 / (1 + blur_reach)
+    return ratio.clip(lowest, None).clip(None, 1e3)
+
+
+Table = Any  # a tensor, or an array of NumPy: operators that both have
+
+
+def _levinson(moments: Sequence[Table]) -> tuple[list[Table], list[Table], Table]:
+    """Levinson recursion for p + 1 autocovariances (N, U): partial correlations, filter, variance of the innovation."""
+    variance = moments[0].clip(_TINY, None)
+    filter_, reflections = [variance / variance], []
     for lag in range(1, len(moments)):
         error = moments[lag]
         for k in range(1, lag):
-            error = torch.addcmul(error, filter_[k], moments[lag - k])
-        reflection = (error / variance).clamp(-0.9995, 0.9995)
-        inner = [torch.addcmul(filter_[k], reflection, filter_[lag - k], value=-1) for k in range(1, lag)]
+            error = error + filter_[k] * moments[lag - k]
+        reflection = (error / variance).clip(-0.9995, 0.9995)
+        inner = [filter_[k] - reflection * filter_[lag - k] for k in range(1, lag)]
         filter_ = [filter_[0], *inner, -reflection]
-        variance = torch.addcmul(variance, variance * reflection, reflection, value=-1)
+        variance = variance - variance * reflection * reflection
         reflections.append(reflection)
     return reflections, filter_, variance
 
 
 def _pooled(power: Tensor) -> Tensor:
-    """Means over 5 x 5 neighbouring frequencies of (U, V)."""
-    u, v = (torch.arange(-2, extent + 2, device=power.device) for extent in power.shape)
-    around = power[u.clamp(0, len(power) - 1)][:, v % power.shape[1]]
-    return torch.nn.functional.avg_pool2d(around[None, None], 5, 1)[0, 0]
+    """Means over 5 x 5 neighbouring frequencies of (N, U, V)."""
+    u, v = (torch.arange(-2, extent + 2, device=power.device) for extent in power.shape[1:])
+    around = power[:, u.clamp(0, power.shape[1] - 1)][..., v % power.shape[2]]
+    return torch.nn.functional.avg_pool2d(around[:, None], 5, 1)[:, 0]
 
 
-def _pooling(u: Tensor) -> Tensor:
-    """Matrix (U, U) of a weighted mean over three neighbouring frequencies (U,), mirrored at both ends."""
-    near = torch.arange(len(u), device=u.device)[:, None] + torch.arange(-1, 2, device=u.device)
-    taps = u.new_tensor([0.25, 0.5, 0.25]).expand(len(u), -1)
-    return torch.zeros_like(u).expand(len(u), -1).scatter_add(1, mirrored(near, len(u)), taps)
+def _pooling(count: int) -> NDArray[np.float64]:
+    """Matrix (U, U) of a weighted mean over three neighbouring frequencies, mirrored at both ends."""
+    matrix = np.zeros((count, count))
+    for step, weight in ((-1, 0.25), (0, 0.5), (1, 0.25)):
+        near = np.abs(np.arange(count) + step)
+        np.add.at(matrix, (np.arange(count), np.minimum(near, 2 * (count - 1) - near)), weight)
+    return matrix
 
 
-def autoregressive_prior(
-    observed: Tensor,
-    transfer: Tensor,
-    aliases: Tensor,
-    noise_power: Tensor,
-    order: int = ORDER,
-    iterations: int = 20,
-) -> RowPrior:
+def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, noise_power: Tensor) -> RowPrior:
     """Fit the prior to the power spectrum of blurred, noisy frames by expectation maximisation.
 
     Each step computes the expected power spectrum of the scene for the current model, the sum of the squared Wiener
     estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations).
 
     Args:
-        observed: (U, V) power of the frames, horizontal frequencies by vertical ones.
-        transfer: (U, V) squared transfer function of the blur.
-        aliases: (T, U, V) power of the interpolation error of the kernel between rows, through the blur of each frame,
-            for a wave of power 1.
-        noise_power: Power of the noise in each value, shape (U, V) or ().
-        order: Rows that a row is predicted from.
-        iterations: Steps of expectation maximisation.
+        observed: (N, U, V) power of the frames, horizontal frequencies by vertical ones.
+        transfer: (N, U, V) squared transfer function of the blur.
+        aliases: (N, T, U, V) power of the interpolation error of the kernel between rows, through the blur of each
+            frame, for a wave of power 1.
+        noise_power: (N, U, V) power of the noise in each value.
 
     Returns:
-        The prior.
+        The priors.
     """
-    # cosines of the lags of autocovariances, and of the products a_k a_(k + d) of a filter
-    v = torch.fft.fftfreq(observed.shape[-1], dtype=observed.dtype, device=observed.device)
-    lags = torch.arange(order + 1, dtype=observed.dtype, device=observed.device)
-    angles = 2 * torch.pi * v[:, None] * lags
-    cosine = torch.cos(angles)
-    both = torch.where(lags > 0, 2 * cosine, cosine).T
-
-    def dot(first: Sequence[Tensor], second: Sequence[Tensor]) -> Tensor:
-        total = first[0] * second[0]
-        for one, other in zip(first[1:], second[1:], strict=True):
-            total = torch.addcmul(total, one, other)
-        return total
-
-    through, pooling = transfer * observed, _pooling(observed[:, 0]) / len(v)
     excess = observed - noise_power
     # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
     # pooled over neighbouring frequencies, as that of a single one depends on chance
     level = 0.5 * noise_power
     excess = torch.where(excess < level, _pooled(excess).minimum(level), excess)
     scene = torch.maximum(excess, 0.002 * noise_power) * transfer / (transfer.square() + 1e-2)
+    # cosines of the lags of autocovariances (V, p + 1), and the pooling of the lags over neighbouring frequencies
+    _, U, V = observed.shape
+    cosine = np.cos(2 * np.pi * np.fft.fftfreq(V)[:, None] * np.arange(ORDER + 1))
+    pooling = _pooling(U) / V
+    tables = (scene, observed, transfer, noise_power)
+    if torch.is_grad_enabled() and any(table.requires_grad for table in tables):
+        constants = [torch.as_tensor(table, device=observed.device) for table in (cosine, pooling)]
+        power, *reflections, scene = _expectation_maximisation(tables, constants[0], constants[1])
+    else:  # small tables, which take a fifth of the time on the CPU without the calls of PyTorch
+        arrays = torch.stack([table.detach() for table in tables]).cpu().numpy()
+        *fitted, expected = _expectation_maximisation(arrays, cosine, pooling)
+        power, *reflections = torch.from_numpy(np.stack(fitted)).to(observed.device)
+        scene = torch.from_numpy(expected).to(observed.device)
+    interpolation = (scene[:, None] * aliases).mean(-1).clamp(min=_TINY)
+    return RowPrior(power.clamp(min=_TINY), torch.stack(reflections), interpolation)
+
+
+def _expectation_maximisation(tables: Table, cosine: Table, pooling: Table, iterations: int = 20) -> tuple[Table, ...]:
+    """Power (N, U), partial correlations and expected spectrum (N, U, V) of the scene; tensors or arrays.
+
+    ``tables`` (N, U, V) are a first expected spectrum, and ``observed``, ``transfer`` and ``noise_power`` as in
+    ``autoregressive_prior``.
+    """
+    scene, observed, transfer, noise_power = tables
+    through = transfer * observed
     for _ in range(iterations):
         # the model of the expected spectrum of the scene
-        moments = (pooling @ (scene @ cosine)).unbind(-1)
+        lags = pooling @ (scene @ cosine)
+        moments = [lags[..., lag] for lag in range(ORDER + 1)]
         reflections, filter_, innovation = _levinson(moments)
-        products = torch.stack([dot(filter_[: order + 1 - d], filter_[d:]) for d in range(order + 1)], -1)
         # squared modulus of the filter, whose terms are of order 1: at least their rounding error
-        penalty = (products @ both).clamp(min=1e-14) * (noise_power / innovation[:, None])
+        modulus: Table = 0.0
+        for lag in range(ORDER + 1):
+            product = sum(first * second for first, second in zip(filter_, filter_[lag:], strict=False))
+            modulus = modulus + ((2.0 if lag else 1.0) * product)[..., None] * cosine[:, lag]
+        penalty = modulus.clip(1e-14, None) * (noise_power / innovation[..., None])
         # the expected spectrum for this model: variance and square of the Wiener estimate
-        gain = (penalty + transfer).reciprocal()
-        scene = torch.addcmul(gain * noise_power, gain.square(), through)
-    tiny = torch.finfo(scene.dtype).tiny
-    return RowPrior(moments[0].clamp(min=tiny), torch.stack(reflections), (scene * aliases).mean(-1).clamp(min=tiny))
+        gain = 1.0 / (penalty + transfer)
+        scene = gain * noise_power + gain * gain * through
+    return (moments[0], *reflections, scene)
 
 
 def brightness(frames: Tensor) -> Tensor:
@@ -204,18 +220,32 @@ def brightness(frames: Tensor) -> Tensor:
     return frames[..., ::8, :].mean((-2, -1))
 
 
+def spread_starts(extent: int, size: int, count: int) -> NDArray[np.int64]:
+    """First rows or columns of ``count`` pieces of ``size`` px, evenly spread over ``extent`` px."""
+    return np.rint(np.linspace(0, extent - size, count)).astype(np.int64)
+
+
+def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64], size: tuple[int, int]) -> Tensor:
+    """The pieces (..., n, m, *size) of images (..., H, W) from n rows and m columns on."""
+    rows, columns = (
+        torch.as_tensor(starts[:, None] + np.arange(extent), device=images.device)
+        for starts, extent in zip((tops, lefts), size, strict=True)
+    )
+    return images[..., rows[:, None, :, None], columns[None, :, None, :]]
+
+
 @dataclass(frozen=True, eq=False)
 class ObservedSpectrum:
-    """Power spectra of pieces of the frames of a stack, whose rows were moved back by their displacement.
+    """Power spectra of pieces of the frames of N stacks, whose rows were moved back by their displacement.
 
     Attributes:
         u: (U,) horizontal frequencies, cycles per px.
         v: (V,) vertical frequencies.
-        power: (T, pieces, U, V) power per pixel: white noise of variance 1 has power 1.
-        whole: (U, V) of whole rows with their boundary extension.
-        displacement: (T, pieces, N, 2) px during the exposure of the middle row of each piece.
-        node_weights: (N,).
-        levels: (T,) standard deviation of the noise of each frame.
+        power: (N, T, pieces, U, V) power per pixel: white noise of variance 1 has power 1.
+        whole: (N, U, V) of whole rows with their boundary extension.
+        displacement: (N, T, pieces, nodes, 2) px during the exposure of the middle row of each piece.
+        node_weights: (nodes,).
+        levels: (N, T) standard deviation of the noise of each frame.
     """
 
     u: Tensor
@@ -226,42 +256,50 @@ class ObservedSpectrum:
     node_weights: Tensor
     levels: Tensor
 
-    def blur(self, alias_u: int = 0, alias_v: int = 0) -> Tensor:
-        """Squared transfer functions (T, pieces, U, V) of the exposures at ``(u - alias_u, v - alias_v)``."""
-        along = waves(self.displacement[..., 0], self.u - alias_u) * self.node_weights[:, None]
-        return squared_modulus(along.transpose(-2, -1) @ waves(self.displacement[..., 1], self.v - alias_v))
+    def blur(self, u: Tensor, v: Tensor) -> Tensor:
+        """Squared transfer functions (N, T, pieces, U, V) of the exposures at frequencies u and v."""
+        along = waves(self.displacement[..., 0], u) * self.node_weights[:, None]
+        return squared_modulus(along.transpose(-2, -1) @ waves(self.displacement[..., 1], v))
 
     def weighted(self, transfer: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Observed power (U, V), weights (T, pieces, U, V) of sum 1, and power (U, V) of the noise.
+        """Observed power (N, U, V), weights (N, T, pieces, U, V) of sum 1, and power (N, U, V) of the noise.
 
         Args:
             transfer: Squared transfer function of each piece; pieces with a stronger one and less noise weigh more.
         """
-        weight = transfer / self.levels.to(torch.float64).square()[:, None, None, None]
-        total = weight.sum((0, 1)).clamp(min=torch.finfo(torch.float32).tiny)
+        weight = transfer / self.levels.to(torch.float64).square()[..., None, None, None]
+        total = weight.sum((1, 2)).clamp(min=_TINY)
         # power of whole rows above 25 times that of the pieces is due to the boundary extension and not to chance:
         # without it, regular patterns are lost near the ends of the rows
-        observed = torch.maximum((weight * self.power).sum((0, 1)) / total, self.whole / 25.0)
-        return observed, weight / total, transfer.sum((0, 1)) / total
+        observed = torch.maximum((weight * self.power).sum((1, 2)) / total, self.whole / 25.0)
+        return observed, weight / total[:, None, None], transfer.sum((1, 2)) / total
 
 
-def observed_spectrum(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> ObservedSpectrum:
-    """Power spectra of pieces of 64 x 256 px of the frames of a stack.
+_PIECE = (64, 256)  # px, rows and columns of the pieces
+_PIECES = 128  # of a frame, at most
+_VALUES = {"cpu": 1 << 21, "cuda": 1 << 27}  # of the pieces that are transformed at a time; bounds the memory
+
+
+def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) -> ObservedSpectrum:
+    """Power spectra of pieces of 64 x 256 px of the frames of N stacks.
 
     Rows are moved back by their displacement, so that neighbours correlate as in the scene.
 
     Args:
-        frames: (T, C, H, W) in row order.
-        motion: Motion of the batch of stacks.
-        stack: Index of the stack in the batch.
-        levels: (T,) standard deviation of the noise of each frame.
+        frames: (N, T, C, H, W) in row order.
+        motion: Motion of the frames.
+        levels: (N, T) standard deviation of the noise of each frame.
         length: Length of the Fourier transform along rows.
     """
-    # places of the pieces, their taper and frequencies
-    size = [min(piece, whole) for piece, whole in zip((64, 256), frames.shape[-2:], strict=True)]
-    starts = _spread_pieces(frames.shape[-2:], size)  # rows, columns
-    tops, lefts = (begin.tolist() for begin in starts)
-    rows = (starts[0][:, None] + torch.arange(size[0], device="cpu")).to(frames.device)
+    # places of the pieces, which overlap by half if possible, their tapers and frequencies
+    shape = frames.shape[-2:]
+    size = (min(_PIECE[0], shape[0]), min(_PIECE[1], shape[1]))
+    counts = [-(-2 * (whole - extent) // extent) + 1 for whole, extent in zip(shape, size, strict=True)]
+    excess = max(1.0, math.sqrt(counts[0] * counts[1] / _PIECES))
+    tops, lefts = (
+        spread_starts(whole, extent, max(1, round(count / excess)))
+        for whole, extent, count in zip(shape, size, counts, strict=True)
+    )
     tapers = [
         torch.hann_window(extent + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1] for extent in size
     ]
@@ -270,48 +308,45 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, stack: int, levels: T
     v = torch.fft.fftfreq(size[0], dtype=torch.float64, device=frames.device)
 
     # phases that move rows back by their displacement, and the taper across rows
-    vibration = motion.vibration[stack]
-    times = motion.frame_starts[:, None] + rows.flatten().to(torch.float64) * motion.timing.row_time
-    mean = vibration.mean_displacement(times, motion.timing.exposure_time)[..., 0]
-    back = waves(mean, -u).to(frames.dtype.to_complex()).unflatten(1, rows.shape)  # (T, pieces, rows, U)
-    back = back * tapers[0][:, None]
-    # power of the pieces, mean over channels
+    displacement, node_weights = motion.exposures
+    rows = torch.as_tensor(tops[:, None] + np.arange(size[0]), device=frames.device)
+    mean = (displacement[:, :, rows, :, 0] * node_weights).sum(-1)
+    back = waves(mean, -u).to(frames.dtype.to_complex()) * tapers[0][:, None]  # (N, T, n, rows, U)
+    # power of the pieces, mean over channels and columns of pieces, some rows of pieces at a time
     bright = brightness(frames)[..., None, None, None]
-    step = 4 if frames.device.type == "cpu" else len(tops)  # rows of pieces at a time, which stay in the cache
+    values = frames[..., 0, 0].numel() * len(lefts) * size[0] * size[1]
+    step = max(1, _VALUES.get(frames.device.type, 1 << 21) // values)
     powers = []
     for chosen in runs(len(tops), step):
-        strips = [frames[..., top : top + size[0], :] for top in tops[chosen]]
-        pieces = torch.stack([strip[..., left : left + size[1]] for strip in strips for left in lefts], dim=2)
-        pieces = pieces.unflatten(2, (-1, len(lefts)))  # (T, C, n, n, rows, columns)
-        spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, None, chosen, None])
-        powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((1, 3)).transpose(-2, -1))
-    power = torch.cat(powers, dim=1).to(torch.float64)  # (T, pieces, U, V)
+        pieces = cut_pieces(frames, tops[chosen], lefts, size)  # (N, T, C, n, m, rows, columns)
+        spectra = torch.fft.rfft(pieces.sub_(bright[..., None]).mul_(tapers[1])).mul_(back[:, :, None, chosen, None])
+        powers.append(squared_modulus(torch.fft.fft(spectra, dim=-2)).mean((2, 4)).transpose(-2, -1))
+    power = torch.cat(powers, dim=2).to(torch.float64)
     # power of a few strips of whole rows with their boundary extension
-    few = torch.linspace(0, len(tops) - 1, min(4, len(tops)), device=rows.device, dtype=torch.float32).round().long()
-    strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (T, C, n, rows, W)
+    few = np.rint(np.linspace(0, len(tops) - 1, min(4, len(tops)))).astype(np.int64)
+    strips_of_rows = (frames[..., rows[few], :] - bright) * tapers[0][:, None]  # (N, T, C, n, rows, W)
     whole = _power_of_rows(strips_of_rows, length, len(u)) / length
-
     # blur of the middle row of each piece
-    displacement, weights = exposure_trajectory(
-        vibration, times.unflatten(1, rows.shape)[..., size[0] // 2], motion.timing, "gauss"
-    )
-    return ObservedSpectrum(u, v, power, whole, displacement, weights, levels)
+    return ObservedSpectrum(u, v, power, whole, displacement[:, :, rows[:, size[0] // 2]], node_weights, levels)
 
 
-def fit_prior(frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int) -> RowPrior:
-    """Fit the prior to the frames of a stack: to their ``observed_spectrum``, whose arguments it has.
+def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) -> RowPrior:
+    """Fit the priors to the frames of N stacks: to their ``observed_spectrum``, whose arguments it has.
 
     Returns:
-        The prior for transforms of that length.
+        The priors for transforms of that length.
     """
-    spectrum = observed_spectrum(frames, motion, stack, levels, length)
-    v = spectrum.v
-    transfer = smeared(spectrum.blur() * kernel_spectrum(v).square())
-    aliases = torch.zeros_like(transfer[:, 0])
-    for cycle in (-1, 1):  # all others together have less than 4 % of their power
-        aliases = aliases + spectrum.blur(alias_v=-cycle).mean(1) * interpolation_error(v, [cycle])
+    spectrum = observed_spectrum(frames, motion, levels, length)
+    # blur at the vertical frequencies, and at those of the two strongest aliases across rows: all others together have
+    # less than 4 % of their power
+    cycles = (-1, 1)
+    v = torch.cat([spectrum.v, *(spectrum.v + cycle for cycle in cycles)])
+    blur = spectrum.blur(spectrum.u, v).unflatten(-1, (3, -1))
+    transfer = smeared(blur[..., 0, :] * kernel_spectrum(spectrum.v).square())
+    error = torch.stack([interpolation_error(spectrum.v, [cycle]) for cycle in cycles])
+    aliases = (blur[..., 1:, :].mean(2) * error).sum(-2)
     observed, weight, noise = spectrum.weighted(transfer)
-    passed = (weight * transfer).sum((0, 1))
+    passed = (weight * transfer).sum((1, 2))
     prior = autoregressive_prior(observed, passed, aliases, noise)
     return prior.resampled(length // 2 + 1)
 
@@ -326,28 +361,17 @@ def smeared(transfer: Tensor) -> Tensor:
 
 
 def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
-    """Power (U, V) of whole rows with their boundary extension, pooled to U frequencies along them.
+    """Power (N, U, V) of whole rows with their boundary extension, pooled to U frequencies along them.
 
     Rows are not moved back by their displacement: it does not matter at the low frequencies of the extension.
 
     Args:
-        strips: (T, C, n, R, W), tapered across their rows.
+        strips: (N, T, C, n, R, W), tapered across their rows.
         length: Period of the rows.
         count: U.
     """
-    power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2))
-    return torch.nn.functional.adaptive_avg_pool1d(power.mean((0, 1, 2)), count).T.to(torch.float64)
-
-
-def _spread_pieces(shape: torch.Size, size: list[int]) -> list[Tensor]:
-    """First rows and columns of at most 128 pieces spread evenly over the frame, overlapping by half if possible."""
-    counts = [-(-2 * (whole - extent) // extent) + 1 for whole, extent in zip(shape, size, strict=True)]
-    excess = max(1.0, math.sqrt(counts[0] * counts[1] / 128))
-    counts = [max(1, round(count / excess)) for count in counts]
-    return [
-        torch.linspace(0, whole - extent, count, dtype=torch.float32, device="cpu").round().to(torch.int64)
-        for whole, extent, count in zip(shape, size, counts, strict=True)
-    ]
+    power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2)).mean((1, 2, 3))
+    return torch.nn.functional.adaptive_avg_pool1d(power, count).mT.to(torch.float64)
 
 
 # Degree 6 instead of 4: 0.6 to 1.0 dB for eight frames of scenes with little detail beyond half a cycle per px, -0.4 dB
@@ -396,11 +420,7 @@ class PolynomialPrior:
     coefficients: Tensor
     period: int
 
-    def of(self, members: list[int]) -> "PolynomialPrior":
-        """The prior for restoring a scene from some of the frames."""
-        return self
-
-    def precision(self, noise_power: Tensor, *, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
+    def precision(self, noise_power: Tensor, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
         """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
 
         Args:
@@ -423,25 +443,26 @@ class PolynomialPrior:
 
 @torch.no_grad()
 def fit_polynomial_prior(
-    frames: Tensor, motion: FrameMotion, stack: int, levels: Tensor, length: int, iterations: int = 60
+    frames: Tensor, motion: FrameMotion, levels: Tensor, length: int, iterations: int = 60
 ) -> PolynomialPrior:
-    """Fit the prior to the frames of a stack, whose spectrum is blurred and aliased.
+    """Fit the prior to the frames of one stack, whose spectrum is blurred and aliased.
 
     The expected power of a frame at (u, v) is that of the noise plus that of the scene, through the blur of the
     exposure, at (u - a, v - b) for all aliases within 1 cycle per px. Observed powers are distributed like chi-squared
     around it (Whittle likelihood): scoring for the logarithms of a_mn.
 
     Args:
-        frames: (T, C, H, W) in row order.
-        motion: Motion of the batch of stacks.
-        stack: Index of the stack in the batch.
-        levels: (T,) standard deviation of the noise of each frame.
+        frames: (1, T, C, H, W) in row order.
+        motion: Motion of the frames.
+        levels: (1, T) standard deviation of the noise of each frame.
         length: Length of the Fourier transform along rows.
         iterations: Largest number of steps.
     """
-    spectrum = observed_spectrum(frames, motion, stack, levels, length)
+    spectrum = observed_spectrum(frames, motion, levels, length)
     u, v = spectrum.u[:, None], spectrum.v
-    observed, weight, noise = spectrum.weighted(smeared(spectrum.blur()))
+    observed, weight, noise = (
+        values[0] for values in spectrum.weighted(smeared(spectrum.blur(spectrum.u, spectrum.v)))
+    )
     # transfer function and powers of the Laplacians at each alias
     gains, features = [], []
     rising, order = _rising_powers(frames.device), torch.arange(_DEGREE + 1, device=frames.device)
@@ -449,7 +470,8 @@ def fit_polynomial_prior(
         for alias_v in (-1, 0, 1):
             beyond = (v - alias_v).abs() > 1
             along, across = u - alias_u, (v - alias_v).clamp(-1, 1)
-            blur = (weight * smeared(spectrum.blur(alias_u, alias_v))).sum((0, 1)).masked_fill(beyond, 0.0)
+            blur = smeared(spectrum.blur(spectrum.u - alias_u, spectrum.v - alias_v))[0]
+            blur = (weight * blur).sum((0, 1)).masked_fill(beyond, 0.0)
             gains.append(blur * _pixel(along) * spline_transfer(across).square())
             rows = _laplacian(across)[:, None] ** order @ rising.T
             features.append(torch.stack([rows[:, m] * _laplacian(along) ** n for m, n in _POWERS], dim=-1))

@@ -2,10 +2,15 @@
 
 A restored frame, blurred by the motion of the next frame, should equal that next frame. The residual displacement
 between the two and the estimated gain in PSNR determine the outcome of every pair of frames, see ``outcome_of_pair``.
+All stacks of a batch are judged together.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -14,12 +19,13 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.frames.orientation import reasons_from_row_order
-from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -29,7 +35,16 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restoration_warning import RestorationWarning
-from rsvib_torch.restoration.verdict.pairs import FramePair, equally_bright, misfit, pairs_to_judge, shared_part
+from rsvib_torch.restoration.verdict.pairs import (
+    FramePairs,
+    Overlap,
+    TooLittleInCommonError,
+    equally_bright,
+    misfit,
+    overlaps,
+    pairs_to_judge,
+    shared_part,
+)
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 __all__ = [
@@ -38,6 +53,7 @@ __all__ = [
     "RestorationWarning",
     "judge_prepared",
     "judge_restoration",
+    "judge_stacks",
     "outcome_of_pair",
 ]
 
@@ -49,8 +65,13 @@ _PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a 
 _WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
 _GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
 
+# fields of a verdict that have one value, and those that have one for each axis
+_LEVELS = ("before", "after", "noise", "chi_square", "predicted_gain")
+_DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
+
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
+_PIXELS = {"cpu": 1 << 22, "cuda": 1 << 26}  # judged at a time; the images and spectra of 2^22 px need 0.5 GB
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -150,15 +171,6 @@ class RestorationVerdict(
         }
         return sentences[self.overall]
 
-    @checks_arguments
-    def in_image_axes(self, timing: SensorTiming) -> "RestorationVerdict":
-        """The verdict on frames in row order, with axes named as in the image."""
-        if timing.scan_axis == -2:
-            return self
-        swapped = {name: getattr(self, name).flip(-1) for name in ("misfit_before", "misfit_after", "resolution")}
-        findings = tuple(reasons_from_row_order(of_pair, timing) for of_pair in self.findings)
-        return replace(self, findings=findings, **swapped)
-
 
 def outcome_of_pair(
     before: list[float],
@@ -195,11 +207,12 @@ def outcome_of_pair(
         if not moves[axis]:
             motion_is_complete &= size <= least
             continue
+        negligible = max(least, crosstalk * before[1 - axis])
         visible = max(size, offset[axis])
         details = {"before": size}
         if math.isinf(least):
             outcomes.append(("unknown", Reason("no_contrast", name)))
-        elif rest <= max(least, crosstalk * before[1 - axis]):
+        elif rest <= negligible:
             is_visible = visible > least
             outcomes.append(
                 ("helps", None) if is_visible else ("unknown", Reason("displaced_alike", name, visible, least))
@@ -207,10 +220,11 @@ def outcome_of_pair(
         elif rest > _WORSE_RESIDUAL * size:
             # less noise may outweigh a motion that was not undone, but not a motion that does not exist
             outweighed = size > least and gain > _GAIN_ERROR and not one_image
-            remains = Reason("motion_remains", name, rest, _WORSE_RESIDUAL * size, details)
+            remains = Reason("motion_remains", name, rest, max(_WORSE_RESIDUAL * size, negligible), details)
             outcomes.append(("partly" if outweighed else "worse", remains))
         elif rest > _PARTLY_RESIDUAL * size:
-            outcomes.append(("partly", Reason("motion_remains", name, rest, _PARTLY_RESIDUAL * size, details)))
+            remains = Reason("motion_remains", name, rest, max(_PARTLY_RESIDUAL * size, negligible), details)
+            outcomes.append(("partly", remains))
         else:
             outcomes.append(("helps", None))
     if not outcomes:
@@ -225,48 +239,82 @@ def outcome_of_pair(
 
 
 def _mean_square(difference: Tensor) -> Tensor:
-    return difference.square().mean(dtype=torch.float64)
+    """Mean square (B,) of images (B, C, h, w), float64."""
+    return difference.square().mean((1, 2, 3), dtype=torch.float64)
 
 
-def _judge_pair(pair: FramePair, moves: list[bool], shared: int, *, max_missing: float = 0.5) -> RestorationVerdict:
-    """Verdict on one pair, its values without a leading axis; not judged if more than ``max_missing`` is missing."""
-    noise = estimate_noise(torch.stack([pair.earlier, pair.later]), pair.ignore).square().nanmean().double()
+@dataclass(frozen=True, eq=False)
+class _PairVerdicts:
+    """Verdicts on one pair of frames of each of B stacks, in row order; the fields of ``RestorationVerdict``.
+
+    Attributes:
+        levels: (5, B) before, after, noise, chi_square, predicted_gain.
+        displacements: (3, B, 2) misfit_before, misfit_after, resolution.
+        outcomes: Outcome of each stack.
+        reasons: Reasons for each outcome.
+    """
+
+    levels: Tensor
+    displacements: Tensor
+    outcomes: list[Outcome]
+    reasons: list[tuple[Reason, ...]]
+
+
+def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_missing: float = 0.5) -> _PairVerdicts:
+    """Verdict on one pair of each stack; not judged if more than ``max_missing`` is missing.
+
+    Args:
+        pair: The pairs of B stacks.
+        moves: For each stack, the axes with motion in the vibration.
+        shared: Frames from which one image is restored.
+        max_missing: Largest share of missing pixels.
+    """
+    # Noise of the raw frames; frames that differ in brightness are made equal.
+    raw = torch.stack([pair.earlier, pair.later], 1)
+    noise = estimate_noise(raw, pair.ignore).square().flatten(1).nanmean(1).double()
     noise = noise.nan_to_num(nan=0.0).clamp(min=_MIN_NOISE**2)
     pair = equally_bright(pair, noise)
-    # an image restored from both frames lies between them, so that its distance from either is the smaller
+
+    # Displacement between the raw frames, and between the later one and its prediction. An image restored from both
+    # frames lies between them, so that its distance from either is the smaller.
     widening = math.sqrt(2.0 * shared / (shared - 1.0)) if shared > 1 else 1.0
-    misfit_before, coarse = misfit(pair.earlier, pair.later)
-    misfit_after, fine = (widening * value for value in misfit(pair.predicted, pair.later))
-    resolution = torch.minimum(coarse, fine)
+    sizes, resolutions = misfit(torch.stack([pair.earlier, pair.predicted]), torch.stack([pair.later, pair.later]))
+    misfit_before, misfit_after = sizes[0], widening * sizes[1]
+    resolution = torch.minimum(resolutions[0], widening * resolutions[1])
+
+    # Error of the restored frames, from their difference and that of the later frame from its prediction.
     unexplained = _mean_square(pair.later - pair.predicted)
     error = (unexplained - noise).clamp(min=0.0)
-    after = error.new_tensor(math.nan)
+    after = torch.full_like(error, math.nan)
     if pair.restored_later is not None:
         after = _mean_square(pair.restored_later - pair.restored)
     error = torch.maximum(error, 0.5 * after) if shared == 1 else error + noise / shared
-    # change of the scene by the motion; the noise of two restored frames is independent and vanishes in the product
-    raw_error = ((pair.predicted - pair.restored) * pair.changed_later).mean(dtype=torch.float64).clamp(min=0.0) + noise
-    gain = 10.0 * torch.log10(raw_error / error.clamp(min=_MIN_NOISE**2))
-    misfits = (misfit_before.tolist(), misfit_after.tolist(), resolution.tolist())
+
+    # Error of the raw frames: the change of the scene by the motion, and noise. The noise of two restored frames is
+    # independent and vanishes in the product.
+    change = ((pair.predicted - pair.restored) * pair.changed_later).mean((1, 2, 3), dtype=torch.float64)
+    gain = 10.0 * torch.log10((change.clamp(min=0.0) + noise) / error.clamp(min=_MIN_NOISE**2))
+
+    # Outcome of each pair, from figures that are transferred together.
+    missing = torch.zeros_like(gain) if pair.ignore is None else pair.ignore.any(1).double().mean((1, 2, 3))
+    displacements = torch.stack([misfit_before, misfit_after, resolution])
+    figures = torch.cat([*displacements, pair.offset, gain[:, None], missing[:, None]], 1)
+    outcomes: list[Outcome] = []
+    reasons: list[tuple[Reason, ...]] = []
+    contradicted = []
     one_image = pair.restored_later is None
-    outcome, reasons = outcome_of_pair(*misfits, moves, pair.offset.tolist(), float(gain), one_image=one_image)
-    if (outcome == "worse" and gain > 0) or (outcome in ("helps", "partly") and gain < 0):
-        gain = torch.full_like(gain, math.nan)
-    missing = 0.0 if pair.ignore is None else float(pair.ignore.any(0).double().mean())
-    if missing > max_missing:
-        outcome, reasons = "unknown", (Reason("pixels_missing", None, missing, max_missing),)
-    return RestorationVerdict(
-        before=_mean_square(pair.later - pair.earlier).sqrt()[None],
-        after=after.sqrt()[None],
-        misfit_before=misfit_before[None],
-        misfit_after=misfit_after[None],
-        resolution=resolution[None],
-        noise=noise.sqrt()[None],
-        chi_square=(unexplained / noise)[None],
-        predicted_gain=gain[None],
-        outcome=(outcome,),
-        findings=(reasons,),
-    )
+    for values, moving in zip(figures.tolist(), moves, strict=True):
+        *axes, level, share = values
+        outcome, why = outcome_of_pair(axes[:2], axes[2:4], axes[4:6], moving, axes[6:], level, one_image=one_image)
+        contradicted.append((outcome == "worse" and level > 0) or (outcome in ("helps", "partly") and level < 0))
+        if share > max_missing:
+            outcome, why = "unknown", (Reason("pixels_missing", None, share, max_missing),)
+        outcomes.append(outcome)
+        reasons.append(why)
+    gain = gain.masked_fill(torch.tensor(contradicted, device=gain.device), math.nan)
+    before = _mean_square(pair.later - pair.earlier)
+    levels = torch.stack([before.sqrt(), after.sqrt(), noise.sqrt(), unexplained / noise, gain])
+    return _PairVerdicts(levels, displacements, outcomes, reasons)
 
 
 @checks_arguments
@@ -366,27 +414,29 @@ def _at_pixels(restored: Tensor, frames: PreparedFrames, count: int) -> Tensor:
 def _judged_strip(
     raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: Motion, timing: RowTiming
 ) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
-    """The part of the frames of a stack by which their restoration is judged, and its motion.
+    """The part of the frames by which their restoration is judged, and its motion.
 
     With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
-    Arguments and results are as in ``shared_part``, except for the motion (1) in row order and the timing.
+    Arguments and results are as in ``shared_part``, except for the motion (B) in row order and the timing.
     """
-    count, (height, width) = len(raw), raw.shape[-2:]
+    count, (height, width) = raw.shape[1], raw.shape[-2:]
     if motion.same_for_all_columns:
         of_frames = frame_motion(motion, timing, count, height)
-        of_frames.check_fits(height, width)
+        of_frames.check_fits(width)
         return raw, restored, ignore, of_frames
     strip = min(_STRIP, width // 2)
     halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
-    both = torch.cat([raw[0][..., half] for half in halves], -1)
-    half = halves[0 if detailed_columns(both, strip).start < strip // 2 else 1]
-    column = torch.tensor([half.start + 0.5 * (strip - 1) - 0.5 * (width - 1)], dtype=torch.float64)
-    of_strip = ColumnMotion.of_columns(motion, column, timing, count, height)
-    ignore = None if ignore is None else ignore[..., half]
-    return raw[..., half], restored[..., half], ignore, frame_motion(of_strip, timing, count, height)
+    both = torch.cat([raw[..., half] for half in halves], -1)
+    parts = [halves[0 if part.start < strip // 2 else 1] for part in detailed_parts(both, strip)]
+    middles = [part.start + 0.5 * (strip - 1) - 0.5 * (width - 1) for part in parts]
+    columns = torch.tensor(middles, dtype=torch.float64, device=raw.device)
+    starts = tuple(timing.frame_starts(count).tolist())
+    of_strips = ColumnMotion(motion, columns, starts, timing.row_time, height)
+    raw, restored = cut_columns(raw, parts), cut_columns(restored, parts)
+    ignore = None if ignore is None else cut_columns(ignore, parts)
+    return raw, restored, ignore, frame_motion(of_strips, timing, count, height)
 
 
-@torch.no_grad()
 def judge_prepared(
     frames: PreparedFrames,
     restored: Tensor,
@@ -394,47 +444,158 @@ def judge_prepared(
     *,
     joint: bool | int = False,
     most_pairs: int | None = None,
-    columns: int | None = None,
-    stack: int = 0,
 ) -> RestorationVerdict:
-    """``judge_restoration`` of one stack of frames that are already prepared.
-
-    Args:
-        frames: The raw frames.
-        restored: (B, T, C, H, W), or (B, 1, C, H, W), in row order.
-        vibration: The vibration that was undone, in image axes, batch shape () or (B,).
-        joint: As in ``judge_restoration``.
-        most_pairs: As in ``judge_restoration``.
-        columns: Judge on so many columns only, those with the most detail; None for all.
-        stack: Index of the stack.
-
-    Returns:
-        The verdict in image axes.
+    """``judge_restoration`` of one stack of frames that are already prepared; arguments as in ``judge_stacks``.
 
     Raises:
         TooLittleInCommonError: If two frames have too little in common.
     """
-    # Frames, restored frames and motion of the stack; with roll or zoom, of a strip of columns.
-    limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
-    motion = motion_in_row_order(frames, vibration)[stack].expanded(1)
-    dtype = torch.promote_types(frames.images.dtype, restored.dtype)
-    taken, still = (images[stack].to(dtype) for images in frames.compared(restored))
-    ignore = None if frames.missing is None else frames.missing[stack]
-    raw, image, ignore, of_part = _judged_strip(taken, still, ignore, motion, frames.timing)
+    motion = motion_in_row_order(frames, vibration)
+    moves = {0: motion.moving_axes()[0].tolist()}
+    (verdict,) = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=most_pairs)
+    if isinstance(verdict, TooLittleInCommonError):
+        raise verdict
+    return verdict
 
-    # The verdict on each pair of frames.
-    count = len(raw)
-    shared, pairs = len(joint_groups(count, joint)[0][0]), pairs_to_judge(count, joint, limit)
-    moves = motion.moving_axes()[0].tolist()
-    verdicts, advance = [], steps(len(pairs), "pairs")
-    for pair in pairs:
-        verdicts.append(_judge_pair(shared_part(raw, image, of_part, pair, columns, ignore), moves, shared))
-        advance()
-    joined = {
-        field.name: torch.cat([getattr(verdict, field.name) for verdict in verdicts])
-        for field in fields(RestorationVerdict)
-        if field.name not in ("outcome", "findings")
+
+@torch.no_grad()
+def judge_stacks(
+    frames: PreparedFrames,
+    restored: Tensor,
+    motion: Motion,
+    moves: dict[int, list[bool]],
+    *,
+    joint: bool | int = False,
+    most_pairs: int | None = None,
+    columns: int | None = None,
+) -> list[RestorationVerdict | TooLittleInCommonError]:
+    """Verdicts on stacks of a batch, which are judged together.
+
+    Args:
+        frames: The raw frames.
+        restored: (B, T, C, H, W), or (B, 1, C, H, W), in row order.
+        motion: The motion that was undone, batch shape (B,), in row order.
+        moves: Indices of the stacks to judge, and for each the axes with motion in row order.
+        joint: As in ``judge_restoration``.
+        most_pairs: As in ``judge_restoration``.
+        columns: Judge on so many columns only, those with the most detail; None for all.
+
+    Returns:
+        For each of these stacks its verdict in image axes, or an error if two frames have too little in common.
+    """
+    limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
+    dtype = torch.promote_types(frames.images.dtype, restored.dtype)
+    raw, still = (images.to(dtype) for images in frames.compared(restored))
+    count = raw.shape[1]
+    pairs = pairs_to_judge(count, joint, limit)
+    task = _Task(
+        pairs, len(joint_groups(count, joint)[0][0]), columns, frames.image_timing, steps(len(moves), "stacks")
+    )
+
+    # as many stacks at a time as the memory allows
+    pixels = raw.shape[2] * raw.shape[3] * min(columns or raw.shape[4], raw.shape[4])
+    together = max(1, _PIXELS.get(raw.device.type, 1 << 22) // pixels)
+    verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
+    for chosen in (list(moves)[part] for part in runs(len(moves), together)):
+        taken, images = _of_stacks(raw, chosen), _of_stacks(still, chosen)
+        ignore = None if frames.missing is None else _of_stacks(frames.missing, chosen)
+        of_stacks = motion.mapped(partial(_of_stacks, chosen=chosen))
+        judged = _judged_strip(taken, images, ignore, of_stacks, frames.timing)
+        verdicts += _judge_batch(*judged, [moves[stack] for stack in chosen], task)
+    return verdicts
+
+
+def _of_stacks(values: Tensor, chosen: list[int]) -> Tensor:
+    """Values (B, ...) of some stacks, without a copy if these are all."""
+    return values if chosen == list(range(len(values))) else values[chosen]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What the verdicts on the stacks of a batch have in common.
+
+    Attributes:
+        pairs: Indices of the frames to compare.
+        shared: Frames from which one image is restored.
+        columns: Judge on so many columns only, those with the most detail; None for all.
+        timing: The sensor in image orientation.
+        advance: To be called with the number of stacks that were judged.
+    """
+
+    pairs: list[tuple[int, int]]
+    shared: int
+    columns: int | None
+    timing: SensorTiming
+    advance: Callable[[int], None]
+
+
+def _judge_batch(
+    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: FrameMotion, moves: list[list[bool]], task: _Task
+) -> list[RestorationVerdict | TooLittleInCommonError]:
+    """Verdicts on all stacks of a batch, whose displacement depends on the row only.
+
+    Args:
+        raw: As in ``shared_part``, and likewise the next three.
+        restored: Restored frames.
+        ignore: Pixels that were not measured.
+        motion: Motion of the frames.
+        moves: For each stack, the axes with motion in the vibration.
+        task: What the verdicts have in common.
+    """
+    # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
+    # would be too small are judged one by one.
+    size = raw.shape[-2], raw.shape[-1]
+    rows = torch.arange(size[0], dtype=torch.float64, device=raw.device)
+    moved = motion.mean_displacement(rows.expand(1, raw.shape[1], -1))
+    common = overlaps(motion, moved, task.pairs)
+    errors = {
+        stack: error for stack, of_stack in enumerate(common) if (error := _too_little(of_stack, task.pairs, size))
     }
-    outcome = tuple(verdict.outcome[0] for verdict in verdicts)
-    findings = tuple(verdict.findings[0] for verdict in verdicts)
-    return RestorationVerdict(**joined, outcome=outcome, findings=findings).in_image_axes(frames.image_timing)
+    shared = [Overlap.of_all([of_stack[pair] for of_stack in common]) for pair in range(len(task.pairs))]
+    if errors or not all(one.is_enough(size) for one in shared):
+        results: list[RestorationVerdict | TooLittleInCommonError] = []
+        for stack in range(len(raw)):
+            if stack in errors:
+                results.append(errors[stack])
+                continue
+            alone = slice(stack, stack + 1)
+            missing = None if ignore is None else ignore[alone]
+            results += _judge_batch(raw[alone], restored[alone], missing, motion.of([stack]), moves[alone], task)
+        return results
+
+    # The verdict on each pair of frames, of all stacks.
+    verdicts = []
+    for number, pair in enumerate(task.pairs):
+        of_stacks = [of_stack[number] for of_stack in common]
+        part = shared_part(raw, restored, ignore, motion, moved, pair, of_stacks, task.columns)
+        verdicts.append(_judge_pairs(part, moves, task.shared))
+    task.advance(len(raw))
+
+    # One result for each stack, in image axes.
+    levels = torch.stack([verdict.levels for verdict in verdicts], -1)  # (5, B, P)
+    displacements = torch.stack([verdict.displacements for verdict in verdicts], -2)  # (3, B, P, 2)
+    if task.timing.scan_axis == -1:
+        displacements = displacements.flip(-1)
+    levels_of, displacements_of = (values.flatten(0, 1).unbind() for values in (levels, displacements))
+    return [
+        RestorationVerdict(
+            **dict(zip(_LEVELS, levels_of[stack :: len(raw)], strict=True)),
+            **dict(zip(_DISPLACEMENTS, displacements_of[stack :: len(raw)], strict=True)),
+            outcome=tuple(verdict.outcomes[stack] for verdict in verdicts),
+            findings=tuple(reasons_from_row_order(verdict.reasons[stack], task.timing) for verdict in verdicts),
+        )
+        for stack in range(len(raw))
+    ]
+
+
+def _too_little(
+    common: list[Overlap], pairs: list[tuple[int, int]], size: tuple[int, int]
+) -> TooLittleInCommonError | None:
+    """An error for the first pair of frames with too little in common."""
+    for overlap, (earlier, later) in zip(common, pairs, strict=True):
+        if not overlap.is_enough(size):
+            y, x = overlap.step
+            return TooLittleInCommonError(
+                f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
+            )
+    return None

@@ -1,38 +1,80 @@
 """Comparison of two frames of one scene: common part, the later one predicted from the earlier one, misfit.
 
+Every function takes the frames of B stacks at a time.
+
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extended_length, spline_spectra
 from rsvib_torch.core.splines import correlated
-from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.pixels import cut_parts, detailed_parts
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
-__all__ = ["FramePair", "TooLittleInCommonError", "equally_bright", "misfit", "pairs_to_judge", "reblur", "shared_part"]
+__all__ = [
+    "FramePairs",
+    "Overlap",
+    "TooLittleInCommonError",
+    "equally_bright",
+    "misfit",
+    "overlaps",
+    "pairs_to_judge",
+    "reblur",
+    "shared_part",
+]
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
-_ELEMENTS = {"cpu": 1 << 18}  # values of the kernels in ``reblur`` at a time; they fit into the cache (speed only)
+_MARGIN = 4  # px between the compared pixels and those outside the frame
+# values of the kernels in ``reblur`` at a time: 16 MB on a CPU. Eight times less takes 0.9 of the time for one pair of
+# frames of 2048 rows, but eight times as many operations for a batch
+_ELEMENTS = {"cpu": 1 << 21, "cuda": 1 << 26}
 
 
 class TooLittleInCommonError(ValueError):
     """Two frames share too little of the scene to be compared."""
 
 
+@dataclass(frozen=True)
+class Overlap:
+    """What two frames of a stack have in common, in whole px along (rows, columns).
+
+    Attributes:
+        step: Displacement of the content from the earlier to the later frame, beyond the displacement of single rows.
+        rim: Displacement of single rows, with a margin: so much at the ends of the common part is not compared.
+    """
+
+    step: tuple[int, int]
+    rim: tuple[int, int]
+
+    @classmethod
+    def of_all(cls, common: list["Overlap"]) -> "Overlap":
+        """The smallest common part of several pairs of frames, of which rims are compared nowhere."""
+        steps, rims = ([tuple(map(abs, one.step)) for one in common], [one.rim for one in common])
+        return cls(tuple(map(max, *steps, steps[0])), tuple(map(max, *rims, rims[0])))
+
+    def size(self, frame: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns of the common part of frames of (rows, columns)."""
+        return frame[0] - abs(self.step[0]), frame[1] - abs(self.step[1])
+
+    def is_enough(self, frame: tuple[int, int]) -> bool:
+        """Whether the common part is larger than the filters."""
+        return all(size - 2 * rim >= 2 * _RIM + 3 for size, rim in zip(self.size(frame), self.rim, strict=True))
+
+
 @dataclass(frozen=True, eq=False)
-class FramePair:
-    """The common part of two raw frames and of their restored frames, (C, h, w) each.
+class FramePairs:
+    """The common parts of two raw frames and of their restored frames, of each of B stacks, (B, C, h, w) each.
 
     Attributes:
         earlier: Raw.
@@ -41,9 +83,9 @@ class FramePair:
         restored_later: Restored from the later frame; None where there is one image.
         predicted: The later raw frame, formed from ``restored``.
         changed_later: Change of the restored later frame by the motion of that frame.
-        offset: (2,) px, root-mean-square displacement between the two frames by the motion, axes (x, y).
-        ignore: (2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames
-            predict. None for none.
+        offset: (B, 2) px, root-mean-square displacement between the two frames by the motion, axes (x, y).
+        ignore: (B, 2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored
+            frames predict. None for none.
     """
 
     earlier: Tensor
@@ -68,87 +110,120 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
     return [pairs[index] for index in chosen]
 
 
+def overlaps(motion: FrameMotion, moved: Tensor, pairs: list[tuple[int, int]]) -> list[list[Overlap]]:
+    """What the frames of each pair have in common, for each of B stacks.
+
+    Args:
+        motion: Motion of the frames.
+        moved: (B, T, R, 2) mean displacement of their rows beyond the shift, in px.
+        pairs: Indices of the two frames of each pair.
+    """
+    # one transfer for all stacks and pairs
+    shifts, reaches = torch.stack([motion.shift, moved.abs().amax(-2)]).flip(-1).tolist()
+    found = []
+    for shift, reach in zip(shifts, reaches, strict=True):
+        of_stack = []
+        for earlier, later in pairs:
+            (y, x), (above, beside) = (
+                [operation(a, b) for a, b in zip(values[earlier], values[later], strict=True)]
+                for values, operation in ((shift, lambda a, b: int(b - a)), (reach, max))
+            )
+            of_stack.append(Overlap((y, x), (math.ceil(above) + _MARGIN, math.ceil(beside) + _MARGIN)))
+        found.append(of_stack)
+    return found
+
+
 def shared_part(
     raw: Tensor,
     restored: Tensor,
+    ignore: Tensor | None,
     motion: FrameMotion,
+    moved: Tensor,
     frames: tuple[int, int],
+    common: list[Overlap],
     columns: int | None,
-    ignore: Tensor | None = None,
-    *,
-    margin: int = 4,
-) -> FramePair:
-    """Cut two frames to their common part; rows are those of the later one.
+) -> FramePairs:
+    """Cut two frames of each stack to their common part; rows are those of the later one.
 
     Args:
-        raw: (T, C, H, W) in row order.
-        restored: (T, C, H, W), or (1, C, H, W) in the coordinates of the first of ``frames``.
-        motion: Motion of the frames, batch of one.
-        frames: Indices of the two frames.
-        columns: Cut to so many columns, those with the most detail; None for all.
+        raw: (B, T, C, H, W) in row order.
+        restored: (B, T, C, H, W), or (B, 1, C, H, W) in the coordinates of the first of ``frames``.
         ignore: Mask shaped like ``raw`` of pixels that were not measured.
-        margin: px between the compared pixels and those outside the frame.
-
-    Raises:
-        TooLittleInCommonError: If the common part is smaller than the filters.
+        motion: Motion of the frames.
+        moved: As in ``overlaps``.
+        frames: Indices of the two frames.
+        common: ``overlaps`` of each stack.
+        columns: Cut to so many columns, those with the most detail; None for all.
     """
     earlier, later = frames
-    x, y = (int(step) for step in (motion.shift[0, later] - motion.shift[0, earlier]).tolist())
-    height, width = (size - abs(step) for size, step in zip(raw.shape[-2:], (y, x), strict=True))
-    moved = _displacement_of_rows(motion, frames, raw.shape[-2])
-    rim_x, rim_y = (math.ceil(reach) + margin for reach in moved.abs().amax((0, 1)).tolist())
-    if min(height - 2 * rim_y, width - 2 * rim_x) < 2 * _RIM + 3:
-        raise TooLittleInCommonError(
-            f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
-        )
-    before, after = (_overlap(step, raw.shape[-2:]) for step in ((y, x), (-y, -x)))
-    first, second = raw[earlier][before], raw[later][after]
-    single = len(restored) == 1
-    still = restored[0 if single else earlier][before]
-    still_later = still if single else restored[later][after]
-    strip = slice(0, width)
+    # the largest displacement of all stacks determines the size of the part
+    size = raw.shape[-2], raw.shape[-1]
+    of_all = Overlap.of_all(common)
+    (height, width), (rim_y, rim_x) = of_all.size(size), of_all.rim
+    steps = list(zip(*(one.step for one in common), strict=True))
+    tops, lefts = ([max(-step, 0) for step in along] for along in steps)
+    later_tops, later_lefts = ([max(step, 0) for step in along] for along in steps)
     if columns is not None:
-        detailed = detailed_columns(second[..., rim_x : width - rim_x], columns)
-        strip = slice(detailed.start, detailed.stop + 2 * rim_x)
-    cut = (..., slice(rim_y, height - rim_y), slice(rim_x, -rim_x))
-    first, second, still, still_later = (image[..., strip] for image in (first, second, still, still_later))
-    predicted, formed_later = reblur(torch.cat([still, still_later]), motion, later, first_row=max(y, 0)).chunk(2)
+        second = cut_parts(raw[:, later], later_tops, later_lefts, (height, width))
+        detailed = detailed_parts(second[:, None, ..., rim_x : width - rim_x], columns)
+        lefts, later_lefts = (
+            [left + part.start for left, part in zip(starts, detailed, strict=True)] for starts in (lefts, later_lefts)
+        )
+        width = detailed[0].stop - detailed[0].start + 2 * rim_x
+
+    def before(images: Tensor) -> Tensor:
+        return cut_parts(images, tops, lefts, (height, width))
+
+    def after(images: Tensor) -> Tensor:
+        return cut_parts(images, later_tops, later_lefts, (height, width))
+
+    single = restored.shape[1] == 1
+    first, second = before(raw[:, earlier]), after(raw[:, later])
+    still = before(restored[:, 0 if single else earlier])
+    still_later = still if single else after(restored[:, later])
+    # both restored frames with the motion of the later frame
+    scenes = still if single else torch.cat([still, still_later], 1)
+    formed = reblur(scenes, motion, later, later_tops)
+    predicted, formed_later = (formed, formed) if single else formed.chunk(2, 1)
+    inner = (..., slice(rim_y, height - rim_y), slice(rim_x, width - rim_x))
     if ignore is not None:
-        masks = torch.stack([ignore[earlier][before], ignore[later][after]])[..., strip]
-        first = torch.where(masks[0], reblur(still, motion, earlier, first_row=max(-y, 0)), first)
-        second = torch.where(masks[1], predicted, second)
-        ignore = masks[(slice(None), *cut)]
-    return FramePair(
-        first[cut],
-        second[cut],
-        still[cut],
-        None if single else still_later[cut],
-        predicted[cut],
-        formed_later[cut] - still_later[cut],
-        (moved[1] - moved[0]).square().mean(0).sqrt(),
+        masks = torch.stack([before(ignore[:, earlier]), after(ignore[:, later])], 1)
+        first = torch.where(masks[:, 0], reblur(still, motion, earlier, tops), first)
+        second = torch.where(masks[:, 1], predicted, second)
+        ignore = masks[inner]
+    return FramePairs(
+        first[inner],
+        second[inner],
+        still[inner],
+        None if single else still_later[inner],
+        predicted[inner],
+        formed_later[inner] - still_later[inner],
+        (moved[:, later] - moved[:, earlier]).square().mean(1).sqrt(),
         ignore,
     )
 
 
-def equally_bright(pair: FramePair, noise: Tensor, *, block: int = 16) -> FramePair:
-    """The pair with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
+def equally_bright(pair: FramePairs, noise: Tensor, *, block: int = 16) -> FramePairs:
+    """The pairs with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
 
     Gain and offset are the regression of the later frame on the predicted one, from means over squares of ``block`` px,
-    which are large beside residual displacements. The noise power ``noise`` draws the gain towards 1.
+    which are large beside residual displacements. The noise power ``noise`` (B,) draws the gain towards 1.
     """
     side = min(block, *pair.later.shape[-2:])
-    predicted, later = (
-        torch.nn.functional.avg_pool2d(image[None], side)[0].to(torch.float64) for image in (pair.predicted, pair.later)
-    )
-    mean, target = (values.mean((-2, -1), keepdim=True) for values in (predicted, later))
-    power = (predicted - mean).square().mean() + noise
-    gain = (((predicted - mean) * (later - target)).mean() + noise) / power
-    if float(gain) <= 0.0:
-        return pair
-    mean, target, gain = (value.to(pair.later.dtype) for value in (mean, target, gain))
+    images = torch.stack([pair.predicted, pair.later])
+    means = functional.avg_pool2d(images.flatten(0, 2)[:, None], side).view(*images.shape[:3], -1).to(torch.float64)
+    mean, target = levels = means.mean(-1, keepdim=True)
+    predicted, later = means - levels
+    noise = noise[:, None, None, None]
+    gain = (predicted * later).mean((-2, -1), keepdim=True)[..., None] + noise
+    gain = gain / (predicted.square().mean((-2, -1), keepdim=True)[..., None] + noise)
+    # frames that contradict each other keep their brightness
+    related = gain > 0.0
+    offset = torch.where(related, target[..., None] - gain * mean[..., None], 0.0).to(pair.later.dtype)
+    gain = torch.where(related, gain, 1.0).to(pair.later.dtype)
 
     def adjusted(image: Tensor) -> Tensor:
-        return torch.addcmul(target - gain * mean, image, gain)
+        return torch.addcmul(offset, image, gain)
 
     return replace(
         pair,
@@ -167,86 +242,88 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Ten
     holds for displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2.
 
     Args:
-        first: (C, H, W), at least 35 px on a side.
+        first: (..., C, H, W), at least 35 px on a side.
         second: The same shape.
         step: px between the places that are used; after smoothing, neighbours are nearly equal.
 
     Returns:
-        Misfit (2,) and its resolution (2,) in px, axes (x, y), float64; a misfit below the resolution cannot be
+        Misfit (..., 2) and its resolution (..., 2) in px, axes (x, y), float64; a misfit below the resolution cannot be
         distinguished from zero. For images without contrast 0 and infinity.
     """
-    place = torch.arange(-_RIM, _RIM + 1, dtype=torch.float32, device=first.device)
-    gaussian = torch.where(place.abs() < _RIM, torch.exp(-0.5 * (place / _SMOOTHING).double().square()), 0.0)
+    # Gaussian and its derivative; gradients of the mean image, and the smoothed difference
+    place = np.arange(-_RIM, _RIM + 1)
+    gaussian = np.where(abs(place) < _RIM, np.exp(-0.5 * (place / _SMOOTHING) ** 2), 0.0)
     gaussian = gaussian / gaussian.sum()
-    kernels = torch.stack([gaussian, 0.5 * (gaussian.roll(1) - gaussian.roll(-1))]).to(first.dtype)
-    mean, changed = (0.5 * (first + second), second - first)
-    smooth, slope = correlated(torch.stack([mean, changed]), kernels, -1, step)
-    along = correlated(slope[0], kernels[:1], -2, step)[0].flatten().to(torch.float64)
-    (_, change), (across, _) = correlated(smooth, kernels, -2, step)
-    across, change = (values.flatten().to(torch.float64) for values in (across, change))
-    change = change.square()
+    taps = np.stack([gaussian, 0.5 * (np.roll(gaussian, 1) - np.roll(gaussian, -1))])
+    kernels = torch.as_tensor(taps, dtype=first.dtype, device=first.device)
+    images = torch.stack([0.5 * (first + second), second - first])
+    filtered = correlated(correlated(images, kernels, -1, step), kernels, -2, step)  # (across, along, image, ...)
+    along, across, change = (
+        values.flatten(-3).to(torch.float64) for values in (filtered[0, 1, 0], filtered[1, 0, 0], filtered[0, 0, 1])
+    )
+    # normal equations of weighted least squares for the four terms
     energy = along.square() + across.square()
     tiny = torch.finfo(torch.float64).tiny
-    weight = (energy + energy.mean()).square().clamp(min=tiny).reciprocal()
-    terms = torch.stack([torch.ones_like(along), along.square(), across.square(), 2 * along * across])
-    normal = (terms * weight) @ terms.T
-    scale = normal.diagonal().clamp(min=tiny).rsqrt()
-    inverse = torch.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
-    solution = inverse @ ((terms * weight) @ change)
-    # the variance of a squared Gaussian is twice the square of its mean; values within the smoothing are correlated
-    correlated_values = 4 * math.pi * (_SMOOTHING / step) ** 2
-    scatter = (terms * weight.square()) @ terms.T * (correlated_values * 2.0 * solution[0].square())
-    deviation = (inverse @ scatter @ inverse).diagonal()[1:3].clamp(min=0.0).sqrt()
-    rounding = 1e-5 * torch.maximum(first.abs().amax(), second.abs().amax())
-    has_contrast = energy.amax().sqrt() > rounding
-    size, resolution = solution[1:3].clamp(min=0.0).sqrt(), (2.0 * deviation).sqrt()
-    return size.where(has_contrast, 0.0), resolution.where(has_contrast, math.inf)
+    weight = (energy + energy.mean(-1, keepdim=True)).square().clamp(min=tiny).reciprocal()[..., None, :]
+    terms = torch.stack([torch.ones_like(along), along.square(), across.square(), 2 * along * across], -2)
+    weighted = terms * weight
+    data = torch.cat([terms, change.square()[..., None, :], weighted], -2)
+    products, strongest = (weighted @ data.mT).cpu().numpy(), energy.amax(-1).sqrt()
+    normal, right, scatter = products[..., :4], products[..., 4:5], products[..., 5:]
+    # small tables on the CPU; those of images without contrast may overflow
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        scale = np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), tiny) ** -0.5
+        scale = scale[..., None, :] * scale[..., None]
+        inverse = np.linalg.pinv(normal * scale, hermitian=True) * scale
+        solution = (inverse @ right)[..., 0]
+        # the variance of a squared Gaussian is twice the square of its mean; values within the smoothing are correlated
+        correlated_values = 4 * math.pi * (_SMOOTHING / step) ** 2
+        scatter = scatter * (correlated_values * 2.0 * solution[..., :1, None] ** 2)
+        variance = np.diagonal(inverse @ scatter @ inverse, axis1=-2, axis2=-1)[..., 1:3].clip(0.0)
+    figures = torch.as_tensor(np.stack([solution[..., 1:3].clip(0.0) ** 0.5, (2.0 * variance**0.5) ** 0.5]))
+    size, resolution = figures.to(first.device)
+    # rounding is no contrast
+    largest = torch.maximum(first.abs().amax((-3, -2, -1)), second.abs().amax((-3, -2, -1)))
+    has_contrast = (strongest > 1e-5 * largest)[..., None]
+    return torch.where(has_contrast, size, 0.0), torch.where(has_contrast, resolution, math.inf)
 
 
-def reblur(scene: Tensor, motion: FrameMotion, frame: int, *, first_row: int = 0, degree: int = 5) -> Tensor:
-    """Form one frame from a restored scene (Eq. 9), independently of the restoration method.
+def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int], *, degree: int = 5) -> Tensor:
+    """Form one frame of each stack from restored scenes (Eq. 9), independently of the restoration method.
 
     Displacement along rows is a phase ramp, across rows a B-spline, the exposure a Gauss-Legendre sum.
 
     Args:
-        scene: (C, H, W) in row order, in the coordinates in which frame ``frame`` is restored; it may be a part of
-            the rows and columns, and is mirrored beyond.
-        motion: Motion of the frames, batch of one.
+        scenes: (B, C, H, W) in row order, in the coordinates in which frame ``frame`` is restored; they may be a part
+            of the rows and columns, and are mirrored beyond.
+        motion: Motion of the frames.
         frame: Index of the frame to form.
-        first_row: Row of the frame at row 0 of the scene.
+        first_rows: Row of the frame at row 0 of the scene, for each stack.
         degree: Degree of the B-spline.
 
     Returns:
-        The same part (C, H, W) of the frame.
+        The same parts (B, C, H, W) of the frames.
     """
-    height, width = scene.shape[-2:]
-    rows = torch.arange(height, dtype=torch.float64, device=scene.device)
-    starts = motion.frame_starts[frame] + (first_row + rows) * motion.timing.row_time
-    displacement, node_weights = exposure_trajectory(motion.vibration[0], starts, motion.timing, "gauss")
-    displacement = displacement - motion.shift[0, frame]
-    reach = math.ceil(float(displacement[..., 0].abs().amax()))
-    length = extended_length(width, reach)
-    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=scene.device)
-    spectra = spline_spectra(scene, degree, length)
-
-    place = rows[:, None] - displacement[..., 1]
-    along = displacement[..., 0].to(scene.dtype)
-    taps = degree + 1 + math.ceil(float((place.amax(-1) - place.amin(-1)).amax()))
-    step = max(1, _ELEMENTS.get(scene.device.type, height * taps * len(u)) // (taps * len(u)))
+    # displacement of each row during its exposure
+    count, (height, width) = len(scenes), scenes.shape[-2:]
+    rows = torch.arange(height, dtype=torch.float64, device=scenes.device)
+    first = torch.tensor(first_rows, dtype=torch.float64, device=scenes.device)
+    starts = motion.frame_starts[frame] + (first[:, None] + rows) * motion.timing.row_time
+    displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
+    along, across = (displacement - motion.shift[:, frame, None, None]).unbind(-1)
+    place = rows[:, None] - across
+    reach, blur = torch.stack([along.abs().amax(), (place.amax(-1) - place.amin(-1)).amax()]).tolist()
+    # spectra of the spline coefficients, the scenes one below the other
+    length = extended_length(width, math.ceil(reach))
+    u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
+    spectra = spline_spectra(scenes, degree, length).transpose(0, 1).flatten(1, 2)
+    # a few rows of all scenes at a time
+    values = count * (degree + 1 + math.ceil(blur)) * len(u)
+    step = max(1, _ELEMENTS.get(scenes.device.type, 1 << 21) // values)
+    along = along.to(scenes.dtype)
     formed = [
-        form_rows(spectra, place[part], along[part], node_weights, u.to(scene.dtype), degree)
+        form_rows(spectra, place[:, part], along[:, part], node_weights, u, degree, num_scenes=count)
         for part in runs(height, step)
     ]
     image: Tensor = torch.fft.irfft(torch.cat(formed, dim=-2), n=length)[..., :width]
-    return image
-
-
-def _overlap(step: tuple[int, int], size: Sequence[int]) -> tuple[Any, ...]:
-    """Part of an image whose content is found ``step`` px further on in another image."""
-    return (..., *(slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, size, strict=True)))
-
-
-def _displacement_of_rows(motion: FrameMotion, frames: Sequence[int], num_rows: int) -> Tensor:
-    """Mean displacement (2, R, 2) of the rows of two frames minus their shifts, in px."""
-    rows = torch.arange(num_rows, dtype=torch.float64, device=motion.frame_starts.device)
-    return motion.mean_displacement(rows.expand(1, len(motion.frame_starts), -1))[0, list(frames)]
+    return image.transpose(0, 1)

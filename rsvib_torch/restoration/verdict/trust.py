@@ -92,19 +92,19 @@ def trusted_vibration(
         value.to(vibration.device) for value in displacement_uncertainty(vibration, std, timing, num_frames, num_rows)
     )
     accurate = error.square() <= 0.5 * size.square()
+    # of all stacks and axes in one transfer
+    figures = torch.stack([error, size, reliable.to(error), accurate.to(error)], -1)
     batched = len(vibration.batch_shape) > 0
     left_alone = []
-    for index in range(vibration.batch_shape[0] if batched else 1):
-        at = (index,) if batched else ()
-        reasons = detected.reasons[index] if batched else detected.reasons
-        where: dict[str, float | str] = {"action": "restored"} | ({"stack": index} if batched else {})
-        for axis, name in enumerate(AXIS_NAMES[: vibration.num_axes]):
-            here = (*at, axis)
-            if not bool(reliable[here]):
+    for stack, of_axes in enumerate(figures.view(-1, *figures.shape[-2:]).tolist()):
+        reasons = detected.reasons[stack] if batched else detected.reasons
+        where: dict[str, float | str] = {"action": "restored"} | ({"stack": stack} if batched else {})
+        for axis, (value, moved, is_reliable, is_accurate) in enumerate(of_axes):
+            name = AXIS_NAMES[axis]
+            if not is_reliable:
                 left_alone.append(Reason("axis_not_reliable", name, details=where | {"why": "; ".join(reasons[axis])}))
-            elif not bool(accurate[here]):
-                value, moved, unit = float(error[here]), float(size[here]), ("px", "px", "rad", "(zoom)")[axis]
-                details = where | {"size": moved, "unit": unit}
+            elif not is_accurate:
+                details = where | {"size": moved, "unit": ("px", "px", "rad", "(zoom)")[axis]}
                 left_alone.append(Reason("axis_not_accurate", name, value, math.sqrt(0.5) * moved, details))
     return vibration.scaled(reliable & accurate), tuple(left_alone)
 
