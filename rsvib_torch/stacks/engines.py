@@ -164,7 +164,7 @@ class _DaskResult:
         while True:
             try:
                 return self.future.result(timeout=1.0)
-            except distributed.TimeoutError:
+            except (distributed.TimeoutError, UnboundLocalError):  # of distributed, if its own wait is cancelled
                 if self.future.done():
                     return self.future.result()  # or its error
                 if self.client.scheduler_info(n_workers=-1)["workers"]:
