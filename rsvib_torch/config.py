@@ -16,24 +16,16 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import Field, create_model, model_validator
 
 from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.core.option_types import (
-    DEFAULT_WINDOW,
-    METHOD_SETTINGS,
-    BadFrames,
-    DetectionSettings,
-    Mosaic,
-    OpticsSettings,
-    PriorName,
-)
 from rsvib_torch.core.reading import read_text
-from rsvib_torch.core.validation import Section, checked, options_section, validate
+from rsvib_torch.core.validation import Section, checked, validate
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 
 if TYPE_CHECKING:
     from rsvib_torch.imaging.sensor_model import SensorNoise
     from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["Config", "Simulation", "file_section", "presets", "read_config", "simulation_section"]
+__all__ = ["Config", "ConfigFile", "Simulation", "presets", "read_config", "simulation_section"]
 
 _MAX_BYTES = 10**7  # start times of 500,000 frames
 _MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
@@ -162,13 +154,11 @@ def simulation_section() -> Any:
         phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
         image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
 
-    noise_section = options_section("_NoiseSection", SensorNoise)
-
     class SimulationSection(Section):
         vibration: VibrationSection
         num_frames: int = 2
         frame_size: list[int] | None = None
-        noise: noise_section | None = None  # type: ignore[valid-type]
+        noise: SensorNoise | None = None
         seed: int = 0
 
         @model_validator(mode="after")
@@ -183,50 +173,19 @@ def simulation_section() -> Any:
         def simulation(self) -> Simulation:
             """The values as a ``Simulation``."""
             size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
-            noise = None if self.noise is None else SensorNoise(**_given(self.noise))
-            return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
+            return Simulation(self.vibration.to_vibration(), self.num_frames, size, self.noise, self.seed)
 
     return SimulationSection
 
 
-_OpticsSection = options_section("_OpticsSection", OpticsSettings)
-_DetectionSection = options_section("_DetectionSection", DetectionSettings)
+class ConfigFile(Section):
+    """All tables of a file; the keys of ``[simulation]`` are those of ``simulation_section``."""
 
-
-class _StackSection(Section):
-    """``[stack]``: processing of stacks in windows."""
-
-    window: int = Field(
-        default=DEFAULT_WINDOW, ge=2, description="Largest number of frames in which one vibration is detected."
-    )
-    bad_frames: BadFrames = Field(
-        default="pass",
-        description='Frames that cannot be read or used: ``"pass"`` writes them unchanged, ``"skip"`` leaves them out.',
-    )
-
-
-def _restoration_section(method: object) -> Any:
-    """``[restoration]``: the keys depend on the method."""
-    settings = METHOD_SETTINGS.get(method if isinstance(method, str) else "exact", METHOD_SETTINGS["exact"])
-    common: dict[str, Any] = {"method": Literal[*METHOD_SETTINGS], "saturation": float | None}
-    if "prior" in settings.__annotations__:
-        common["prior"] = PriorName
-        common["mosaic"] = Mosaic | None
-        common["optics"] = _OpticsSection | None
-    return options_section("_RestorationSection", settings, **common)
-
-
-def file_section(method: object = "exact") -> Any:
-    """Class of the file for a restoration method, without the keys of ``[simulation]``."""
-    return create_model(
-        "_Root",
-        __base__=Section,
-        sensor=(SensorSection, ...),
-        detection=(_DetectionSection | None, None),
-        restoration=(_restoration_section(method) | None, None),
-        simulation=(Any, None),
-        stack=(_StackSection | None, None),
-    )
+    sensor: SensorSection
+    detection: ToneOptions | None = None
+    restoration: RestorationOptions | None = None
+    simulation: Any = None
+    stack: WindowOptions | None = None
 
 
 def presets() -> dict[str, str]:
@@ -275,9 +234,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
             replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}
-    restoration = data.get("restoration")
-    root = file_section(restoration.get("method") if isinstance(restoration, dict) else None)
-    content = validate(root, data, source)
+    content = validate(ConfigFile, data, source)
     simulation = None
     if content.simulation is not None:
         part: Any = create_model("_Part", __base__=Section, simulation=(simulation_section(), ...))
@@ -286,10 +243,10 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
         source=source,
         timing=content.sensor.to_timing(),
         full_scale=content.sensor.full_scale,
-        detection=_given(content.detection),
-        restoration=_given(content.restoration),
+        detection=data.get("detection", {}),
+        restoration=data.get("restoration", {}),
         simulation=simulation,
-        stack=_given(content.stack),
+        stack=data.get("stack", {}),
         path=None if path is None else Path(path),
     )
 
@@ -303,8 +260,3 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a TOML file: {error}") from error
-
-
-def _given(section: Any) -> dict[str, Any]:
-    """The keys that are in the file; the functions that take the options have the defaults."""
-    return {} if section is None else section.model_dump(exclude_unset=True)

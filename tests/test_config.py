@@ -143,13 +143,13 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
         (SENSOR + "[detection]\nregistration = 'sift'", "detection.registration: expected 'projection' or 'ncc' or"),
         (
             SENSOR + "[detection]\nfull_scale = 9",
-            "detection.full_scale: unknown key; expected one of registration,",
+            "detection.full_scale: unknown key; expected one of band_rows,",
         ),
         (SENSOR + "[restoration]\nmethod = 'magic'", "restoration.method: expected '"),
         (SENSOR + "[restoration]\nprior = 'magic'", "restoration.prior: expected '"),
         (
             SENSOR + "[restoration]\nmethod = 'banded'\nhalf_row = 1",
-            "restoration.half_row: unknown key; expected one of half_rows, stride",
+            "restoration.half_row: unknown key; expected one of joint, iterations",
         ),
         (SENSOR + "[simulation]\nseed = 1", "simulation.vibration: missing key; expected a table with amplitude, freq"),
         (
@@ -161,10 +161,10 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
             SENSOR + VIBRATION.replace("[1, 2]", "'1'"),
             "simulation.vibration.amplitude: expected a list of numbers or a",
         ),
-        (SENSOR + VIBRATION + "[simulation.noise]\nbits = 99", "simulation: bits must be at most 32, got 99"),
+        (SENSOR + VIBRATION + "[simulation.noise]\nbits = 99", "simulation.noise.bits: expected at most 32, got 99"),
         (
             SENSOR + VIBRATION + "[simulation.noise]\nfull_well = 0",
-            "simulation: full_well must be larger than 0, got 0",
+            "simulation.noise.full_well: expected larger than 0, got 0",
         ),
         (SENSOR + "[simulation]\nnum_frames = 0\n" + VIBRATION, "simulation: num_frames must be at least 1, got 0"),
         (

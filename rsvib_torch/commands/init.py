@@ -11,7 +11,7 @@ import typer
 
 from rsvib_torch import io
 from rsvib_torch.commands.answers import command_text
-from rsvib_torch.commands.options import (
+from rsvib_torch.commands.shared_options import (
     READOUT_HELP,
     SCAN_AXIS_HELP,
     ExposureOption,

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_number
-from rsvib_torch.core.option_types import MotionUnit, TimeUnit
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.options import MotionUnit, TimeUnit
 
 __all__ = ["SECONDS", "MotionUnit", "TimeUnit", "check_times", "read_motion"]
 

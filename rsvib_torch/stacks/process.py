@@ -10,7 +10,6 @@ from typing import Any, Unpack
 
 from rsvib_torch.core.arguments import check_fields, checks_arguments
 from rsvib_torch.core.atomic import make_folder, sync, whole_file
-from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import number_of
@@ -20,6 +19,7 @@ from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import BadFrames
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
     DetectOptions,

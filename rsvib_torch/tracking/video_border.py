@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import BorderName
+from rsvib_torch.options import BorderName
 from rsvib_torch.tracking.tracked_frame import TrackedFrame
 
 __all__ = ["Margins", "VideoBorder"]

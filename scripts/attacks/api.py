@@ -25,12 +25,15 @@ from attacks.warm import in_warm_child, place_of
 from torch import Tensor
 
 import rsvib_torch as rsv
+from rsvib_torch.core.reason import Reason
 
 __all__ = ["calls", "trials"]
 
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _REFUSED = (ValueError, TypeError, OSError)
 _NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
+_NOT_CALLED |= {"RestorationMtf", "TimingDiagnosis", "TrackedFrame", "Margins", "VideoBorder"}  # made by functions
+_NOT_CALLED |= {"process_video"}  # takes seconds
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ def _with_fields(value: Any) -> Call:
 
 def _methods(value: Any, **arguments: Any) -> dict[str, Call]:
     """All public methods of an object whose arguments are known by name."""
-    calls = {}
+    calls, arguments = {}, {"results": [value, value], **arguments}
     for name, method in inspect.getmembers(value, callable):
         if name.startswith("_") or name == "mapped" or not getattr(method, "__module__", "").startswith("rsvib_torch"):
             continue
@@ -149,7 +152,8 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
     common |= {"height": 24, "width": 16, "frames": frames, "generator": torch.Generator("cpu").manual_seed(1)}
     common |= {"scene": scene, "u": times * 10, "v": times * 10, "input": frames[:, None], "image": image}
     common |= {"vibration": vibration, "index": 0, "count": 3, "shape": (3, 96, 64), "dtype": "float32"}
-    common |= {"start": times, "end": times + 0.01, "reference": 0.01}
+    common |= {"start": times, "end": times + 0.01, "reference": 0.01, "factor": 0.5}
+    common |= {"reason": Reason("no_contrast", "x"), "mosaic": None}
     common |= {"frame": frames[0].numpy(), "x": scene, "y": frames[0], "scene_shape": (160, 128), "tones": None}
     frames_call = {"frames": frames, "timing": timing, "full_scale": None, "channels": None, "ignore": None}
     result = {
@@ -212,6 +216,21 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - a table
             },
         ),
         "detect_vibration direct": Call(rsv.detect_vibration, {**frames_call, **bands}),
+        "diagnose_timing": Call(rsv.diagnose_timing, {**frames_call, **bands}),
+        "VibrationTracker": Call(
+            rsv.VibrationTracker,
+            {
+                "timing": dataclasses.replace(timing, frame_start_times=None),
+                "window": 4,
+                "columns": 64,
+                "method": "dewarp",
+                "steady": 0.1,
+                "wobble": True,
+                "full_scale": None,
+                "channels": None,
+                "chunk_rows": 16,
+            },
+        ),
         "find_slanted_edges": Call(
             rsv.find_slanted_edges, {"image": image, "min_length": 32, "max_length": 64, "min_contrast": 0.1}
         ),

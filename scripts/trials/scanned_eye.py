@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import rsvib_torch as rsv
-from rsvib_torch.registration import Registration
+from rsvib_torch.options import Registration
 
 FILES = ("tslo-dark.avi", "tslo-stim.avi")
 PERIOD, ROWS, RIM = 1 / 30, 512, 32

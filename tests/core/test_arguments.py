@@ -105,7 +105,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, noise=1e308), "noise must be at most"),
         (lambda: rsv.row_psf(VIBRATION, TIMING.row_starts(1, 4)[0], TIMING, num_nodes=10**9), "num_nodes must be at"),
         (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
-        (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be finite"),
+        (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be a number, got a very large int"),
         (lambda: rsv.comparison_figure(torch.tensor(1.0), FRAMES[0]), "raw must have shape"),
         (lambda: rsv.comparison_figure(FRAMES[0], FRAMES[None]), r"restored must have shape \(C, H, W\) with C = 1"),
         (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=1e-40), "flicker_frequency=1000 Hz is ambiguous"),
@@ -143,7 +143,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: blur().A_adjoint(torch.tensor(1.0)), r"y must have shape \(..., R, W\)"),
         (lambda: blur()(FRAMES[0].to(torch.uint16)), "scene must be a floating-point tensor, got torch.uint16"),
         (lambda: blur()((100 * FRAMES[0]).to(torch.int64)), "scene must be a floating-point tensor, got torch.int64"),
-        (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration .* or None"),
+        (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration"),
         (lambda: rsv.MotionCheck("x", torch.zeros(2), True, (), *CURVES), "before must be a tensor"),
         (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
     ],
@@ -157,7 +157,7 @@ def test_values_beyond_the_limits_of_an_argument(build, message):
 def test_nested_tensors_are_described():
     with pytest.raises(TypeError, match="frames must be a NumPy array, got a nested tensor"):
         rsv.restore_block(nested(), TIMING)
-    with pytest.raises(TypeError, match="displacement must be a dense tensor or None, got a nested"):
+    with pytest.raises(TypeError, match="displacement must be a dense tensor, got a nested"):
         replace(STD, displacement=nested())
 
 
@@ -175,7 +175,6 @@ def test_nested_tensors_are_described():
         ("swept", {"reliable": torch.ones(1, 2, dtype=torch.bool)}, r"reliable must have shape .* with \.\.\. = \(\)"),
         ("swept", {"std": {"a": 1}}, r"std\['a'\] must be a tensor, got 1 \(int\)"),
         ("swept", {"std": {"a": torch.zeros(2)}}, "std must have the keys amplitude, frequency, decay, chirp, phase"),
-        ("swept", {"std": {1: torch.zeros(2)}}, r"keys of std must be text, got 1 \(int\)"),
     ],
 )
 def test_results_of_contradicting_shapes(result, changes, message):
@@ -225,7 +224,7 @@ def test_checks_leave_calls_unchanged():
     assert scaled.__doc__ == "Doc."
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'values'"):
         scaled()
-    with pytest.raises(ValueError, match="names must have 2 values, got 1"):
+    with pytest.raises(TypeError, match="names must be 2 texts, got tuple"):
         scaled(values, names=("a",))
     with pytest.raises(TypeError, match=r"names\[1\] must be text"):
         scaled(values, names=("a", 1))

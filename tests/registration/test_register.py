@@ -7,7 +7,8 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, register_bands
-from rsvib_torch.registration.methods import BAND_METHODS, Registration
+from rsvib_torch.options import Registration
+from rsvib_torch.registration.methods import BAND_METHODS
 
 METHODS = get_args(Registration)
 # RMS error in px along the rows and along the scan axis, valid bands only; the offsets are 1.4 and 5 px RMS

@@ -15,11 +15,11 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import StmapConvention
 from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.motion.field import ColumnMotion, displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.options import StmapConvention
 from rsvib_torch.report.export.exported import check_exportable, num_rows_of
 from rsvib_torch.restoration.frame_motion import frame_motion
 
