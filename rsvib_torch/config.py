@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rsvib_torch.imaging.sensor_model import SensorNoise
     from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["Config", "ConfigFile", "Simulation", "presets", "read_config", "simulation_section"]
+__all__ = ["Config", "ConfigFile", "SensorSection", "Simulation", "presets", "read_config", "simulation_section"]
 
 _MAX_BYTES = 10**7  # start times of 500,000 frames
 _MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
@@ -85,22 +85,39 @@ class SensorSection(Section):
     ``frame_rows``).
     """
 
-    row_time: float
+    row_time: float = Field(
+        description="Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row "
+        "period; 'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because "
+        "sensors have blanking rows."
+    )
     exposure_time: float | None = Field(
-        default=None, description="Exposure time in seconds; this key or ``exposure_rows`` is required."
-    )
-    exposure_rows: float | None = None
-    frame_rate: float | None = Field(
-        default=None, description="Frames per second of the sensor; this key or ``frame_rows`` is required."
-    )
-    frame_rows: float | None = None
-    scan_axis: Literal["y", "x"] = "y"
-    readout_direction: Literal["forward", "reverse"] = "forward"
-    frame_start_times: list[float] | None = None
-    full_scale: float | None = Field(
         default=None,
-        description="Count of an integer file that corresponds to 1.0, for example 4095 for 12-bit counts; 255 for "
-        "8-bit files.",
+        description="Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
+    )
+    exposure_rows: float | None = Field(default=None, description="Exposure time divided by row_time.")
+    frame_rate: float | None = Field(
+        default=None,
+        description="Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
+    )
+    frame_rows: float | None = Field(
+        default=None,
+        description="Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
+    )
+    scan_axis: Literal["y", "x"] = Field(
+        default="y",
+        description="'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
+    )
+    readout_direction: Literal["forward", "reverse"] = Field(
+        default="forward",
+        description="'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
+    )
+    frame_start_times: list[float] | None = Field(
+        default=None,
+        description="Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced "
+        "(dropped frames, irregular clocks); strictly increasing.",
+    )
+    full_scale: float | None = Field(
+        default=None, description="Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."
     )
 
     @model_validator(mode="after")

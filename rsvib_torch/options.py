@@ -34,48 +34,6 @@ else:  # arrays are checked where they are used
     Mask = Any
     Curve = list[list[float]]
 
-__all__ = [
-    "COMMAND_LINE",
-    "METHOD_OPTIONS",
-    "BadFrames",
-    "BandOptions",
-    "BandRegistrationOptions",
-    "BandedOptions",
-    "BorderName",
-    "Channels",
-    "DetectionMethod",
-    "DewarpOptions",
-    "ExactOptions",
-    "ExportFormat",
-    "FreeMotionOptions",
-    "InputOptions",
-    "IsdModel",
-    "MaskedInputOptions",
-    "Mosaic",
-    "MotionUnit",
-    "NoiseGainOptions",
-    "OffsetOptions",
-    "OpticsOptions",
-    "PriorName",
-    "ProjectionOptions",
-    "Registration",
-    "RegistrationOptions",
-    "RestorationMtfOptions",
-    "RestorationName",
-    "RestorationOptions",
-    "RestoreOptions",
-    "RestorerOptions",
-    "RichardsonLucyOptions",
-    "StmapConvention",
-    "SweptToneOptions",
-    "TimeUnit",
-    "ToneOptions",
-    "TrackerOptions",
-    "VibrationOptions",
-    "WindowOptions",
-    "method_options",
-]
-
 BorderName = Literal["mirror", "hold", "crop"]
 BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None

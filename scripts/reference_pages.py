@@ -100,7 +100,7 @@ def configuration_page() -> str:
     plain = [key for key in simulation.model_fields if key not in ("vibration", "noise")]
     vibration = simulation.model_fields["vibration"].annotation
     lines = [CONFIGURATION, "## [sensor]", "", SENSOR, ""]
-    lines += key_table(SensorSection, meaning=documented(rsv.SensorTiming))
+    lines += key_table(SensorSection)
     lines += ["## [detection]", "", "Options of `detect_vibration`.", "", *key_table(ToneOptions)]
     lines += ["## [restoration]", "", f"Options of `restore` for all methods. {SATURATION}", ""]
     lines += key_table(RestorationOptions, ("method", "saturation"))

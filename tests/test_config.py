@@ -161,7 +161,6 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
             SENSOR + VIBRATION.replace("[1, 2]", "'1'"),
             "simulation.vibration.amplitude: expected a list of numbers or a",
         ),
-        (SENSOR + VIBRATION + "[simulation.noise]\nbits = 99", "simulation.noise.bits: expected at most 32, got 99"),
         (
             SENSOR + VIBRATION + "[simulation.noise]\nfull_well = 0",
             "simulation.noise.full_well: expected larger than 0, got 0",

@@ -13,7 +13,19 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, reduce, wraps
-from typing import Annotated, Any, ParamSpec, TypeVar, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
+from typing import (
+    Annotated,
+    Any,
+    ParamSpec,
+    Self,
+    TypeVar,
+    Union,
+    Unpack,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 import numpy as np
 import torch
@@ -33,6 +45,7 @@ __all__ = [
     "check_pixels",
     "check_shapes",
     "check_tensor",
+    "checked_methods",
     "checks_arguments",
 ]
 
@@ -266,6 +279,17 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     return checked
 
 
+def checked_methods(kind: type[R]) -> type[R]:
+    """Check the arguments of the public methods that a class defines against their annotations before each call."""
+    for name, method in tuple(vars(kind).items()):
+        function = method.__func__ if isinstance(method, classmethod) else method
+        is_public = name in ("__init__", "__getitem__") or not name.startswith("_")
+        if isinstance(function, types.FunctionType) and is_public and len(function.__annotations__) > 1:
+            checked = checks_arguments(function)
+            setattr(kind, name, classmethod(checked) if isinstance(method, classmethod) else checked)
+    return kind
+
+
 def check_fields(value: Any) -> None:
     """Check the types of the fields of a dataclass against their annotations; lists and arrays become tuples.
 
@@ -304,7 +328,7 @@ def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
         return check_tensor(name, value)
     if isinstance(value, _ARRAYS) and any({int, float} & {*get_args(member)} for member in members):
         value = (check_tensor(name, value) if isinstance(value, Tensor) else value).tolist()
-    return validated(name, tuple(value) if isinstance(value, torch.Size) else value, adapter, kind)
+    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter, kind)
 
 
 @cache
@@ -324,7 +348,7 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
         return Number
     if kind is int:
         return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
-    if kind is Any or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False) or is_typeddict(kind):
+    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False) or is_typeddict(kind):
         return Any
     if get_origin(kind) in (os.PathLike, np.ndarray) or (
         isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None

@@ -220,6 +220,7 @@ class _Mistake:
         text: A sentence that replaces the others.
         known: The keys that exist, for one that does not.
         choices: The choices, if there is nothing else.
+        accepts_none: Whether None is possible in Python.
         kind: The exception in Python.
         is_bound: Whether the value has the right type and is out of bounds.
     """
@@ -230,6 +231,7 @@ class _Mistake:
     text: str = ""
     known: tuple[str, ...] = ()
     choices: tuple[Any, ...] = ()
+    accepts_none: bool = False
     kind: type[Exception] = ValueError
     is_bound: bool = False
 
@@ -240,7 +242,7 @@ class _Mistake:
         if self.choices:
             names = ", ".join(map(repr, self.choices))
             return ValueError(f"{self.path} must be one of {names}; got {described(self.value)}")
-        expected = self.expected.replace("true or false", "True or False")
+        expected = self.expected.replace("true or false", "True or False") + " or None" * self.accepts_none
         return self.kind(self.text or f"{self.path} must be {expected}, got {described(self.value)}")
 
     def in_file(self, source: str) -> str:
@@ -294,7 +296,8 @@ def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
         return _Mistake(path, value, _BOUNDS[kind].format(**context), is_bound=True)
     choices = [member for member in members_of(expected) if get_origin(member) is Literal]
     only = tuple(name for member in choices for name in get_args(member)) if choices == [*members_of(expected)] else ()
-    return _Mistake(path, value, expected_text(expected), kind=TypeError, choices=only)
+    accepts_none = type(None) in get_args(expected)
+    return _Mistake(path, value, expected_text(expected), kind=TypeError, choices=only, accepts_none=accepts_none)
 
 
 def members_of(annotation: Any) -> tuple[Any, ...]:

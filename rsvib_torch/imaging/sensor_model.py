@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checks_arguments
+from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checked_methods
 from rsvib_torch.core.checks import check_number, check_whole_number, described
 from rsvib_torch.core.validation import NotNegative, Positive, options
 from rsvib_torch.options import OpticsOptions
@@ -22,6 +22,7 @@ _LEAST_RESPONSE = (
 
 
 @options
+@checked_methods
 class Optics(OpticsOptions):
     """Transfer function of a lens and of square pixels.
 
@@ -40,7 +41,6 @@ class Optics(OpticsOptions):
         if self.mtf is not None:
             object.__setattr__(self, "mtf", _checked_mtf(self.mtf))  # lists of numbers, which can be compared
 
-    @checks_arguments
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
         """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
         check_broadcast(u=u, v=v)
@@ -54,7 +54,6 @@ class Optics(OpticsOptions):
             transfer = transfer * _interpolated(squared.sqrt(), *_checked_mtf(self.mtf))
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
-    @checks_arguments
     def apply(self, scene: Tensor) -> Tensor:
         """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
 
@@ -140,6 +139,7 @@ def _interpolated(place: Tensor, places: Sequence[float], values: Sequence[float
 
 
 @options
+@checked_methods
 class SensorNoise:
     """Shot noise, read noise, fixed pattern and quantisation of a sensor whose full scale is 1.
 
@@ -184,7 +184,6 @@ class SensorNoise:
         default=0, ge=0, le=2**63 - 1, description="Seed of the fixed pattern; each seed is another sensor."
     )
 
-    @checks_arguments
     def fixed_pattern(self, height: int, width: int) -> tuple[Tensor, Tensor]:
         """Gain and offset of every pixel, float64 (height, width), the same in every call.
 
@@ -201,7 +200,6 @@ class SensorNoise:
         )
         return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows
 
-    @checks_arguments
     def apply(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return noisy frames of the same shape and dtype.
 

@@ -726,7 +726,6 @@ def test_batch_equals_single_stacks(paper_camera):
         ({"window": 1}, ValueError, "window must be at least 2, got 1"),
         ({"window": 5}, ValueError, "window of 5 frames is longer than the stack of 3"),
         ({"window": 2, "window_step": 0}, ValueError, "window_step must be at least 1, got 0"),
-        ({"harmonics": 0}, ValueError, "harmonics must be at least 1, got 0"),
         ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit"),
         ({"ignore": torch.zeros(256, 256)}, TypeError, "ignore must be a bool tensor"),
         ({"ignore": torch.ones(256, 256, dtype=torch.bool)}, ValueError, "frames have no pixel with data"),
