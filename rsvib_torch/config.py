@@ -11,44 +11,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, create_model, model_validator
 
-from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.reading import read_text
-from rsvib_torch.core.validation import Section, checked, validate
+from rsvib_torch.core.validation import Count, Section, checked, validate
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 
-if TYPE_CHECKING:
-    from rsvib_torch.imaging.sensor_model import SensorNoise
-    from rsvib_torch.motion.vibration import Vibration
-
-__all__ = ["Config", "ConfigFile", "SensorSection", "Simulation", "presets", "read_config", "simulation_section"]
+__all__ = ["Config", "ConfigFile", "SensorSection", "presets", "read_config", "simulation_section"]
 
 _MAX_BYTES = 10**7  # start times of 500,000 frames
 _MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """Content of ``[simulation]``.
-
-    Attributes:
-        vibration: The motion to simulate.
-        num_frames: Number of frames.
-        frame_size: (height, width) of the frames in px; None for the largest size that the scene allows.
-        noise: Noise of the sensor; None for none.
-        seed: Seed of the noise.
-    """
-
-    vibration: "Vibration"
-    num_frames: int
-    frame_size: tuple[int, int] | None
-    noise: "SensorNoise | None"
-    seed: int
 
 
 @dataclass(frozen=True)
@@ -61,7 +38,7 @@ class Config:
         full_scale: Count that corresponds to 1.0 in integer frames; None if it is not in the file.
         detection: Options of ``detect_vibration`` that are in the file.
         restoration: Options of ``restore`` that are in the file.
-        simulation: Vibration and noise to simulate; None if it is not in the file.
+        simulation: ``[simulation]``, of the class ``simulation_section``; None if it is not in the file.
         stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
         arguments: Options of the program that describe the camera, for the commands that it suggests.
         path: The file; None if the camera is described by options only.
@@ -72,7 +49,7 @@ class Config:
     full_scale: float | None
     detection: dict[str, Any]
     restoration: dict[str, Any]
-    simulation: Simulation | None
+    simulation: Any
     stack: dict[str, Any]
     arguments: tuple[str, ...] = ()
     path: Path | None = None
@@ -173,24 +150,14 @@ def simulation_section() -> Any:
 
     class SimulationSection(Section):
         vibration: VibrationSection
-        num_frames: int = 2
-        frame_size: list[int] | None = None
+        num_frames: Count = Field(default=2, description="Number of frames.")
+        frame_size: tuple[Count, Count] | None = Field(
+            default=None,
+            strict=False,
+            description="(height, width) of the frames in px; None for the largest size that the scene allows.",
+        )
         noise: SensorNoise | None = None
-        seed: int = 0
-
-        @model_validator(mode="after")
-        def _check(self) -> Self:
-            check_whole_number("num_frames", self.num_frames, at_least=1)
-            check_whole_number("seed", self.seed, at_least=0)
-            if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
-                raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
-            checked(self.simulation)
-            return self
-
-        def simulation(self) -> Simulation:
-            """The values as a ``Simulation``."""
-            size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
-            return Simulation(self.vibration.to_vibration(), self.num_frames, size, self.noise, self.seed)
+        seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Seed of the noise.")
 
     return SimulationSection
 
@@ -255,7 +222,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     simulation = None
     if content.simulation is not None:
         part: Any = create_model("_Part", __base__=Section, simulation=(simulation_section(), ...))
-        simulation = validate(part, {"simulation": content.simulation}, source).simulation.simulation()
+        simulation = validate(part, {"simulation": content.simulation}, source).simulation
     return Config(
         source=source,
         timing=content.sensor.to_timing(),

@@ -16,7 +16,7 @@ import typer
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import app
-from rsvib_torch.config import SensorSection, Simulation, simulation_section
+from rsvib_torch.config import SensorSection, simulation_section
 from rsvib_torch.core.reason import GROUPS
 from rsvib_torch.core.validation import expected_text, fields_of
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
@@ -109,7 +109,7 @@ def configuration_page() -> str:
     lines += ["## [restoration.optics]", "", "Optics of the camera, see `optics`.", "", *key_table(OpticsOptions)]
     lines += ["## [stack]", "", "Processing of stacks in windows.", "", *key_table(WindowOptions)]
     lines += ["## [simulation]", "", "For `rsvib simulate`.", ""]
-    lines += key_table(simulation, plain, documented(Simulation))
+    lines += key_table(simulation, plain)
     lines += ["## [simulation.vibration]", "", "The motion that is simulated; required for a simulation.", ""]
     lines += key_table(vibration, meaning=documented(rsv.Vibration))
     lines += ["## [simulation.noise]", "", "Noise of the sensor; none without this table.", ""]

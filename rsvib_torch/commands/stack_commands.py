@@ -265,6 +265,7 @@ def simulate(
             f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
         )
     simulation, target = settings.simulation, torch_device(device)
+    vibration = simulation.vibration.to_vibration()
     image = io.read_stack(scene, full_scale=full_scale)
     if len(image) != 1:
         raise ValueError(f"{scene}: the scene must be one image, this file has {len(image)} frames")
@@ -275,7 +276,7 @@ def simulate(
         simulated = imaging.simulate_frames(
             image[0].to(target),
             settings.timing,
-            simulation.vibration,
+            vibration,
             simulation.num_frames,
             frame_size=simulation.frame_size,
             noise=simulation.noise,
@@ -287,8 +288,8 @@ def simulate(
     line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
     run_it = command_text("run", frames, frames.with_name("results"), *settings.arguments)
     return Answer(
-        {"Simulated frames": [line, f"vibration:\n{simulation.vibration}"]},
-        {"shape": list(simulated.shape), "dtype": dtype, "vibration": simulation.vibration.to_dict()},
+        {"Simulated frames": [line, f"vibration:\n{vibration}"]},
+        {"shape": list(simulated.shape), "dtype": dtype, "vibration": vibration.to_dict()},
         [frames],
         [f"detect the vibration and restore the frames:\n  {run_it}"],
     )
