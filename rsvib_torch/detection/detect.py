@@ -179,11 +179,11 @@ def _checked_field(options: VibrationOptions, camera: Camera | None) -> FieldOpt
 class VibrationDetector(nn.Module):
     """``detect_vibration`` with fixed timing and options as a module, for one stack or a batch of stacks.
 
-    It has no weights. Autocast does not affect it, and ``torch.compile`` calls it uncompiled, at one graph break.
+    The options are those of ``detect_vibration`` for tones. It has no weights. Autocast does not affect it, and
+    ``torch.compile`` calls it uncompiled, at one graph break.
 
     Args:
         timing: The sensor.
-        options: As in ``detect_vibration`` for tones.
 
     Raises:
         TypeError: If an option is unknown.

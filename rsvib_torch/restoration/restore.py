@@ -243,12 +243,11 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, vibration: Motion, 
 class VibrationRestorer(nn.Module):
     """``restore`` as a module, for stacks (T, H, W) to batches of stacks (B, T, C, H, W).
 
-    It has no weights, ignores autocast, and is called by ``torch.compile`` unchanged, at one break of the graph.
-    Gradients flow to frames and vibration.
+    The options are those of ``restore``. It has no weights, ignores autocast, and is called by ``torch.compile``
+    unchanged, at one break of the graph. Gradients flow to frames and vibration.
 
     Args:
         timing: The sensor.
-        options: As in ``restore``.
 
     Example:
         >>> import torch

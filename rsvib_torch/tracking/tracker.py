@@ -154,7 +154,6 @@ class VibrationTracker:
 
     Args:
         timing: The sensor, without ``frame_start_times``.
-        options: Options, see ``TrackerOptions``.
 
     Raises:
         TypeError: If the method does not have an option.

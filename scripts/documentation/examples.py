@@ -36,6 +36,7 @@ class DoctestsAsCode(griffe.Extension):
         ]
         if func.docstring is not None:
             func.docstring.value = inspect.getdoc(thing) or ""
+            self.on_object(obj=func)
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         """Look at one object as it is loaded."""
