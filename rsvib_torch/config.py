@@ -11,52 +11,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, create_model, model_validator
 
-from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.core.option_types import (
-    DEFAULT_WINDOW,
-    METHOD_SETTINGS,
-    BadFrames,
-    DetectionSettings,
-    Mosaic,
-    OpticsSettings,
-    PriorName,
-)
+from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.reading import read_text
-from rsvib_torch.core.validation import Section, checked, options_section, validate
+from rsvib_torch.core.validation import Count, Section, checked, validate
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 
-if TYPE_CHECKING:
-    from rsvib_torch.imaging.sensor_model import SensorNoise
-    from rsvib_torch.motion.vibration import Vibration
-
-__all__ = ["Config", "Simulation", "file_section", "presets", "read_config", "simulation_section"]
+__all__ = ["Config", "ConfigFile", "SensorSection", "presets", "read_config", "simulation_section"]
 
 _MAX_BYTES = 10**7  # start times of 500,000 frames
 _MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """Content of ``[simulation]``.
-
-    Attributes:
-        vibration: The motion to simulate.
-        num_frames: Number of frames.
-        frame_size: (height, width) of the frames in px; None for the largest size that the scene allows.
-        noise: Noise of the sensor; None for none.
-        seed: Seed of the noise.
-    """
-
-    vibration: "Vibration"
-    num_frames: int
-    frame_size: tuple[int, int] | None
-    noise: "SensorNoise | None"
-    seed: int
 
 
 @dataclass(frozen=True)
@@ -69,7 +38,7 @@ class Config:
         full_scale: Count that corresponds to 1.0 in integer frames; None if it is not in the file.
         detection: Options of ``detect_vibration`` that are in the file.
         restoration: Options of ``restore`` that are in the file.
-        simulation: Vibration and noise to simulate; None if it is not in the file.
+        simulation: ``[simulation]``, of the class ``simulation_section``; None if it is not in the file.
         stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
         arguments: Options of the program that describe the camera, for the commands that it suggests.
         path: The file; None if the camera is described by options only.
@@ -80,7 +49,7 @@ class Config:
     full_scale: float | None
     detection: dict[str, Any]
     restoration: dict[str, Any]
-    simulation: Simulation | None
+    simulation: Any
     stack: dict[str, Any]
     arguments: tuple[str, ...] = ()
     path: Path | None = None
@@ -93,22 +62,39 @@ class SensorSection(Section):
     ``frame_rows``).
     """
 
-    row_time: float
+    row_time: float = Field(
+        description="Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row "
+        "period; 'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because "
+        "sensors have blanking rows."
+    )
     exposure_time: float | None = Field(
-        default=None, description="Exposure time in seconds; this key or ``exposure_rows`` is required."
-    )
-    exposure_rows: float | None = None
-    frame_rate: float | None = Field(
-        default=None, description="Frames per second of the sensor; this key or ``frame_rows`` is required."
-    )
-    frame_rows: float | None = None
-    scan_axis: Literal["y", "x"] = "y"
-    readout_direction: Literal["forward", "reverse"] = "forward"
-    frame_start_times: list[float] | None = None
-    full_scale: float | None = Field(
         default=None,
-        description="Count of an integer file that corresponds to 1.0, for example 4095 for 12-bit counts; 255 for "
-        "8-bit files.",
+        description="Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
+    )
+    exposure_rows: float | None = Field(default=None, description="Exposure time divided by row_time.")
+    frame_rate: float | None = Field(
+        default=None,
+        description="Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
+    )
+    frame_rows: float | None = Field(
+        default=None,
+        description="Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
+    )
+    scan_axis: Literal["y", "x"] = Field(
+        default="y",
+        description="'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
+    )
+    readout_direction: Literal["forward", "reverse"] = Field(
+        default="forward",
+        description="'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
+    )
+    frame_start_times: list[float] | None = Field(
+        default=None,
+        description="Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced "
+        "(dropped frames, irregular clocks); strictly increasing.",
+    )
+    full_scale: float | None = Field(
+        default=None, description="Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."
     )
 
     @model_validator(mode="after")
@@ -162,71 +148,28 @@ def simulation_section() -> Any:
         phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
         image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
 
-    noise_section = options_section("_NoiseSection", SensorNoise)
-
     class SimulationSection(Section):
         vibration: VibrationSection
-        num_frames: int = 2
-        frame_size: list[int] | None = None
-        noise: noise_section | None = None  # type: ignore[valid-type]
-        seed: int = 0
-
-        @model_validator(mode="after")
-        def _check(self) -> Self:
-            check_whole_number("num_frames", self.num_frames, at_least=1)
-            check_whole_number("seed", self.seed, at_least=0)
-            if self.frame_size is not None and (len(self.frame_size) != 2 or min(self.frame_size) < 1):
-                raise ValueError(f"frame_size must be [height, width] in px, got {self.frame_size}")
-            checked(self.simulation)
-            return self
-
-        def simulation(self) -> Simulation:
-            """The values as a ``Simulation``."""
-            size = None if self.frame_size is None else (self.frame_size[0], self.frame_size[1])
-            noise = None if self.noise is None else SensorNoise(**_given(self.noise))
-            return Simulation(self.vibration.to_vibration(), self.num_frames, size, noise, self.seed)
+        num_frames: Count = Field(default=2, description="Number of frames.")
+        frame_size: tuple[Count, Count] | None = Field(
+            default=None,
+            strict=False,
+            description="(height, width) of the frames in px; None for the largest size that the scene allows.",
+        )
+        noise: SensorNoise | None = None
+        seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Seed of the noise.")
 
     return SimulationSection
 
 
-_OpticsSection = options_section("_OpticsSection", OpticsSettings)
-_DetectionSection = options_section("_DetectionSection", DetectionSettings)
+class ConfigFile(Section):
+    """All tables of a file; the keys of ``[simulation]`` are those of ``simulation_section``."""
 
-
-class _StackSection(Section):
-    """``[stack]``: processing of stacks in windows."""
-
-    window: int = Field(
-        default=DEFAULT_WINDOW, ge=2, description="Largest number of frames in which one vibration is detected."
-    )
-    bad_frames: BadFrames = Field(
-        default="pass",
-        description='Frames that cannot be read or used: ``"pass"`` writes them unchanged, ``"skip"`` leaves them out.',
-    )
-
-
-def _restoration_section(method: object) -> Any:
-    """``[restoration]``: the keys depend on the method."""
-    settings = METHOD_SETTINGS.get(method if isinstance(method, str) else "exact", METHOD_SETTINGS["exact"])
-    common: dict[str, Any] = {"method": Literal[*METHOD_SETTINGS], "saturation": float | None}
-    if "prior" in settings.__annotations__:
-        common["prior"] = PriorName
-        common["mosaic"] = Mosaic | None
-        common["optics"] = _OpticsSection | None
-    return options_section("_RestorationSection", settings, **common)
-
-
-def file_section(method: object = "exact") -> Any:
-    """Class of the file for a restoration method, without the keys of ``[simulation]``."""
-    return create_model(
-        "_Root",
-        __base__=Section,
-        sensor=(SensorSection, ...),
-        detection=(_DetectionSection | None, None),
-        restoration=(_restoration_section(method) | None, None),
-        simulation=(Any, None),
-        stack=(_StackSection | None, None),
-    )
+    sensor: SensorSection
+    detection: ToneOptions | None = None
+    restoration: RestorationOptions | None = None
+    simulation: Any = None
+    stack: WindowOptions | None = None
 
 
 def presets() -> dict[str, str]:
@@ -275,21 +218,19 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
             replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}
-    restoration = data.get("restoration")
-    root = file_section(restoration.get("method") if isinstance(restoration, dict) else None)
-    content = validate(root, data, source)
+    content = validate(ConfigFile, data, source)
     simulation = None
     if content.simulation is not None:
         part: Any = create_model("_Part", __base__=Section, simulation=(simulation_section(), ...))
-        simulation = validate(part, {"simulation": content.simulation}, source).simulation.simulation()
+        simulation = validate(part, {"simulation": content.simulation}, source).simulation
     return Config(
         source=source,
         timing=content.sensor.to_timing(),
         full_scale=content.sensor.full_scale,
-        detection=_given(content.detection),
-        restoration=_given(content.restoration),
+        detection=data.get("detection", {}),
+        restoration=data.get("restoration", {}),
         simulation=simulation,
-        stack=_given(content.stack),
+        stack=data.get("stack", {}),
         path=None if path is None else Path(path),
     )
 
@@ -303,8 +244,3 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a TOML file: {error}") from error
-
-
-def _given(section: Any) -> dict[str, Any]:
-    """The keys that are in the file; the functions that take the options have the defaults."""
-    return {} if section is None else section.model_dump(exclude_unset=True)

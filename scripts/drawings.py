@@ -41,6 +41,7 @@ ARCHITECTURE = (
     (("frames", "input preparation: files, dtype, masks, orientation"),),
     (("io", "file formats"),),
     (("motion", "timing, vibration, spline, recorded motion"),),
+    (("options", "groups of options: types, bounds, defaults, descriptions"),),
     (("core", "FFT, splines, banded systems, parallel, checks"),),
 )
 

@@ -1,13 +1,13 @@
 #!/usr/bin/env python
 """Write docs/configuration.md (all keys of the TOML file), docs/commands.md (all commands) and docs/reasons.md.
 
-Types and defaults come from the sections of the configuration and the parameters of the commands, descriptions from
-docstrings and help texts, reasons from their table in core/reason.py. A test fails if the pages are out of date.
+Types, defaults and descriptions come from the groups of options and the parameters of the commands, reasons from their
+table in core/reason.py. A test fails if the pages are out of date.
 """
 
 import argparse
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,10 +16,10 @@ import typer
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import app
-from rsvib_torch.config import Simulation, file_section, simulation_section
+from rsvib_torch.config import SensorSection, simulation_section
 from rsvib_torch.core.reason import GROUPS
-from rsvib_torch.core.validation import expected_text
-from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.core.validation import expected_text, fields_of
+from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTE = "<!-- Written by scripts/reference_pages.py: change the docstrings and help texts, then run make pages. -->"
@@ -36,7 +36,7 @@ and the expected value.
 SENSOR = """The camera. Exposure and frame period are in seconds (`exposure_time`, `frame_rate`) or in row times
 (`exposure_rows`, `frame_rows`); both keys of a pair may be given if they agree within 0.1 %.
 [Your own camera](your_own_camera.md) explains how to find the values."""
-SATURATION = "Level from which pixels are saturated, in the unit of the file; without it full scale for integer files."
+SATURATION = "`saturation` is in the unit of the file."
 COMMANDS = f"""{NOTE}
 
 # Commands
@@ -77,65 +77,43 @@ def value_text(value: object) -> str:
     return "`" + text.replace("'", '"') + "`"
 
 
-def key_table(
-    section: Any, meaning: dict[str, str], function: Callable[..., Any] | None = None, keys: Iterable[str] = ()
-) -> list[str]:
-    """Table of the keys of a section.
+def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] | None = None) -> list[str]:
+    """Table of keys.
 
     Args:
-        section: Class of the section.
-        meaning: Descriptions of the keys whose field has none.
-        function: Its arguments have the defaults; None if the fields of the section have them.
+        group: Group of options, or section.
         keys: Keys to list, by default all.
+        meaning: Descriptions of keys whose field has none.
     """
-    arguments = inspect.signature(function).parameters if function else {}
     rows = []
-    for name in keys or section.model_fields:
-        field = section.model_fields[name]
-        default = arguments[name].default if function else field.get_default(call_default_factory=True)
-        shown = "required" if field.is_required() else value_text(default)
+    for name in keys or fields_of(group):
+        field = fields_of(group)[name]
+        shown = "required" if field.is_required() else value_text(field.get_default(call_default_factory=True))
         kind = expected_text(field.annotation).replace("'", '"')
-        rows.append([f"`{name}`", kind, shown, field.description or meaning[name]])
+        rows.append([f"`{name}`", kind, shown, field.description or (meaning or {})[name]])
     return table(("key", "type", "default", "meaning"), rows)
-
-
-def section_of(model: Any, name: str) -> Any:
-    """Class of a table of a section."""
-    annotation = model.model_fields[name].annotation
-    return next((member for member in get_args(annotation) if hasattr(member, "model_fields")), annotation)
 
 
 def configuration_page() -> str:
     """Markdown of the reference of the configuration file."""
-    file = file_section()
     simulation = simulation_section()
     plain = [key for key in simulation.model_fields if key not in ("vibration", "noise")]
-    vibration, noise = section_of(simulation, "vibration"), section_of(simulation, "noise")
-    meaning = documented(rsv.restore) | {"saturation": SATURATION}
+    vibration = simulation.model_fields["vibration"].annotation
     lines = [CONFIGURATION, "## [sensor]", "", SENSOR, ""]
-    lines += key_table(section_of(file, "sensor"), documented(rsv.SensorTiming))
-    lines += ["## [detection]", "", "Options of `detect_vibration`.", ""]
-    lines += key_table(section_of(file, "detection"), documented(rsv.detect_vibration), rsv.detect_vibration)
-    lines += ["## [restoration]", "", "Options of `restore` for all methods:", ""]
-    lines += key_table(section_of(file, "restoration"), meaning, rsv.restore, ("method", "saturation"))
-    for name, method in METHODS.items():
-        section = section_of(file_section(name), "restoration")
-        shared = [key for key in section.model_fields if key in ("mosaic", "optics")]
-        own = [key for key in section.model_fields if key not in ("method", "saturation", *shared)]
-        lines += [f'Options of `method = "{name}"`:', ""]
-        lines += key_table(section, documented(method.function), method.function, own)
-        if shared:
-            lines[-1:] = key_table(section, meaning, rsv.restore, shared)[2:]
-    optics = section_of(section_of(file, "restoration"), "optics")
-    lines += ["## [restoration.optics]", "", "Optics of the camera, see `optics`.", ""]
-    lines += key_table(optics, documented(rsv.Optics), rsv.Optics)
-    lines += ["## [stack]", "", "Processing of stacks in windows.", "", *key_table(section_of(file, "stack"), {})]
+    lines += key_table(SensorSection)
+    lines += ["## [detection]", "", "Options of `detect_vibration`.", "", *key_table(ToneOptions)]
+    lines += ["## [restoration]", "", f"Options of `restore` for all methods. {SATURATION}", ""]
+    lines += key_table(RestorationOptions, ("method", "saturation"))
+    for name, group in METHOD_OPTIONS.items():
+        lines += [f'Options of `method = "{name}"`:', "", *key_table(group)]
+    lines += ["## [restoration.optics]", "", "Optics of the camera, see `optics`.", "", *key_table(OpticsOptions)]
+    lines += ["## [stack]", "", "Processing of stacks in windows.", "", *key_table(WindowOptions)]
     lines += ["## [simulation]", "", "For `rsvib simulate`.", ""]
-    lines += key_table(simulation, documented(Simulation), keys=plain)
+    lines += key_table(simulation, plain)
     lines += ["## [simulation.vibration]", "", "The motion that is simulated; required for a simulation.", ""]
-    lines += key_table(vibration, documented(rsv.Vibration))
+    lines += key_table(vibration, meaning=documented(rsv.Vibration))
     lines += ["## [simulation.noise]", "", "Noise of the sensor; none without this table.", ""]
-    lines += key_table(noise, documented(rsv.SensorNoise), rsv.SensorNoise)
+    lines += key_table(rsv.SensorNoise)
     return "\n".join(lines)
 
 

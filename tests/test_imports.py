@@ -13,6 +13,7 @@ PACKAGE = Path(rsvib_torch.__file__).parent
 # From the lowest layer to the highest. A part may import from lower layers only; parts of one layer are independent.
 LAYERS = (
     {"core"},
+    {"options"},
     {"motion"},
     {"io"},
     {"frames"},
@@ -167,7 +168,7 @@ def test_no_two_modules_share_a_name():
 
 
 def test_the_top_level_holds_packages_and_the_configuration():
-    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "__main__.py", "config.py"}
+    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "__main__.py", "config.py", "options.py"}
 
 
 def test_modules_that_use_a_displacement_per_row_state_the_invariant():

@@ -11,11 +11,11 @@ import typer
 
 from rsvib_torch import detection, io, restoration
 from rsvib_torch import report as reports
-from rsvib_torch.commands.options import OverwriteOption, check_new
+from rsvib_torch.commands.shared_options import OverwriteOption, check_new
 from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.core.atomic import check_writable
-from rsvib_torch.core.option_types import ExportFormat, IsdModel, StmapConvention
 from rsvib_torch.core.validation import read_json
+from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
 
 if TYPE_CHECKING:
     from rsvib_torch.detection import DetectionResult

@@ -11,7 +11,7 @@ import typer
 
 from rsvib_torch import io
 from rsvib_torch.commands.answers import command_text
-from rsvib_torch.commands.options import (
+from rsvib_torch.commands.shared_options import (
     READOUT_HELP,
     SCAN_AXIS_HELP,
     ExposureOption,
@@ -22,28 +22,17 @@ from rsvib_torch.commands.options import (
     stated_rate,
 )
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
-from rsvib_torch.config import presets, read_config
+from rsvib_torch.config import SensorSection, presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.text import printable
-from rsvib_torch.core.validation import MistakesError
+from rsvib_torch.core.validation import MistakesError, fields_of
 from rsvib_torch.motion.timing import SensorTiming
 
 __all__ = ["init", "sensor_toml"]
 
 # How to find each value of [sensor]: comments of the file, and the text of questions and errors.
-_HINTS = {
-    "row_time": "Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row period; "
-    "'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because sensors have "
-    "blanking rows.",
-    "exposure_time": "Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
-    "exposure_rows": "Exposure time divided by row_time.",
-    "frame_rate": "Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
-    "frame_rows": "Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
-    "scan_axis": "'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
-    "readout_direction": "'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
-    "full_scale": "Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file.",
-}
+_HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
 
 
 def init(

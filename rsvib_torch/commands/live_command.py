@@ -10,16 +10,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
 import typer
 
 from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
-from rsvib_torch.commands.options import (
+from rsvib_torch.commands.shared_options import (
+    CameraSettings,
     OverwriteOption,
     ScaleOption,
-    camera_options,
     check_new,
     file_of_source,
 )
@@ -27,8 +27,8 @@ from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import METHOD_SETTINGS, BorderName, method_options
 from rsvib_torch.core.text import number_of
+from rsvib_torch.options import METHOD_OPTIONS, BorderName, TrackerOptions, method_options
 
 if TYPE_CHECKING:
     from rsvib_torch.live import FrameOutput, FrameSource, LiveReport
@@ -39,14 +39,13 @@ __all__ = ["live_session"]
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 
 
-@camera_options
 def live_session(
     source: Annotated[
         str,
         typer.Argument(help="Number or URL of a camera, - for raw frames on standard input, or a file with frames."),
     ],
     *,
-    settings: Config,
+    settings: CameraSettings,
     out: Annotated[
         Path | None, typer.Option(help="Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout.")
     ] = None,
@@ -69,11 +68,15 @@ def live_session(
     method: Annotated[
         str | None,
         typer.Option(
-            help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or dewarp"
+            help=f"Restoration method: {', '.join(METHOD_OPTIONS)}.", show_default="from the configuration, or dewarp"
         ),
     ] = None,
-    columns: Annotated[int, typer.Option(help="Columns that are measured: those with the most detail.", min=64)] = 384,
-    window: Annotated[int, typer.Option(help="Frames from which the vibration is detected at first.", min=2)] = 8,
+    columns: Annotated[
+        int | None, typer.Option(help="Columns that are measured: those with the most detail.", min=64)
+    ] = TrackerOptions.columns,
+    window: Annotated[
+        int, typer.Option(help="Frames from which the vibration is detected at first.", min=2)
+    ] = TrackerOptions.window,
     steady: Annotated[
         float,
         typer.Option(
@@ -110,7 +113,7 @@ def live_session(
     for path in written:
         check_writable(path)
     options = dict(settings.restoration)
-    name = method or options.get("method", "dewarp")
+    name: Any = method or options.get("method", "dewarp")
     options = {key: value for key, value in options.items() if key in method_options(name) and key != "joint"}
 
     def opened() -> FrameSource:

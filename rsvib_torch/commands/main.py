@@ -1,28 +1,25 @@
 """The ``rsvib`` program: its commands, and one line for every error."""
 
-import inspect
 import io
 import logging
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated
 
 import typer
 
 import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
 from rsvib_torch.commands.export_command import export
+from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import init
 from rsvib_torch.commands.live_command import live_session
-from rsvib_torch.commands.options import DebugOption, JsonOption, QuietOption
 from rsvib_torch.commands.terminal import (
     Answer,
     error_line,
-    output_of,
     print_line,
     running,
-    show_answer,
     warnings_in_one_line,
 )
 from rsvib_torch.commands.unexpected_errors import in_one_line, system_error
@@ -142,24 +139,6 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 
 
-def _with_output(name: str, function: Callable[..., Answer]) -> Callable[..., None]:
-    """A command that prints its answer, with the options ``--json``, ``--quiet`` and ``--debug``."""
-
-    def command(*, as_json: bool = False, quiet: bool = False, debug: bool = False, **arguments: Any) -> None:
-        with output_of(as_json=as_json, quiet=quiet):
-            show_answer(name, function(**arguments))
-
-    parameters = inspect.signature(function, eval_str=True).parameters.values()
-    hints = get_type_hints(function, include_extras=True)
-    own = inspect.signature(command).parameters
-    options = {"as_json": JsonOption, "quiet": QuietOption, "debug": DebugOption}
-    added = [own[option].replace(annotation=kind) for option, kind in options.items()]
-    command.__signature__ = inspect.Signature([*parameters, *added])  # type: ignore[attr-defined]
-    command.__annotations__ = hints | options
-    command.__doc__ = function.__doc__
-    return command
-
-
 # plain help texts: rich would read [sensor] as markup and join the lines of the examples
 app = typer.Typer(name="rsvib", rich_markup_mode=None, context_settings=_SETTINGS, pretty_exceptions_enable=False)
 for _name, _function, _help, _examples in _COMMANDS:
@@ -168,7 +147,7 @@ for _name, _function, _help, _examples in _COMMANDS:
         short_help=_help,
         epilog="\b\nExamples:" + _examples.replace("\n        ", "\n  ").rstrip(),  # \b keeps the lines
         context_settings=_SETTINGS,
-    )(_with_output(_name, _function))
+    )(flat_command(_name, _function))
 
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 

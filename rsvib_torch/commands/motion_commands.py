@@ -13,15 +13,15 @@ import rsvib_torch
 from rsvib_torch import calibration, detection, io
 from rsvib_torch.commands.answers import command_text, restoration_data, restoration_lines
 from rsvib_torch.commands.init import sensor_toml
-from rsvib_torch.commands.options import (
+from rsvib_torch.commands.shared_options import (
     READOUT_HELP,
+    CameraSettings,
     DeviceOption,
     FrameRateOption,
     FramesArgument,
     OverwriteOption,
     RestoredArgument,
     ScaleOption,
-    camera_options,
     check_new,
     full_scale_of,
     restoration_options,
@@ -30,10 +30,9 @@ from rsvib_torch.commands.options import (
 )
 from rsvib_torch.commands.stack_commands import load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
-from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_file
-from rsvib_torch.core.option_types import MotionUnit, TimeUnit
 from rsvib_torch.core.text import measured_text
+from rsvib_torch.options import FreeMotionOptions, MotionUnit, TimeUnit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,11 +51,10 @@ if TYPE_CHECKING:
 __all__ = ["calibrate", "known", "motion"]
 
 
-@camera_options
 def motion(
     frames: FramesArgument,
     *,
-    settings: Config,
+    settings: CameraSettings,
     out: Annotated[
         Path,
         typer.Option(help="CSV file to write: time in s, x and y in px, and their standard deviations (model free)."),
@@ -68,10 +66,12 @@ def motion(
             "whose frequency changes linearly."
         ),
     ] = "free",
-    knot_rows: Annotated[int, typer.Option(help="Distance of the knots of a free motion, in rows.")] = 24,
+    knot_rows: Annotated[
+        int, typer.Option(help="Distance of the knots of a free motion, in rows.")
+    ] = FreeMotionOptions.knot_rows,
     search: Annotated[
         int, typer.Option(help="Search range for the offset of a row, in px around the offset of its whole frame.")
-    ] = 16,
+    ] = FreeMotionOptions.search,
     device: DeviceOption = "auto",
     full_scale: ScaleOption = None,
     overwrite: OverwriteOption = False,
@@ -145,12 +145,11 @@ def _sampled(motion: FreeMotion, last: float, knots: float) -> tuple[Array, Arra
     return times, motion.displacement(torch.from_numpy(times).to(motion.device)).cpu().numpy()
 
 
-@camera_options
 def known(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
-    settings: Config,
+    settings: CameraSettings,
     motion: Annotated[
         Path,
         typer.Option(

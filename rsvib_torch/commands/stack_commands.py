@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,25 +21,19 @@ from rsvib_torch.commands.answers import (
     step_with_force,
     steps_after_detection,
 )
-from rsvib_torch.commands.options import (
+from rsvib_torch.commands.flat_command import MadeBy, group_arguments
+from rsvib_torch.commands.shared_options import (
+    CameraSettings,
     DeviceName,
     DeviceOption,
-    FinerOption,
     ForceOption,
     FramesArgument,
-    JointOption,
     MemoryOption,
-    MethodOption,
-    MosaicOption,
-    OpticsOption,
-    Overrides,
     OverwriteOption,
-    PriorOption,
+    RestorationArguments,
     RestoredArgument,
-    SaturationOption,
     ScaleOption,
     WorkersOption,
-    camera_options,
     check_new,
     full_scale_of,
     restoration_options,
@@ -51,9 +45,9 @@ from rsvib_torch.commands.video_command import check_followed, followed_figure, 
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder, write_json
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames, BorderName
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import number_of, printable
+from rsvib_torch.options import BorderName, WindowOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -244,12 +238,11 @@ _OF_DETECTION = ("vibration.json", "offsets.csv", "offsets.png")
 _OF_WINDOWS = ("manifest.json", "windows.json", "windows.csv", "windows.png")
 
 
-@camera_options
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Image of the scene at rest, larger than the frames.")],
     frames: Annotated[Path, typer.Argument(help="Stack to write.")],
     *,
-    settings: Config,
+    settings: CameraSettings,
     device: DeviceOption = "auto",
     full_scale: Annotated[
         float | None, typer.Option(help="Count of the scene's file that corresponds to full scale.")
@@ -271,6 +264,7 @@ def simulate(
             f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
         )
     simulation, target = settings.simulation, torch_device(device)
+    vibration = simulation.vibration.to_vibration()
     image = io.read_stack(scene, full_scale=full_scale)
     if len(image) != 1:
         raise ValueError(f"{scene}: the scene must be one image, this file has {len(image)} frames")
@@ -281,7 +275,7 @@ def simulate(
         simulated = imaging.simulate_frames(
             image[0].to(target),
             settings.timing,
-            simulation.vibration,
+            vibration,
             simulation.num_frames,
             frame_size=simulation.frame_size,
             noise=simulation.noise,
@@ -293,18 +287,17 @@ def simulate(
     line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
     run_it = command_text("run", frames, frames.with_name("results"), *settings.arguments)
     return Answer(
-        {"Simulated frames": [line, f"vibration:\n{simulation.vibration}"]},
-        {"shape": list(simulated.shape), "dtype": dtype, "vibration": simulation.vibration.to_dict()},
+        {"Simulated frames": [line, f"vibration:\n{vibration}"]},
+        {"shape": list(simulated.shape), "dtype": dtype, "vibration": vibration.to_dict()},
         [frames],
         [f"detect the vibration and restore the frames:\n  {run_it}"],
     )
 
 
-@camera_options
 def detect(
     frames: FramesArgument,
     *,
-    settings: Config,
+    settings: CameraSettings,
     out: Annotated[Path, typer.Option(help="Folder for vibration.json, offsets.csv and offsets.png.")],
     window: Annotated[
         int | None,
@@ -371,22 +364,15 @@ def _warn_of_failures(windows: int) -> None:
         error_line(f"detection failed in {number_of(windows, 'window')}: see manifest.json", "warning")
 
 
-@camera_options
 def restore_frames(
     frames: FramesArgument,
     restored: RestoredArgument,
     *,
-    settings: Config,
+    settings: CameraSettings,
     vibration: Annotated[
         Path, typer.Option(help="The vibration.json, or manifest.json of windows, written by detect or run.")
     ],
-    method: MethodOption = None,
-    joint: JointOption = None,
-    finer: FinerOption = None,
-    mosaic: MosaicOption = None,
-    optics_sigma: OpticsOption = None,
-    prior: PriorOption = None,
-    saturation: SaturationOption = None,
+    restoration: RestorationArguments,
     force: ForceOption = False,
     report: Annotated[
         Path | None, typer.Option(help="JSON file to write: whether restoration helped, with the measured values.")
@@ -399,7 +385,6 @@ def restore_frames(
 
     If the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
-    overrides = Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
     outputs, inputs = io.stack_files(restored), [*io.stack_files(frames), settings.path, vibration]
     check_new([*outputs, *([] if report is None else [report])], overwrite, inputs)
     check_regular(vibration)
@@ -409,11 +394,11 @@ def restore_frames(
         if report is not None:
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
         check_new([*outputs, restored.with_name(f"{restored.name}.manifest.json")], overwrite, inputs)
-        return _restore_windows(frames, restored, settings, vibration, overrides, force, device, full_scale)
+        return _restore_windows(frames, restored, settings, vibration, restoration, force, device, full_scale)
     info = io.read_stack_info(frames)
     detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, overrides)
+    options = restoration_options(info, scale, settings, restoration)
     io.check_stack_target(restored, restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
@@ -437,7 +422,7 @@ def _restore_windows(
     restored: Path,
     config: Config,
     vibration: Path,
-    overrides: Overrides,
+    given: Mapping[str, Any],
     force: bool,
     device: DeviceName,
     full_scale: float | None,
@@ -471,7 +456,7 @@ def _restore_windows(
             config.timing,
             window=window,
             given=manifest.detections(),
-            restoration=restoration_options(info, scale, config, overrides),
+            restoration=restoration_options(info, scale, config, given),
             full_scale=scale,
             force=force,
             device=str(torch_device(device)),
@@ -487,12 +472,11 @@ def _restore_windows(
     )
 
 
-@camera_options
 def run(
     frames: FramesArgument,
     out: Annotated[Path, typer.Argument(help="Folder for the restored frames, the vibration and the figures.")],
     *,
-    settings: Config,
+    settings: CameraSettings,
     output: Annotated[
         str,
         typer.Option(
@@ -525,28 +509,9 @@ def run(
         ),
     ] = None,
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
-    method: MethodOption = None,
-    joint: JointOption = None,
-    finer: FinerOption = None,
-    mosaic: MosaicOption = None,
-    optics_sigma: OpticsOption = None,
-    prior: PriorOption = None,
-    saturation: SaturationOption = None,
+    restoration: RestorationArguments,
     force: ForceOption = False,
-    window: Annotated[
-        int | None,
-        typer.Option(
-            help="Largest number of frames that are processed together; longer stacks are divided into windows.",
-            show_default=f"from the configuration, or {DEFAULT_WINDOW}",
-        ),
-    ] = None,
-    bad_frames: Annotated[
-        BadFrames | None,
-        typer.Option(
-            help="Frames that cannot be read or used: 'pass' writes them unchanged, 'skip' leaves them out.",
-            show_default="from the configuration, or pass",
-        ),
-    ] = None,
+    windows: Annotated[dict[str, Any], MadeBy(group_arguments(WindowOptions))],
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     memory: MemoryOption = None,
     workers: WorkersOption = None,
@@ -580,15 +545,14 @@ def run(
     info = io.read_stack_info(frames)
     print_notes(info, settings)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(
-        info, scale, settings, Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
-    )
-    frames_at_once = settings.stack.get("window", DEFAULT_WINDOW) if window is None else window
+    options = restoration_options(info, scale, settings, restoration)
+    chosen = WindowOptions(**{**settings.stack, **windows})
+    frames_at_once = chosen.window
     requested = border is not None or steady is not None
     if video and is_followed(frames, info.shape[0], frames_at_once, requested=requested):
-        windows_only = {"--window": window, "--bad-frames skip": bad_frames == "skip"}
+        windows_only = {"--window": windows.get("window"), "--bad-frames skip": windows.get("bad_frames") == "skip"}
         check_followed(windows_only | {"--scheduler": scheduler, "--compression": compression}, options)
-        if saturation is None and settings.restoration.get("saturation") is None:
+        if {**settings.restoration, **restoration}.get("saturation") is None:
             options.pop("saturation", None)  # that of integer formats
         answer = run_followed(
             frames,
@@ -626,7 +590,7 @@ def run(
             out / output,
             settings.timing,
             **common,
-            bad_frames=bad_frames or settings.stack.get("bad_frames", "pass"),
+            bad_frames=chosen.bad_frames,
             scheduler=scheduler,
             compression=compression,
             resume=resume,
@@ -731,12 +695,11 @@ def _comparison(frames: Path, full_scale: float | None, first: WindowResult, pat
     return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
 
 
-@camera_options
 def report(
     frames: FramesArgument,
     out: Annotated[Path, typer.Argument(help="Folder for report.html and its figures.")],
     *,
-    settings: Config,
+    settings: CameraSettings,
     edge: Annotated[
         list[str] | None,
         typer.Option(
@@ -751,13 +714,7 @@ def report(
             help="The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."
         ),
     ] = None,
-    method: MethodOption = None,
-    joint: JointOption = None,
-    finer: FinerOption = None,
-    mosaic: MosaicOption = None,
-    optics_sigma: OpticsOption = None,
-    prior: PriorOption = None,
-    saturation: SaturationOption = None,
+    restoration: RestorationArguments,
     force: Annotated[
         bool, typer.Option("--force", help="Show the restored frames even if they are judged no better than the input.")
     ] = False,
@@ -775,9 +732,7 @@ def report(
     _check_folder(out, ["report.html"], overwrite, inputs)
     info = io.read_stack_info(frames)
     scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(
-        info, scale, settings, Overrides(method, joint, prior, saturation, finer, mosaic, optics_sigma)
-    )
+    options = restoration_options(info, scale, settings, restoration)
     stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")

@@ -5,18 +5,19 @@ that PyTorch cannot compute with, a number that is not finite or beyond all phys
 are refused with the name of the argument. Bounds that depend on the function are checked by the function.
 """
 
-import collections.abc
 import inspect
 import math
+import operator
 import os
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
-from functools import cache, wraps
+from dataclasses import dataclass, fields
+from functools import cache, reduce, wraps
 from typing import (
+    Annotated,
     Any,
-    Literal,
     ParamSpec,
+    Self,
     TypeVar,
     Union,
     Unpack,
@@ -28,9 +29,12 @@ from typing import (
 
 import numpy as np
 import torch
+from pydantic import ConfigDict, Field, Strict, TypeAdapter
+from pydantic_core import core_schema
 from torch import Tensor
 
-from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number, check_whole_number, described
+from rsvib_torch.core.checks import MAX_NUMBER, described
+from rsvib_torch.core.validation import Number, members_of, validated
 
 __all__ = [
     "as_numbers",
@@ -38,17 +42,17 @@ __all__ = [
     "check_device",
     "check_fields",
     "check_images",
-    "check_options",
     "check_pixels",
     "check_shapes",
     "check_tensor",
+    "checked_methods",
     "checks_arguments",
 ]
 
 P = ParamSpec("P")
 R = TypeVar("R")
-_Check = Callable[[str, Any], None]
 _ARRAYS = (Tensor, np.ndarray)
+_PLAIN = (bool, float, str, type(None), object)  # types that pydantic checks itself
 
 
 def check_tensor(name: str, value: object) -> Tensor:
@@ -204,23 +208,6 @@ def check_pixels(name: str, pixels: Tensor) -> None:
         )
 
 
-def check_options(options: Mapping[str, Any], kind: type) -> None:
-    """Check options against the annotations of a ``TypedDict``.
-
-    Example:
-        >>> from typing import TypedDict
-        >>> Options = TypedDict("Options", {"iterations": int})
-        >>> check_options({"iterations": 1.5}, Options)
-        Traceback (most recent call last):
-        ...
-        TypeError: iterations must be a whole number, got 1.5 (float)
-    """
-    checks = _option_checks(kind)
-    for name, value in options.items():
-        if check := checks.get(name):
-            check(name, value)
-
-
 def check_broadcast(**tensors: Any) -> None:
     """Raise a ``ValueError`` unless tensors broadcast; other values are omitted.
 
@@ -265,8 +252,7 @@ def check_device(name: str, value: object) -> torch.device:
 def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Check the arguments of a function against its annotations before each call.
 
-    Arguments that accept arrays are left to ``as_tensor``, which the function calls. Compiled graphs omit the
-    checks.
+    Arguments that accept arrays are left to ``as_tensor``, which the function calls. Compiled graphs omit the checks.
 
     Example:
         >>> @checks_arguments
@@ -283,15 +269,25 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():
-            return function(*args, **kwargs)
-        checks = _checks_of(function)
-        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
-            if check := checks.get(name):
-                check(name, value)
+        if not torch.compiler.is_compiling():
+            kinds = _hints(function)
+            for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+                if name in kinds:
+                    _checked(name, value, kinds[name])
         return function(*args, **kwargs)
 
     return checked
+
+
+def checked_methods(kind: type[R]) -> type[R]:
+    """Check the arguments of the public methods that a class defines against their annotations before each call."""
+    for name, method in tuple(vars(kind).items()):
+        function = method.__func__ if isinstance(method, classmethod) else method
+        is_public = name in ("__init__", "__getitem__") or not name.startswith("_")
+        if isinstance(function, types.FunctionType) and is_public and len(function.__annotations__) > 1:
+            checked = checks_arguments(function)
+            setattr(kind, name, classmethod(checked) if isinstance(method, classmethod) else checked)
+    return kind
 
 
 def check_fields(value: Any) -> None:
@@ -300,195 +296,77 @@ def check_fields(value: Any) -> None:
     Raises:
         TypeError: If a field has another type; numbers may be infinite or NaN.
     """
-    for name, check, is_tuple in _field_checks(value.__class__):
+    kinds = _hints(value.__class__)
+    for name in (field.name for field in fields(value)):
         given = getattr(value, name)
-        check(name, given)
-        if is_tuple and given is not None and not isinstance(given, tuple):
-            given = tuple(given.tolist() if isinstance(given, _ARRAYS) else given)
-            check(name, given)
-            object.__setattr__(value, name, given)
+        made = _checked(name, given, kinds[name], finite=False)
+        if isinstance(made, tuple) and not isinstance(given, tuple):
+            object.__setattr__(value, name, made)
 
 
 @cache
-def _field_checks(kind: type) -> list[tuple[str, _Check, bool]]:
-    """Name and check of each field, and whether it is a tuple."""
-    hints = get_type_hints(kind, localns={"Tensor": Tensor})
-    checks = ((name, _check(hints[name], finite=False)) for name in (field.name for field in fields(kind)))
-    return [
-        (name, check, tuple in (get_origin(hints[name]), *map(get_origin, get_args(hints[name]))))
-        for name, check in checks
-        if check is not None
-    ]
-
-
-@cache
-def _option_checks(kind: type) -> dict[str, _Check | None]:
-    return {name: _check(hint) for name, hint in get_type_hints(kind).items()}
-
-
-@cache
-def _checks_of(function: Callable[..., Any]) -> dict[str, _Check]:
-    """Check of each parameter and option by name."""
-    checks: dict[str, _Check | None] = {}
-    given = {name: kind for name, kind in function.__annotations__.items() if name != "return"}
-    names = inspect.unwrap(function).__globals__
+def _hints(owner: Any) -> dict[str, Any]:
+    """Annotations of the arguments of a function, or of the fields of a class."""
+    given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
+    if isinstance(owner, type):
+        return get_type_hints(owner, localns={"Tensor": Tensor})
+    names = inspect.unwrap(owner).__globals__
     hints = get_type_hints(types.SimpleNamespace(__annotations__=given), names, {"Tensor": Tensor, "torch": torch})
-    for parameter in inspect.signature(function).parameters.values():
-        kind = hints.get(parameter.name, Any)
-        if get_origin(kind) is Unpack:
-            checks |= _option_checks(get_args(kind)[0])
-        elif parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-            checks[parameter.name] = _check(kind)
-    return {name: check for name, check in checks.items() if check is not None}
+    for name in [name for name, kind in hints.items() if get_origin(kind) is Unpack]:
+        hints |= get_type_hints(get_args(hints.pop(name))[0])
+    return hints
 
 
-def _check(kind: Any, *, finite: bool = True) -> _Check | None:  # noqa: PLR0911, PLR0912
-    """The check of an annotation; None where every value is accepted or the function itself checks it."""
-    kind = _without_alias(kind)
-    origin, arguments = get_origin(kind), tuple(map(_without_alias, get_args(kind)))
-    if kind is Any or isinstance(kind, TypeVar):
-        return None
-    if torch.device in arguments and origin in (Union, types.UnionType):
-        return lambda name, value: None if value is None else void(check_device(name, value))
-    if origin in (Union, types.UnionType):
-        return _check_of_union(arguments, finite)
-    if origin is Literal:
-        kinds = tuple({type(choice) for choice in arguments})  # the choices are keys of tables that users extend
-        return lambda name, value: None if isinstance(value, kinds) else check_choice(name, value, arguments)
-    if kind is Tensor:
-        return lambda name, value: void(check_tensor(name, value))
-    if kind is torch.device:
-        return lambda name, value: void(check_device(name, value))
-    if kind is bool:
-        return _instance((bool, np.bool_), "True or False")
-    if kind is int:
-        return lambda name, value: void(check_whole_number(name, value, at_least=-(2**63), at_most=2**63 - 1))
+def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
+    """The value, or a tuple in place of a list or array, if it is of a kind."""
+    adapter, members = _adapter(kind, finite)
+    if torch.device in members and value is not None:
+        return check_device(name, value)
+    if adapter is None:
+        return value
+    if isinstance(value, Tensor) and Tensor in members:
+        return check_tensor(name, value)
+    if isinstance(value, _ARRAYS) and any({int, float} & {*get_args(member)} for member in members):
+        value = (check_tensor(name, value) if isinstance(value, Tensor) else value).tolist()
+    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter, kind)
+
+
+@cache
+def _adapter(kind: Any, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
+    """The check of an annotation, None where the function converts the value itself; and the members of a union."""
+    members = members_of(kind)
+    made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1
+    if made_by_function or any(getattr(member, "_is_protocol", False) for member in members):
+        return None, members
+    config = ConfigDict(strict=True, allow_inf_nan=not finite)
+    return TypeAdapter(_bounded(kind, finite), config=config), members
+
+
+def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
+    """The annotation without numbers beyond all physical quantities, with lists in place of tuples, for pydantic."""
     if kind is float and finite:
-        return lambda name, value: void(check_number(name, value, at_least=-MAX_NUMBER, at_most=MAX_NUMBER))
-    if kind is float:
-        return _instance((float, int, np.floating, np.integer), "a number")
-    if kind is types.NoneType:
-        return _instance((types.NoneType,), "None")
-    if origin is os.PathLike or kind is os.PathLike:
-        return _instance((os.PathLike,), "a path")
-    if kind is str:
-        return _instance((str,), "text")
-    if origin is tuple or (inspect.isclass(origin) and issubclass(origin, Sequence)):
-        return _check_of_sequence(origin, arguments, finite)
-    if origin is np.ndarray:
-        return _instance((np.ndarray,), "a NumPy array")
-    if inspect.isclass(origin) and issubclass(origin, Mapping):
-        return _check_of_mapping(arguments, finite)
-    if origin is collections.abc.Callable:
-        return lambda name, value: None if callable(value) else _refuse(name, "a function", value)
-    if inspect.isclass(kind) and origin is None and not is_typeddict(kind) and kind is not object:
-        if getattr(kind, "_is_protocol", False) and not getattr(kind, "_is_runtime_protocol", False):
-            return None
-        article, source = "an" if kind.__name__[0] in "AEIOU" else "a", getattr(kind, "_MADE_BY", "")
-        return _instance((kind,), f"{article} {kind.__name__}{source and f' ({source})'}")
-    return None
+        return Number
+    if kind is int:
+        return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
+    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False) or is_typeddict(kind):
+        return Any
+    if get_origin(kind) in (os.PathLike, np.ndarray) or (
+        isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
+    ):
+        return Annotated[Any, _Instance(get_origin(kind) or kind)]
+    arguments: Any = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
+    if get_origin(kind) is tuple:
+        return Annotated[tuple.__class_getitem__(arguments), Strict(False)]
+    if get_origin(kind) in (Union, types.UnionType):
+        return reduce(operator.or_, arguments)
+    return get_origin(kind)[arguments] if get_origin(kind) in (Sequence, Mapping, list, dict) else kind
 
 
-def _without_alias(kind: Any) -> Any:
-    """What a ``type`` statement stands for, as numpy.typing.NDArray from NumPy 2.5 on; other annotations unchanged."""
-    alias = kind if get_origin(kind) is None else get_origin(kind)
-    return alias.__value__ if type(alias).__name__ == "TypeAliasType" else kind
+@dataclass(frozen=True)
+class _Instance:
+    """Mark of an annotation of which pydantic checks only the class."""
 
+    kind: type
 
-def void(_: object) -> None:
-    """None, for checks that return their value."""
-
-
-def _refuse(name: str, expected: str, value: object) -> None:
-    raise TypeError(f"{name} must be {expected}, got {described(value)}")
-
-
-def _instance(kinds: tuple[type, ...], expected: str) -> _Check:
-    return lambda name, value: None if isinstance(value, kinds) else _refuse(name, expected, value)
-
-
-def _instance_of_choice(choices: tuple[Any, ...]) -> _Check:
-    """Check of the type only, among other types: the function checks the value."""
-    return _instance(tuple({type(choice) for choice in choices}), " or ".join(map(repr, choices)))
-
-
-def _check_of_union(members: tuple[Any, ...], finite: bool) -> _Check | None:
-    checks = [
-        _instance_of_choice(get_args(member)) if get_origin(member) is Literal else _check(member, finite=finite)
-        for member in members
-    ]
-    if any(get_origin(member) is np.ndarray or check is None for member, check in zip(members, checks, strict=True)):
-        return None  # as_tensor checks arrays
-    if any(getattr(member, "_is_protocol", False) for member in members):
-        return None  # the function names what it accepts, and the remedy
-
-    accepts_none = types.NoneType in members
-
-    def check(name: str, value: Any) -> None:
-        if value is None and accepts_none:
-            return
-        errors = []
-        for member in checks:
-            try:
-                if member is not None:
-                    member(name, value)
-                return
-            except (TypeError, ValueError) as error:
-                # with its traceback, it would keep the tensors of all callers in memory until the garbage collection
-                errors.append(error.with_traceback(None))
-        refused = [error for error in errors if isinstance(error, ValueError)]
-        if len(errors) == 1 or refused:
-            raise (refused or errors)[0]
-        words = dict.fromkeys(str(error).removeprefix(f"{name} must be ").partition(", got")[0] for error in errors)
-        _refuse(name, " or ".join(words), value)
-
-    return check
-
-
-def _holds_numbers(kind: Any) -> bool:
-    return kind in (int, float, bool, Any) or any(map(_holds_numbers, get_args(kind)))
-
-
-def _check_of_sequence(origin: Any, arguments: tuple[Any, ...], finite: bool) -> _Check:
-    length = len(arguments) if origin is tuple and arguments[-1:] != (...,) else None
-    parts = [_check(argument, finite=finite) for argument in arguments if argument is not ...]
-    numbers = not arguments or any(map(_holds_numbers, arguments))
-
-    def check(name: str, value: Any) -> None:
-        if numbers and isinstance(value, _ARRAYS):
-            check_tensor(name, value if isinstance(value, Tensor) else _numeric(name, value))
-            if value.ndim == 0:
-                _refuse(name, "a sequence" if length is None else f"{length} values", value)
-        elif not isinstance(value, Sequence) or isinstance(value, (str, bytes)):
-            _refuse(name, "a sequence" if length is None else f"{length} values", value)
-        if length is not None and len(value) != length:
-            raise ValueError(f"{name} must have {length} values, got {len(value)}")
-        if isinstance(value, Sequence):
-            for index, entry in enumerate(value):
-                part = parts[index] if length is not None else parts[0] if parts else None
-                if part is not None:
-                    part(f"{name}[{index}]", entry)
-
-    return check
-
-
-def _check_of_mapping(arguments: tuple[Any, ...], finite: bool) -> _Check:
-    key_check, value_check = (_check(argument, finite=finite) for argument in arguments)
-
-    def check(name: str, value: Any) -> None:
-        if not isinstance(value, Mapping):
-            _refuse(name, "a dictionary", value)
-        for key, entry in value.items():
-            if key_check is not None:
-                key_check(f"keys of {name}", key)
-            if value_check is not None:
-                value_check(f"{name}[{key!r}]", entry)
-
-    return check
-
-
-def _numeric(name: str, value: Any) -> Tensor:
-    """An array of numbers as a tensor that is not used."""
-    if isinstance(value, np.ma.MaskedArray) or value.dtype.kind not in "biuf":
-        _refuse(name, "an array of real numbers", value)
-    return torch.empty(0, dtype=torch.float32, device="cpu")
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        return core_schema.is_instance_schema(self.kind)

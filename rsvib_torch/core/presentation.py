@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
+from rsvib_torch.core.arguments import check_fields, check_shapes, checked_methods
 from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reason import texts
 from rsvib_torch.core.text import text_table, wrapped
@@ -145,6 +145,7 @@ class Summarised:
         return f'<pre style="white-space: pre-wrap">{html.escape(self.summary())}</pre>'
 
 
+@checked_methods
 class Result(Summarised):
     """Methods of a dataclass of tensors, numbers, texts and other results.
 
@@ -237,7 +238,6 @@ class Result(Summarised):
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
         return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
-    @checks_arguments
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, which ``load`` reads; an existing file is replaced.
 
@@ -252,7 +252,6 @@ class Result(Summarised):
         save_result(self, Path(path))
 
     @classmethod
-    @checks_arguments
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file that ``save`` wrote.
 
@@ -283,12 +282,10 @@ class Result(Summarised):
                 object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
         return result
 
-    @checks_arguments
     def to(self, device: torch.device | str) -> Self:
         """The same result with its tensors on another device."""
         return self.mapped(lambda values: values.to(device))
 
-    @checks_arguments
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
         """Draw the result.
 

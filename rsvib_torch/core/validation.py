@@ -1,23 +1,74 @@
-"""Checks of tables from TOML and JSON files against types, with one line per mistake."""
+"""Groups of options and tables from files: their checks, and one line for each mistake.
+
+The class of a group is the only place that states an option: its type, bounds, default and description. ``options``
+makes a class such a group. Python arguments, keys of TOML files and options of the command line are checked by it, and
+``_mistakes`` translates what pydantic reports for all of them.
+"""
 
 import json
+import os
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import PydanticCustomError, core_schema
 
+from rsvib_torch.core.checks import MAX_NUMBER, described
 from rsvib_torch.core.reading import read_text
 
-__all__ = ["MistakesError", "Section", "checked", "expected_text", "options_section", "read_json", "validate"]
+__all__ = [
+    "Count",
+    "Extensible",
+    "MistakesError",
+    "NotNegative",
+    "Number",
+    "Positive",
+    "Section",
+    "checked",
+    "expected_text",
+    "fields_of",
+    "members_of",
+    "not_an_option",
+    "options",
+    "read_json",
+    "validate",
+    "validated",
+]
 
-_Model = TypeVar("_Model", bound=BaseModel)
+_Group = TypeVar("_Group")
 _Result = TypeVar("_Result")
 _MAX_LINES = 20  # of an error message
 _MAX_JSON_BYTES = 10**9  # a manifest has about 2 KB per window
-_TYPE_NAMES = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+_TYPE_NAMES: dict[Any, str] = {
+    float: "a number",
+    int: "a whole number",
+    str: "text",
+    bool: "true or false",
+    Sequence: "a sequence",
+    Mapping: "a dictionary",
+    os.PathLike: "a path",
+}
+_CLASS_NAMES = {"Tensor": "a tensor", "ndarray": "a NumPy array"}
 _LIST_NAMES: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
+_BOUNDS = {
+    "greater_than": "larger than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than_equal": "at most {le:g}",
+    "finite_number": "finite",
+    "too_short": "{min_length} entries",
+    "too_long": "{max_length} entries",
+}
+_NOT_AN_OPTION = "not_an_option"  # kind of mistake that is a TypeError in Python
+
+# Numbers of options: finite, and of a magnitude that a quantity can have.
+Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=MAX_NUMBER, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=MAX_NUMBER, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=2**31)]
 
 
 class MistakesError(ValueError):
@@ -38,20 +89,81 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
-def options_section(name: str, options: type, **more: Any) -> Any:
-    """Create a section with the keys and types of typed options; no key is required.
+class Extensible:
+    """Mark of a choice whose names are keys of a table that users extend.
 
-    Args:
-        name: Name of the section class.
-        options: ``TypedDict`` or dataclass of the options.
-        **more: Types of further keys.
-
-    Returns:
-        A subclass of ``Section``. Options that are not in a file are None in it and not in ``model_fields_set``.
+    Files may contain only the names of the package. In Python, the function that uses the table refuses unknown names.
     """
-    hints = get_type_hints(options) | more
-    fields: dict[str, Any] = {key: (kind, None) for key, kind in hints.items()}
-    return create_model(name, __base__=Section, **fields)
+
+    @staticmethod
+    def __get_pydantic_core_schema__(source: Any, handler: Callable[[Any], Any]) -> Any:
+        """Schema of any text outside of files."""
+        names = get_args(source)
+
+        def check(value: str, info: core_schema.ValidationInfo) -> str:
+            if info.context is not None and value not in names:
+                raise PydanticCustomError("literal_error", "unknown name")
+            return value
+
+        return core_schema.with_info_after_validator_function(check, core_schema.str_schema())
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
+def options(group: type[_Group]) -> type[_Group]:
+    """Make a class a group of options: a frozen dataclass whose values are checked.
+
+    Raises:
+        TypeError: When an instance is made: for an unknown option, or a value of another type.
+        ValueError: For a value that is out of bounds or not among the choices.
+
+    Example:
+        >>> @options
+        ... class Bands:
+        ...     band_rows: int = Field(default=32, ge=4, description="Rows of a band.")
+        >>> Bands(band_rows=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: band_rows must be at least 4, got 2 (int)
+    """
+    config = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
+    group.__get_pydantic_core_schema__ = classmethod(_accepts_tables)  # type: ignore[attr-defined]
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=config)(group)
+    initialise = made.__init__
+
+    def __init__(self: Any, *args: Any, **given: Any) -> None:  # noqa: N807
+        by_place = dict(zip(fields_of(made), args, strict=False))
+        values = {name: _plain(value) for name, value in (by_place | given).items()}
+        try:
+            initialise(self, **values)
+        except ValidationError as error:
+            first = next(iter(_mistakes(made, values, error)))
+            raise first.in_python() from None
+
+    made.__init__ = __init__
+    return made  # type: ignore[no-any-return]
+
+
+def _accepts_tables(_: type, source: Any, handler: Callable[[Any], Any]) -> Any:
+    """Schema of a group that can be a table; its values are not converted nevertheless."""
+    schema = handler(source)
+    return schema | {"strict": False} if schema["type"] == "dataclass" else schema
+
+
+def _plain(value: Any) -> Any:
+    """NumPy numbers and short arrays as Python numbers and lists."""
+    if type(value).__module__ != "numpy" or getattr(getattr(value, "dtype", None), "kind", "-") not in "biuf":
+        return value
+    return value.tolist() if value.ndim < 2 and value.size < 10 else value
+
+
+def fields_of(group: Any) -> dict[str, Any]:
+    """Fields of a group of options or of a section, by name: annotation, default and description."""
+    return dict(group.model_fields if issubclass(group, BaseModel) else group.__pydantic_fields__)
+
+
+def not_an_option(name: str, message: str) -> PydanticCustomError:
+    """The error of a group for an option that does not go with the others, a ``TypeError`` in Python."""
+    return PydanticCustomError(_NOT_AN_OPTION, "{message}", {"name": name, "message": message})
 
 
 def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result:
@@ -62,11 +174,11 @@ def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result
         raise ValueError(str(error)) from error
 
 
-def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Model:
+def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Result:
     """Return ``data`` as a ``model``.
 
     Args:
-        model: A ``Section``.
+        model: A ``Section``, or a group of options.
         data: Parsed TOML or JSON.
         source: Name of the file, for the messages.
 
@@ -75,74 +187,165 @@ def validate(model: type[_Model], data: Mapping[str, Any], source: str) -> _Mode
             its path, its value and what was expected.
     """
     try:
-        return model.model_validate(data)
+        return TypeAdapter(model).validate_python(data, context={"file": source})
     except ValidationError as error:
-        lines: dict[str, str] = {}
-        for mistake in error.errors(include_url=False):
-            path, message = _describe(model, data, mistake)
-            lines.setdefault(path, f"{source}: {path}: {message}" if path else f"{source}: {message}")
+        lines = [mistake.in_file(source) for mistake in _mistakes(model, data, error)]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        raise MistakesError([*list(lines.values())[:_MAX_LINES], *more]) from error
+        raise MistakesError([*lines[:_MAX_LINES], *more]) from error
 
 
-def _describe(model: type[BaseModel], data: Any, mistake: Any) -> tuple[str, str]:
-    """Path of the key that a mistake of pydantic belongs to, and the message."""
+def validated(name: str, value: Any, adapter: TypeAdapter[Any], kind: Any) -> Any:
+    """Return the value of an argument if it is of a kind, as ``adapter`` converts it.
+
+    Raises:
+        TypeError: If it has another type.
+        ValueError: If it is out of bounds or not among the choices.
+    """
+    try:
+        return adapter.validate_python(_plain(value))
+    except ValidationError as error:
+        mistake = next(iter(_mistakes(kind, value, error)))
+        mistake.path = f"{name}.{mistake.path}".removesuffix(".").replace(".[", "[")
+        raise mistake.in_python() from None
+
+
+@dataclass
+class _Mistake:
+    """A mistake at one key.
+
+    Attributes:
+        path: The key, with the tables around it.
+        value: The value.
+        expected: What was expected instead.
+        text: A sentence that replaces the others.
+        known: The keys that exist, for one that does not.
+        choices: The choices, if there is nothing else.
+        accepts_none: Whether None is possible in Python.
+        kind: The exception in Python.
+        is_bound: Whether the value has the right type and is out of bounds.
+    """
+
+    path: str
+    value: Any = None
+    expected: str = ""
+    text: str = ""
+    known: tuple[str, ...] = ()
+    choices: tuple[Any, ...] = ()
+    accepts_none: bool = False
+    kind: type[Exception] = ValueError
+    is_bound: bool = False
+
+    def in_python(self) -> Exception:
+        """The exception."""
+        if self.known:
+            return TypeError(f"unknown option {self.path!r}; the options are {', '.join(self.known)}")
+        if self.choices:
+            names = ", ".join(map(repr, self.choices))
+            return ValueError(f"{self.path} must be one of {names}; got {described(self.value)}")
+        expected = self.expected.replace("true or false", "True or False") + " or None" * self.accepts_none
+        return self.kind(self.text or f"{self.path} must be {expected}, got {described(self.value)}")
+
+    def in_file(self, source: str) -> str:
+        """The line about a file."""
+        place = f"{source}: {self.path}" if self.path else source
+        if self.known:
+            return f"{place}: unknown key; expected one of {', '.join(self.known)}"
+        return f"{place}: {self.text or f'expected {self.expected}, got {self.value!r}'}"
+
+
+def _mistakes(model: Any, data: Any, error: ValidationError) -> Iterable[_Mistake]:
+    """The mistakes that pydantic found, one for each key: of the members of a union, that of the fitting type."""
+    found: dict[str, _Mistake] = {}
+    for entry in error.errors(include_url=False):
+        mistake = _mistake(model, data, entry)
+        if mistake.path not in found or (mistake.is_bound and not found[mistake.path].is_bound):
+            found[mistake.path] = mistake
+    return found.values()
+
+
+def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
+    """What an entry of pydantic means: the key at its location, and what is wrong."""
     path = ""
     value: Any = data
     expected: Any = model
-    kind, context = mistake["type"], mistake.get("ctx", {})
-    for step in mistake["loc"]:
-        if isinstance(value, Mapping) and isinstance(step, str):
+    kind, context = entry["type"], entry.get("ctx", {})
+    for step in entry["loc"]:
+        tables = [member for member in members_of(expected) if get_origin(member) in (Mapping, dict)]
+        if isinstance(value, Mapping) and tables:
+            path, value, expected = f"{path}[{step!r}]", value.get(step), get_args(tables[0])[1]
+        elif isinstance(value, Mapping) and isinstance(step, str):
             keys = _keys(expected)
             if step not in value and step not in keys:
                 break  # the rest of the location names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
-                return path, f"missing key; expected {expected_text(keys[step])}"
-            if kind == "extra_forbidden" and step not in keys:
-                return path, f"unknown key; expected one of {', '.join(keys)}"
+                return _Mistake(path, text=f"missing key; expected {expected_text(keys[step])}", kind=TypeError)
+            if kind in ("extra_forbidden", "unexpected_keyword_argument") and step not in keys:
+                return _Mistake(path, known=tuple(keys))
             value, expected = value[step], keys.get(step, Any)
-        elif isinstance(value, list) and isinstance(step, int) and step < len(value):
+        elif isinstance(value, (list, tuple)) and isinstance(step, int) and step < len(value):
             path, value = f"{path}[{step}]", value[step]
-            expected = next((get_args(member)[0] for member in _members(expected) if get_origin(member) is list), Any)
+            expected = next(_items(expected, step), Any)
         else:
             break  # the rest of the location names a member of a union
+    if kind == _NOT_AN_OPTION:
+        return _Mistake(".".join(filter(None, (path, context["name"]))), text=context["message"], kind=TypeError)
     if kind == "value_error":
-        return path, str(context["error"])
-    if kind == "greater_than_equal":
-        return path, f"expected at least {context['ge']}, got {value!r}"
-    if kind in ("too_short", "too_long"):
-        return path, f"expected {context.get('min_length', context.get('max_length'))} entries, got {value!r}"
-    return path, f"expected {expected_text(expected)}, got {value!r}"
+        return _Mistake(path, text=str(context["error"]))
+    if kind in _BOUNDS:
+        return _Mistake(path, value, _BOUNDS[kind].format(**context), is_bound=True)
+    choices = [member for member in members_of(expected) if get_origin(member) is Literal]
+    only = tuple(name for member in choices for name in get_args(member)) if choices == [*members_of(expected)] else ()
+    accepts_none = type(None) in get_args(expected)
+    return _Mistake(path, value, expected_text(expected), kind=TypeError, choices=only, accepts_none=accepts_none)
 
 
-def _members(annotation: Any) -> tuple[Any, ...]:
-    """Members of a union, without None."""
-    members = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
-    return tuple(member for member in members if member is not type(None))
+def members_of(annotation: Any) -> tuple[Any, ...]:
+    """Members of a union without their bounds, and without None."""
+    if get_origin(annotation) is Annotated:
+        return members_of(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return tuple(member for part in get_args(annotation) for member in members_of(part))
+    return () if annotation is type(None) else (annotation,)
+
+
+def _items(annotation: Any, index: int) -> Iterator[Any]:
+    """Types that an entry of a list or tuple may have."""
+    for member in members_of(annotation):
+        if get_origin(member) in (list, tuple, Sequence):
+            several = get_origin(member) is tuple and ... not in get_args(member)
+            yield get_args(member)[index if several else 0]
 
 
 def _keys(annotation: Any) -> dict[str, Any]:
-    """Keys of a section with their types; empty for a table with arbitrary keys."""
-    for member in _members(annotation):
-        if isinstance(member, type) and issubclass(member, BaseModel):
-            return {name: field.annotation for name, field in member.model_fields.items()}
+    """Keys of a table with their types; empty for a table with arbitrary keys."""
+    for member in members_of(annotation):
+        if isinstance(member, type) and hasattr(member, "__pydantic_fields__"):
+            return {name: described.annotation for name, described in fields_of(member).items()}
     return {}
 
 
 def expected_text(annotation: Any) -> str:
     """Description of a type in a message."""
     words: list[str] = []
-    for member in _members(annotation):
-        if get_origin(member) is Literal:
-            words.extend(repr(choice) for choice in get_args(member))
-        elif get_origin(member) is list:
-            item = _members(get_args(member)[0])[0]
+    for member in members_of(annotation):
+        origin, arguments = get_origin(member), get_args(member)
+        if origin is Literal:
+            words.extend(repr(choice) for choice in arguments)
+        elif origin is list:
+            item = members_of(arguments[0])[0]
             words.append(f"a list of {_LIST_NAMES.get(item, 'lists' if get_origin(item) is list else 'tables')}")
-        elif isinstance(member, type) and issubclass(member, BaseModel):
-            words.append(f"a table with {', '.join(member.model_fields)}")
+        elif origin is tuple:
+            words.append(f"{len(arguments)} {_LIST_NAMES.get(members_of(arguments[0])[0], 'values')}")
+        elif _keys(member):
+            words.append(f"a table with {', '.join(_keys(member))}")
+        elif isinstance(member, type) and member not in _TYPE_NAMES:
+            name, source = _CLASS_NAMES.get(member.__name__, member.__name__), getattr(member, "_MADE_BY", "")
+            article = "" if " " in name else "an " if name[0] in "AEIOU" else "a "
+            words.append(f"{article}{name}{source and f' ({source})'}")
         else:
-            words.append(_TYPE_NAMES.get(member, str(member)))
+            name = _CLASS_NAMES.get(getattr(origin, "__name__", ""), str(member))
+            words.append(_TYPE_NAMES.get(origin or member, name))
     return " or ".join(dict.fromkeys(words))
 
 

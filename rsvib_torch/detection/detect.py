@@ -5,16 +5,15 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, Unpack, overload
+from typing import Any, Literal, ParamSpec, Protocol, overload
 
 from torch import nn
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import BandSettings, DetectionMethod, Registration, ToneSettings
+from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.precision import full_precision, without_gradients
+from rsvib_torch.core.validation import fields_of
+from rsvib_torch.core.validation import options as option_group
 from rsvib_torch.detection.attempts import FieldOptions, detect_tones, detect_windows, windows_of
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
@@ -22,87 +21,75 @@ from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.strips import camera_in_row_order
 from rsvib_torch.detection.tones.fit import MotionModel
-from rsvib_torch.detection.tones.selection import MAX_TONES
+from rsvib_torch.frames.entry_points import entry_point, module_options
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.options import DetectionMethod, FreeMotionOptions, SweptToneOptions, VibrationOptions
 
 __all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
 
 VibrationModel = Literal["tones", "free", "swept"]
+T = ParamSpec("T")
+F = ParamSpec("F")
+S = ParamSpec("S")
 
 
-MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
+@option_group
+class _FreeModel(FreeMotionOptions):
+    model: Literal["free"]
 
 
-class BandOptions(BandSettings, total=False):
-    """Options of all models, see ``detect_vibration``."""
-
-    ignore: ArrayLike | None
-    full_scale: float | None
-    channels: Channels
+@option_group
+class _SweptModel(SweptToneOptions):
+    model: Literal["swept"]
 
 
-class ToneOptions(BandOptions, ToneSettings, total=False):
-    """Options of the model of tones, see ``detect_vibration``."""
-
-    window: int | None
-    window_step: int | None
-
-
-# Models: what is fitted
-
-# A model is a function ``model(frames, timing, **options)`` of the user's frames and timing. All models take
-# ``BandOptions``. The result is in image axes and has ``reliable`` (..., 2) bool, ``reasons`` for each axis, and a
-# motion that ``restore`` accepts. "tones" also takes ``ToneOptions`` and is implemented by ``detect_vibration``.
-_OTHER_MODELS: dict[str, Callable[..., MotionDetection | SweptTone]] = {
-    "free": detect_motion,
-    "swept": detect_swept_tone,
+# Models: what is fitted. A model is a group of options, and a function ``model(frames, timing, **options)`` of the
+# user's frames and timing. The result is in image axes and has ``reliable`` (..., 2) bool, ``reasons`` for each axis,
+# and a motion that ``restore`` accepts. "tones" is implemented by ``detect_vibration``.
+_OTHER_MODELS: dict[str, tuple[type, Callable[..., MotionDetection | SweptTone]]] = {
+    "free": (_FreeModel, detect_motion),
+    "swept": (_SweptModel, detect_swept_tone),
 }
 
 
-@overload
-def detect_vibration(
-    frames: FramesOrFiles, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
-) -> DetectionResult: ...
-@overload
-def detect_vibration(
-    frames: FramesOrFiles, timing: SensorTiming, *, model: Literal["free"], **options: Unpack[BandOptions]
-) -> MotionDetection: ...
-@overload
-def detect_vibration(
-    frames: FramesOrFiles, timing: SensorTiming, *, model: Literal["swept"], **options: Unpack[BandOptions]
-) -> SweptTone: ...
-@outside_graphs
+class _DetectsVibration(Protocol[T, F, S]):
+    """Type of ``detect_vibration``: the model determines the options and the result."""
+
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, *args: T.args, **kwargs: T.kwargs
+    ) -> DetectionResult: ...
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, *args: F.args, **kwargs: F.kwargs
+    ) -> MotionDetection: ...
+    @overload
+    def __call__(self, frames: FramesOrFiles, timing: SensorTiming, *args: S.args, **kwargs: S.kwargs) -> SweptTone: ...
+
+
+def _options_of_models(
+    tones: Callable[T, VibrationOptions], free: Callable[F, _FreeModel], swept: Callable[S, _SweptModel]
+) -> Callable[[Callable[..., Any]], _DetectsVibration[T, F, S]]:
+    def of_model(model: object = "tones", **given: Any) -> Any:
+        check_choice("model", model, ("tones", *_OTHER_MODELS))
+        group: Any = tones if model == "tones" else _OTHER_MODELS[str(model)][0]
+        for name in given:
+            if name not in fields_of(group):
+                names = ", ".join(fields_of(group))
+                raise TypeError(f"model={model!r} has no option {name!r}; its options are {names}")
+        return group(model=model, **given)
+
+    return lambda function: entry_point(tones, function, of_model)
+
+
+@_options_of_models(VibrationOptions, _FreeModel, _SweptModel)
 @full_precision
 @without_gradients
-@checks_arguments
 def detect_vibration(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    *,
-    model: VibrationModel = "tones",
-    method: DetectionMethod = "direct",
-    registration: Registration = "ncc",
-    tones: Literal["auto"] | int = "auto",
-    harmonics: int = 1,
-    image_acceleration: bool = False,
-    window: int | None = None,
-    window_step: int | None = None,
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    columns: int | None = None,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    roll: bool | Literal["auto"] = "auto",
-    zoom: bool | Literal["auto"] = "auto",
-    focal_length: float | None = None,
-    principal_point: tuple[float, float] | None = None,
-    distortion: tuple[float, float, float, float, float] | None = None,
+    frames: FramesOrFiles, timing: SensorTiming, options: VibrationOptions | _FreeModel | _SweptModel
 ) -> DetectionResult | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
@@ -117,38 +104,7 @@ def detect_vibration(
             which are read as by ``read_stack``. NaN marks missing pixels.
         timing: The sensor. Frame start times at unequal intervals (dropped frames) remove blind frequencies. If frames
             is a path, the frame times in the file are used.
-        model: ``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape; ``"swept"``: one tone per
-            axis whose amplitude decays or grows and whose frequency sweeps. The last two take the options from
-            ``registration`` to ``search``, ``ignore``, ``full_scale`` and ``channels``; ``detect_motion`` and
-            ``detect_swept_tone`` have further ones. ``"free"`` also measures ``roll`` and ``zoom``, if they are True.
-        method: ``"direct"``, or ``"bands"`` (the paper's method), in half the time with ten times larger errors.
-        registration: Method of the band registration, as in ``register_bands``.
-        tones: Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations
-            then allow for a further tone.
-        harmonics: Number of multiples of every tone, with one common base frequency; 1 for independent tones.
-        image_acceleration: Whether the image motion has a constant acceleration.
-        window: Number of frames of one result: the vibration is followed through the stack, and the result is a batch
-            with one entry per window (a leading dimension behind B). None for one result from all frames.
-        window_step: Frames from one window to the next; half a window by default.
-        band_rows: Rows of a band.
-        band_step: Rows from one band to the next.
-        search: Search range in px around the whole-frame offset.
-        columns: Use only this number of neighbouring columns, those with the most detail: all columns contain the same
-            vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for missing pixels (dead, saturated).
-        full_scale: Count that means 1.0, for integer frames.
-        channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
-            and frames that appear to have them last are refused; ``"first"`` omits this check.
-        roll: Measure the rotation about the optical axis as a third component of the motion, in rad: True, False, or
-            ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three axes
-            instead of two, see ``Vibration``.
-        zoom: The same for the change of scale, as a fourth component; includes roll.
-        focal_length: Focal length in px, for a motion that is a rotation of the camera: displacements then follow from
-            the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result
-            has an ``attitude``. None: the displacement by translation is the same in the whole frame.
-        principal_point: px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the
-            frame.
-        distortion: Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none.
+        options: Options.
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
@@ -184,107 +140,52 @@ def detect_vibration(
         >>> detection.reliable.tolist()
         [True, False]
     """
-    check_choice("model", model, ("tones", *_OTHER_MODELS))
-    if model != "tones":
-        tone_options = (
-            ("method", method, "direct"),
-            ("tones", tones, "auto"),
-            ("harmonics", harmonics, 1),
-            ("image_acceleration", image_acceleration, False),
-            ("columns", columns, None),
-            ("window", window, None),
-            ("window_step", window_step, None),
-        )
-        for name, value, default in tone_options:
-            if value != default:
-                valid = ", ".join(sorted(BandOptions.__optional_keys__))
-                raise ValueError(
-                    f"{name}={value!r} goes with model='tones', not with model={model!r}, which takes {valid}"
-                )
-        return _OTHER_MODELS[model](
-            frames,
-            timing,
-            registration=registration,
-            band_rows=band_rows,
-            band_step=band_step,
-            search=search,
-            ignore=ignore,
-            full_scale=full_scale,
-            channels=channels,
-            **_given_for_model(
-                model,
-                roll=roll is True or None,  # "auto": not measured unless requested
-                zoom=zoom is True or None,
-                focal_length=focal_length,
-                principal_point=principal_point,
-                distortion=distortion,
-            ),
-        )
-    check_choice("method", method, tuple(METHODS))
-    if tones != "auto":
-        check_whole_number("tones", tones, at_least=1)
-        if tones > MAX_TONES:
-            raise ValueError(f"tones must be 'auto' or 1 to {MAX_TONES}, got {tones}")
-    check_whole_number("harmonics", harmonics, at_least=1, at_most=MAX_HARMONICS)
-    if columns is not None:
-        check_whole_number("columns", columns, at_least=64)  # px; narrower bands are often registered wrongly
+    if not isinstance(options, VibrationOptions):
+        given = {name: value for name, value in vars(options).items() if name != "model"}
+        return _OTHER_MODELS[options.model][1](frames, timing, **given)
+    check_choice("method", options.method, tuple(METHODS))
 
-    # 1. The user's frames become grey frames in row order, the arguments become options.
-    bands = RegistrationOptions(registration, band_rows, band_step, search)
-    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    # 1. The user's frames become grey frames in row order.
+    stacks = grey_frames(frames, timing, options)
     timing = stacks.timing
     height, width = stacks.images.shape[-2:]
-    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
-    field = _checked_field(roll, zoom, columns, camera)
-    model_of_tones = MotionModel(harmonics, 2 if image_acceleration else 1)
-    options = DetectionOptions(method, None if tones == "auto" else tones, model_of_tones, bands)
-    if columns is not None:
-        stacks = stacks.narrowed(columns)
+    camera = camera_in_row_order(options, (height, width), timing)
+    field = _checked_field(options, camera)
+    model = MotionModel(options.harmonics, 2 if options.image_acceleration else 1)
+    chosen = DetectionOptions(options.method, None if options.tones == "auto" else options.tones, model, options)
+    if options.columns is not None:
+        stacks = stacks.narrowed(options.columns)
 
     # 2. One result from all frames, or one from each window.
     with threads_for(stacks.images):
-        if window is None:
-            result = detect_tones(stacks, timing, options, field)
+        if options.window is None:
+            result = detect_tones(stacks, timing, chosen, field)
         else:
-            windows = windows_of(stacks.images.shape[1], window, window_step, timing)
-            result = detect_windows(stacks, windows, options, field)
+            windows = windows_of(stacks.images.shape[1], options.window, options.window_step, timing)
+            result = detect_windows(stacks, windows, chosen, field)
     result = replace(result, timing=timing)  # of the stack, not of a window
     return result if stacks.batched else result[0]
 
 
-def _checked_field(
-    roll: bool | Literal["auto"], zoom: bool | Literal["auto"], columns: int | None, camera: Camera | None
-) -> FieldOptions:
-    """The checked options of roll and zoom, which are not measured of a part of the columns."""
-    for name, value in (("roll", roll), ("zoom", zoom)):
-        if value not in (True, False, "auto"):
-            raise ValueError(f"{name} must be True, False or 'auto', got {value!r}")
-    if columns is not None and (camera is not None or roll is True or zoom is True):
+def _checked_field(options: VibrationOptions, camera: Camera | None) -> FieldOptions:
+    """The options of roll and zoom, which are not measured of a part of the columns."""
+    all_columns, roll, zoom = options.columns is None, options.roll, options.zoom
+    if not all_columns and (camera is not None or roll is True or zoom is True):
         raise ValueError(
-            f"columns={columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and perspective "
-            "are measured from all columns"
+            f"columns={options.columns} goes with roll=False, zoom=False and focal_length=None: roll, zoom and "
+            "perspective are measured from all columns"
         )
-    return FieldOptions(columns is None and roll, columns is None and zoom, camera)
-
-
-def _given_for_model(model: str, **options: object) -> dict[str, object]:
-    """Options of roll, zoom and camera that were given for another model than tones."""
-    given = {name: value for name, value in options.items() if value is not None}
-    if given and model == "swept":
-        name, value = next(iter(given.items()))
-        raise ValueError(f"{name}={value!r} goes with model='tones' or 'free', not with model='swept'")
-    return given
+    return FieldOptions(all_columns and roll, all_columns and zoom, camera)
 
 
 class VibrationDetector(nn.Module):
     """``detect_vibration`` with fixed timing and options as a module, for one stack or a batch of stacks.
 
-    It has no weights. Autocast does not affect it, and ``torch.compile`` calls it uncompiled, at one graph break.
+    The options are those of ``detect_vibration`` for tones. It has no weights. Autocast does not affect it, and
+    ``torch.compile`` calls it uncompiled, at one graph break.
 
     Args:
         timing: The sensor.
-        model: Only ``"tones"``.
-        **options: Options of ``detect_vibration`` for tones.
 
     Raises:
         TypeError: If an option is unknown.
@@ -302,21 +203,13 @@ class VibrationDetector(nn.Module):
         [[111.0, 90.0], [111.0, 90.0]]
     """
 
-    @checks_arguments
-    def __init__(
-        self, timing: SensorTiming, *, model: Literal["tones"] = "tones", **options: Unpack[ToneOptions]
-    ) -> None:
+    @module_options(VibrationOptions)
+    def __init__(self, timing: SensorTiming, options: VibrationOptions) -> None:
         super().__init__()
-        if model != "tones":
-            raise ValueError(f"a VibrationDetector finds steady tones; for model={model!r} call detect_vibration")
-        unknown = sorted(set(options) - ToneOptions.__optional_keys__)
-        if unknown:
-            valid = ", ".join(sorted(ToneOptions.__optional_keys__))
-            raise TypeError(f"unknown option {unknown[0]!r} of VibrationDetector; the options are {valid}")
-        self.timing = timing
-        self.options = options
+        check_timing(timing)
+        self.timing, self.options = timing, options
 
-    @checks_arguments
     def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
-        return detect_vibration(frames, self.timing, **self.options)
+        result: DetectionResult = detect_vibration(frames, self.timing, **vars(self.options))
+        return result

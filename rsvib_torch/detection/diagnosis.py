@@ -13,10 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.option_types import Registration
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.tables import Array, split_axis, table
 from rsvib_torch.detection.measurements import Measurements
@@ -26,10 +23,11 @@ from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, typical_size
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart
+from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.options import OffsetOptions
 from rsvib_torch.registration.register import fits_frame
 
 __all__ = ["TimingDiagnosis", "diagnose_timing", "other_timings", "period_factor"]
@@ -75,22 +73,10 @@ class TimingDiagnosis:
         return Reason(code, None, self.stated, self.agreeing, details)
 
 
-@outside_graphs
+@frames_options(OffsetOptions)
 @full_precision
 @without_gradients
-@checks_arguments
-def diagnose_timing(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    *,
-    registration: Registration = "ncc",
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-) -> TimingDiagnosis | None:
+def diagnose_timing(frames: FramesOrFiles, timing: SensorTiming, options: OffsetOptions) -> TimingDiagnosis | None:
     """Find the setting of the sensor that the frames contradict.
 
     A row ``i`` of frame ``p`` starts its exposure at ``p frame_rows row_time + i row_time``. The rows of a frame and
@@ -101,13 +87,7 @@ def diagnose_timing(
     Args:
         frames: Stack (T, H, W) or (T, C, H, W), as in ``detect_vibration``.
         timing: The sensor as stated.
-        registration: As in ``detect_vibration``.
-        band_rows: As in ``detect_vibration``.
-        band_step: As in ``detect_vibration``.
-        search: As in ``detect_vibration``.
-        ignore: As in ``detect_vibration``.
-        full_scale: As in ``detect_vibration``.
-        channels: As in ``detect_vibration``.
+        options: Options, as in ``detect_vibration``.
 
     Returns:
         The setting with the value that the frames agree with; None if they do not contradict the stated timing, or
@@ -128,15 +108,14 @@ def diagnose_timing(
         >>> diagnosis.setting, round(diagnosis.agreeing)
         ('frame_rows', 300)
     """
-    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    stacks = grey_frames(frames, timing, options)
     if stacks.batched:
         raise ValueError("diagnose_timing takes one stack, not a batch")
-    options = DetectionOptions(
-        "direct", None, MotionModel(), RegistrationOptions(registration, band_rows, band_step, search)
-    )
     height, width = stacks.images.shape[-2:]
     translation = Hypothesis(FieldScale(2, width, height))
-    found = attempt(stacks, stacks.timing.in_row_order(), options, translation)
+    found = attempt(
+        stacks, stacks.timing.in_row_order(), DetectionOptions("direct", None, MotionModel(), options), translation
+    )
     return other_timings(stacks, stacks.timing, found).get(0)
 
 

@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 import torch
 
-from rsvib_torch.core.option_types import DetectionMethod
 from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
@@ -40,7 +39,8 @@ from rsvib_torch.detection.verdict import BandOffsets, Findings, judged
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
-from rsvib_torch.registration import OffsetCurve, RegistrationOptions
+from rsvib_torch.options import DetectionMethod, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 
 __all__ = ["METHODS", "Attempt", "DetectionOptions", "Hypothesis", "Method", "Status", "attempt"]
 

@@ -17,7 +17,8 @@ from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_a
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.registration import OffsetCurve, RegistrationOptions
+from rsvib_torch.options import RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.register import check_frame_size, fits_frame, register_rows
 
 __all__ = [

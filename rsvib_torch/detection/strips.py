@@ -25,6 +25,7 @@ from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.options import ProjectionOptions
 
 __all__ = ["FieldScale", "camera_in_row_order", "combined_strips", "cut_into_strips"]
 
@@ -86,21 +87,21 @@ class FieldScale:
 
 
 def camera_in_row_order(
-    focal_length: float | None,
-    principal_point: tuple[float, float] | None,
-    distortion: tuple[float, float, float, float, float] | None,
+    options: ProjectionOptions,
     size: tuple[int, int],
     timing: SensorTiming,
 ) -> Camera | None:
     """Camera of frames of ``size`` (rows, columns) in row order, from the options of ``detect_vibration``."""
-    if focal_length is None:
+    principal_point, distortion = options.principal_point, options.distortion
+    if options.focal_length is None:
         for name, value in (("principal_point", principal_point), ("distortion", distortion)):
             if value is not None:
                 raise ValueError(f"{name}={value!r} requires focal_length, in px")
         return None
     height, width = size if timing.scan_axis == -2 else size[::-1]
     centre = (0.5 * (width - 1), 0.5 * (height - 1))
-    camera = Camera(focal_length, centre if principal_point is None else principal_point, distortion or (0.0,) * 5)
+    point = centre if principal_point is None else principal_point
+    camera = Camera(options.focal_length, point, distortion or (0.0,) * 5)
     x, y = camera.principal_point
     camera = replace(camera, principal_point=(x - centre[0], y - centre[1]))
     camera.check_size(width, height)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import FramesLike, as_tensor
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["offset_endpoint_error", "psnr", "ssim"]
 
@@ -145,7 +145,6 @@ def offset_endpoint_error(
         >>> offset_endpoint_error(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.zeros(2, 2))
         tensor(2.5000, dtype=torch.float64)
     """
-    check_choice("reduction", reduction, ("mean", "rms", "none"))
     for name, value in (("measured", measured), ("truth", truth)):
         if value.ndim < 2 or value.shape[-1] != 2:
             raise ValueError(f"{name} must have shape (..., N, 2), got {tuple(value.shape)}")

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arrays import Channels
 from rsvib_torch.frames.mosaic import is_mosaic, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import MaskedInputOptions
 
 __all__ = ["GreyFrames", "constant_frame", "grey_frames", "without_mosaic"]
 
@@ -64,9 +64,7 @@ def _unless_complete(valid: Tensor | None) -> Tensor | None:
 def grey_frames(
     frames: FramesOrFiles,
     timing: SensorTiming,
-    full_scale: float | None,
-    ignore: object,
-    channels: Channels,
+    given: MaskedInputOptions,
     *,
     min_valid_fraction: float = 0.1,
 ) -> GreyFrames:
@@ -76,9 +74,7 @@ def grey_frames(
         frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array, list of these, or files; NaN marks missing
             pixels.
         timing: The sensor.
-        full_scale: Count that means 1.0, for integer frames.
-        ignore: Bool tensor or array, broadcastable to (..., H, W) of the frames: True for missing pixels.
-        channels: As in ``prepare_frames``.
+        given: Full scale, missing pixels and position of the channels.
         min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
 
     Warns:
@@ -89,7 +85,9 @@ def grey_frames(
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
             ``ignore`` does not fit; or a frame is a copy of the one before.
     """
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, minimum_frames=2)
+    prepared = prepare_frames(
+        frames, timing, full_scale=given.full_scale, channels=given.channels, ignore=given.ignore, minimum_frames=2
+    )
     images, valid = prepared.filled, None
     # registration needs measured pixels in every frame
     if prepared.missing is not None:

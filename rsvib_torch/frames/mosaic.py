@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.option_types import Mosaic
 from rsvib_torch.frames.pixels import fill_with_means
+from rsvib_torch.options import Mosaic
 
 __all__ = [
     "check_mosaic",

@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import check_broadcast, check_images, checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, check_images, checked_methods, checks_arguments
 from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.precision import full_precision, outside_graphs
@@ -324,6 +324,7 @@ def blur_rows_adjoint(
     return bspline_coefficients_adjoint(bspline_coefficients_adjoint(scene, psf.degree, -2), psf.degree, -1)
 
 
+@checked_methods
 class RowVaryingBlur(nn.Module):
     """``blur_rows`` with fixed kernels as a module, with its adjoint.
 
@@ -348,7 +349,6 @@ class RowVaryingBlur(nn.Module):
     first_tap: Tensor
     weights: Tensor
 
-    @checks_arguments
     def __init__(
         self,
         psf: RowPSF,
@@ -372,24 +372,20 @@ class RowVaryingBlur(nn.Module):
         """The kernels."""
         return RowPSF(self.first_tap, self.weights, self.degree)
 
-    @checks_arguments
     def forward(self, scene: Tensor) -> Tensor:
         """Form frames (..., R, W) from a scene (..., Hs, Ws)."""
         check_images({"scene": scene}, {"scene": "... H W"})
         return blur_rows(scene, self.psf, frame_width=self.frame_width, origin=self.origin)
 
-    @checks_arguments
     def adjoint(self, frames: Tensor, scene_shape: tuple[int, ...]) -> Tensor:
         """Apply the exact adjoint to frames (..., R, W)."""
         check_images({"frames": frames}, {"frames": "... R W"})
         return blur_rows_adjoint(frames, self.psf, scene_shape, origin=self.origin)
 
-    @checks_arguments
     def A(self, x: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``forward`` under the name that solvers use; their further keywords are ignored."""
         return self(x)  # type: ignore[no-any-return]
 
-    @checks_arguments
     def A_adjoint(self, y: Tensor, **kwargs: object) -> Tensor:  # noqa: N802 - name that solvers use
         """``adjoint`` for scenes with the leading dimensions of the frames and ``scene_size``."""
         check_images({"y": y}, {"y": "... R W"})

@@ -2,15 +2,17 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checks_arguments
-from rsvib_torch.core.arrays import ArrayLike
+from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checked_methods
 from rsvib_torch.core.checks import check_number, check_whole_number, described
+from rsvib_torch.core.validation import NotNegative, Positive, options
+from rsvib_torch.options import OpticsOptions
 
 __all__ = ["Optics", "SensorNoise", "filtered", "sharpened", "target_optics"]
 
@@ -19,22 +21,15 @@ _LEAST_RESPONSE = (
 )
 
 
-@dataclass(frozen=True)
-class Optics:
+@options
+@checked_methods
+class Optics(OpticsOptions):
     """Transfer function of a lens and of square pixels.
 
     ``H(u, v) = exp(-2 pi^2 sigma^2 rho^2) D(rho / cutoff) sinc(pixel u) sinc(pixel v)``, ``rho^2 = u^2 + v^2``, with
     the transfer of a round diffraction-limited pupil ``D(s) = 2 (arccos s - s sqrt(1 - s^2)) / pi``, 0 beyond s = 1.
-    A measured MTF is a further factor, interpolated linearly in rho from 1 at 0.
-
-    Args:
-        sigma: Standard deviation of the Gaussian blur of aberrations in px.
-        cutoff: Diffraction cutoff frequency in cycles/px (pixel pitch over wavelength and f-number); None for no
-            diffraction.
-        pixel: Width of the light-sensitive square in px; 0 for none, for a scene that was recorded by pixels before.
-        mtf: Measured MTF: frequencies in cycles/px, increasing from above 0 or from 0 with an MTF of 1, and values; 0
-            beyond the last one. The curve of ``slanted_edge_mtf`` contains the pixel: ``Optics(mtf=(curve.frequency,
-            curve.mtf))``.
+    A measured MTF is a further factor, interpolated linearly in rho from 1 at 0. The fields are those of
+    ``OpticsOptions``.
 
     Example:
         >>> optics = Optics(sigma=0.5, pixel=1.0)
@@ -42,20 +37,10 @@ class Optics:
         '0.1854'
     """
 
-    sigma: float = 0.0
-    cutoff: float | None = None
-    pixel: float = 0.0
-    mtf: tuple[ArrayLike | Sequence[float], ArrayLike | Sequence[float]] | None = None
-
     def __post_init__(self) -> None:
-        check_number("sigma", self.sigma, at_least=0.0)
-        if self.cutoff is not None:
-            check_number("cutoff", self.cutoff, above=0.0)
-        check_number("pixel", self.pixel, at_least=0.0)
         if self.mtf is not None:
             object.__setattr__(self, "mtf", _checked_mtf(self.mtf))  # lists of numbers, which can be compared
 
-    @checks_arguments
     def transfer(self, u: Tensor, v: Tensor) -> Tensor:
         """Transfer function at horizontal and vertical frequencies in cycles/px, in their broadcast shape."""
         check_broadcast(u=u, v=v)
@@ -69,7 +54,6 @@ class Optics:
             transfer = transfer * _interpolated(squared.sqrt(), *_checked_mtf(self.mtf))
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
-    @checks_arguments
     def apply(self, scene: Tensor) -> Tensor:
         """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
 
@@ -154,7 +138,8 @@ def _interpolated(place: Tensor, places: Sequence[float], values: Sequence[float
     return torch.where(place <= known[-1], inside, 0.0)
 
 
-@dataclass(frozen=True)
+@options
+@checked_methods
 class SensorNoise:
     """Shot noise, read noise, fixed pattern and quantisation of a sensor whose full scale is 1.
 
@@ -162,39 +147,43 @@ class SensorNoise:
     full well F, the gain error p of the pixel and the offsets c and r of its column and row: p, c and r are Gaussian,
     drawn once from ``pattern_seed``, and the same in all frames.
 
-    Args:
-        full_well: Electrons at full scale, for shot noise; None for no shot noise.
-        read_noise: Standard deviation of the Gaussian noise as a fraction of full scale.
-        bits: Bits of the converter (values are then clipped to 0 ... 1); None for no quantisation.
-        gain_spread: Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.
-        column_offset: Standard deviation of the offsets of the columns as a fraction of full scale.
-        row_offset: Standard deviation of the offsets of the rows as a fraction of full scale.
-        pattern_seed: Seed of the fixed pattern; each seed is another sensor.
-
     Example:
         >>> SensorNoise(bits=1).apply(torch.tensor([[0.2, 0.7, 1.3]])).tolist()
         [[0.0, 1.0, 1.0]]
     """
 
-    full_well: float | None = None
-    read_noise: float = 0.0
-    bits: int | None = None
-    gain_spread: float = 0.0
-    column_offset: float = 0.0
-    row_offset: float = 0.0
-    pattern_seed: int = 0
+    full_well: Positive | None = Field(
+        default=None, description="Electrons at full scale, for shot noise; None for no shot noise."
+    )
+    read_noise: NotNegative = Field(
+        default=0.0, description="Standard deviation of the Gaussian noise as a fraction of full scale."
+    )
+    bits: Annotated[int, Field(ge=1, le=32)] | None = Field(
+        default=None,
+        description="Bits of the converter (values are then clipped to 0 ... 1); None for no quantisation.",
+    )
+    gain_spread: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.",
+    )
+    column_offset: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Standard deviation of the offsets of the columns as a fraction of full scale.",
+    )
+    row_offset: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Standard deviation of the offsets of the rows as a fraction of full scale.",
+    )
+    pattern_seed: int = Field(
+        default=0, ge=0, le=2**63 - 1, description="Seed of the fixed pattern; each seed is another sensor."
+    )
 
-    def __post_init__(self) -> None:
-        if self.full_well is not None:
-            check_number("full_well", self.full_well, above=0.0)
-        check_number("read_noise", self.read_noise, at_least=0.0)
-        if self.bits is not None and not check_number("bits", self.bits, at_least=1, at_most=32).is_integer():
-            raise TypeError(f"bits must be a whole number, got {self.bits!r}")
-        for name in ("gain_spread", "column_offset", "row_offset"):
-            check_number(name, getattr(self, name), at_least=0.0, at_most=1.0)
-        check_whole_number("pattern_seed", self.pattern_seed, at_least=0)
-
-    @checks_arguments
     def fixed_pattern(self, height: int, width: int) -> tuple[Tensor, Tensor]:
         """Gain and offset of every pixel, float64 (height, width), the same in every call.
 
@@ -211,7 +200,6 @@ class SensorNoise:
         )
         return 1 + self.gain_spread * pixels, self.column_offset * columns + self.row_offset * rows
 
-    @checks_arguments
     def apply(self, frames: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return noisy frames of the same shape and dtype.
 

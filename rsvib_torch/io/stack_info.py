@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import check_fields, checks_arguments
+from rsvib_torch.core.arguments import check_fields, checked_methods
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
 
@@ -54,6 +54,7 @@ class Tag:
 
 
 @dataclass(frozen=True, repr=False)
+@checked_methods
 class StackInfo(Summarised):
     """Shape, data type and full scale of a stack in a file.
 
@@ -166,7 +167,6 @@ class StackInfo(Summarised):
         """Size of a frame in bytes."""
         return int(np.prod(self.shape[1:], dtype=object)) * np.dtype(self.dtype).itemsize
 
-    @checks_arguments
     def with_frames(self, count: int) -> "StackInfo":
         """The same kind of stack with ``count`` frames; times and path are kept only if their number is unchanged."""
         if count == self.shape[0]:
@@ -184,7 +184,6 @@ class StackInfo(Summarised):
         shape = (self.shape[0], *channels, scale * self.shape[-2], scale * self.shape[-1])
         return replace(self, shape=shape, path=None, metadata=self.metadata_for(shape))
 
-    @checks_arguments
     def metadata_for(self, shape: tuple[int, ...], dtype: str | None = None) -> dict[str, Tag | None]:
         """The metadata of a stack of another shape or data type: None for those that are not valid for it."""
         invalid: set[Scope] = set()
@@ -194,14 +193,12 @@ class StackInfo(Summarised):
             invalid.add("image")
         return {name: None if tag is None or tag.scope in invalid else tag for name, tag in self.metadata.items()}
 
-    @checks_arguments
     def from_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
         """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""
         if self.stored_axes == "THWC":
             frame = np.moveaxis(frame, -1, 0)
         return frame.astype(frame.dtype.newbyteorder("="), copy=False)
 
-    @checks_arguments
     def to_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
         """Convert a frame (H, W) or (C, H, W) to the axis order and data type of the file."""
         if self.stored_axes == "THWC":

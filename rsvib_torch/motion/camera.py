@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, checked_methods
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 __all__ = ["Camera"]
@@ -23,6 +23,7 @@ def _first(components: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
+@checked_methods
 class Camera:
     """Focal length, principal point, and lens distortion (the five coefficients of OpenCV).
 
@@ -70,7 +71,6 @@ class Camera:
                 check_number(name, value, at_least=-1e6, at_most=1e6)
             object.__setattr__(self, name, tuple(float(value) for value in values))
 
-    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> "Camera":
         """The camera for images whose axis k (x, y) is ``signs[k]`` times axis ``order[k]`` of these images."""
         if sorted(order)[:2] != [0, 1] or any(sign not in (1, -1) for sign in signs):
@@ -103,7 +103,6 @@ class Camera:
             -2,
         )
 
-    @checks_arguments
     def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(u, v) of the rays (u, v, 1) of image points in px from the centre of the frame, by Newton's method."""
         check_broadcast(x=x, y=y)
@@ -123,7 +122,6 @@ class Camera:
             u, v = u + (d * rest - b * other) / determinant, v + (a * other - c * rest) / determinant
         return u, v
 
-    @checks_arguments
     def check_size(self, width: int, height: int) -> None:
         """Raise a ``ValueError`` unless every point of a frame of this size has one ray.
 
@@ -151,7 +149,6 @@ class Camera:
                 "calibration"
             )
 
-    @checks_arguments
     def displacement(self, components: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2) in px of content at (x, y) px (S) from the centre, by components (S, A) of a motion.
 
@@ -163,7 +160,6 @@ class Camera:
         check_broadcast(components=_first(components), x=x, y=y)
         return self.displacement_of_rays(components, *self.rays(x.to(components), y.to(components)))
 
-    @checks_arguments
     def displacement_of_rays(self, components: Tensor, u: Tensor, v: Tensor) -> Tensor:
         """``displacement`` of the content at the rays (u, v, 1)."""
         check_broadcast(components=_first(components), u=u, v=v)
@@ -185,7 +181,6 @@ class Camera:
             moved = moved * (1 + components[..., 3:])
         return self.focal_length * (moved - rest)
 
-    @checks_arguments
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
         """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles.
 
@@ -209,7 +204,6 @@ class Camera:
         zoomed = torch.stack([x - self.principal_point[0], y - self.principal_point[1]], -1)
         return torch.cat([moved, zoomed[..., None]], -1)[..., :axes]
 
-    @checks_arguments
     def attitude(self, components: Tensor) -> Tensor:
         """(S, 3) rad: pitch, yaw and roll of the camera for components (S, A) of a motion.
 

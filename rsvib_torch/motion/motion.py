@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, checked_methods
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.camera import Camera
@@ -19,6 +19,7 @@ __all__ = ["Motion"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+@checked_methods
 class Motion(Result, ABC):
     """Motion of the image on the sensor as a function of time: scene content at ``s`` appears at ``s + D(t)``.
 
@@ -112,7 +113,6 @@ class Motion(Result, ABC):
         """Whether all columns of a row are displaced alike: no roll, no zoom, no finite focal length."""
         return self.num_axes == 2 and self.camera is None
 
-    @checks_arguments
     def attitude(self, times: Tensor) -> Tensor:
         """Rotation of the camera in rad, see ``Camera``; times as in ``displacement``.
 
@@ -132,7 +132,6 @@ class Motion(Result, ABC):
             raise ValueError("the attitude requires a motion with a camera: pass focal_length or camera=Camera(...)")
         return self.camera.attitude(self.displacement(times))
 
-    @checks_arguments
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:
         """Displacement during exposures in px.
 
@@ -145,7 +144,6 @@ class Motion(Result, ABC):
         """
         return self.displacement(starts.to(dtype=torch.float64, device=self.device)[..., None] + delays)
 
-    @checks_arguments
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
         """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
 
@@ -162,7 +160,6 @@ class Motion(Result, ABC):
         check_broadcast(starts=starts, later_starts=later_starts)
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)
 
-    @checks_arguments
     def largest_displacement(self, first: float, last: float) -> Tensor:
         """Bound on ``|D(t)|`` for ``first <= t <= last``, (..., axes), in px."""
         longest = max(abs(first), abs(last))
@@ -180,13 +177,11 @@ class Motion(Result, ABC):
         """
         return self.largest_displacement(-1.0, 1.0) > 0
 
-    @checks_arguments
     def to_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in image axes, as it appears in frames in row order, see ``row_axes``."""
         order, signs = row_axes(timing, self.num_axes)
         return self.with_axes(order, signs)
 
-    @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> Self:
         """The motion, given in row order, in image axes: the inverse of ``to_row_order``."""
         order, signs = row_axes(timing, self.num_axes)
@@ -209,13 +204,11 @@ class Motion(Result, ABC):
         """The same motion without gradients."""
         return self.mapped(Tensor.detach)
 
-    @checks_arguments
     def expanded(self, size: int) -> Self:
         """A batch of ``size`` copies of the motion; the new dimension is the first."""
         check_whole_number("size", size, at_least=1, at_most=MAX_BATCH)
         return self.mapped(lambda values: values.expand(size, *values.shape))
 
-    @checks_arguments
     def __getitem__(self, index: int) -> Self:
         """One motion of a batch."""
         if not self.batch_shape:

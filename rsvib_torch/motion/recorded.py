@@ -4,18 +4,17 @@ import csv
 import math
 import os
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_choice, check_number
-from rsvib_torch.core.option_types import MotionUnit, TimeUnit
+from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.options import MotionUnit, TimeUnit
 
 __all__ = ["SECONDS", "MotionUnit", "TimeUnit", "check_times", "read_motion"]
 
@@ -76,8 +75,6 @@ def read_motion(
         [-1.45, 2.9]
     """
     path = Path(path)
-    check_choice("unit", unit, get_args(MotionUnit))
-    check_choice("time_unit", time_unit, get_args(TimeUnit))
     if unit == "px" and focal_length is not None:
         raise ValueError("focal_length is for angles and rates only; omit it for unit='px'")
     if unit != "px":

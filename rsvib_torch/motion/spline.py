@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, checks_arguments
+from rsvib_torch.core.arguments import as_numbers, checked_methods
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import axis_head, axis_rows
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
@@ -27,6 +27,7 @@ MAX_EXPOSURE_NODES = 10_000  # times; an exposure of 1 s of a gyroscope with 5 k
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+@checked_methods
 class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "s"}):
     """A free spline with tones: ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + R(t)``.
 
@@ -61,7 +62,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     tones: Vibration
     camera: Camera | None = None
 
-    @checks_arguments
     def __init__(
         self,
         coefficients: TensorLike,
@@ -99,7 +99,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         object.__setattr__(self, "camera", tones.camera if camera is None else camera)
 
     @classmethod
-    @checks_arguments
     def through(
         cls,
         times: TensorLike,
@@ -125,7 +124,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         return cls(coefficients[:, len(grid) - 2 : 2 * len(grid)], float(grid[0]), spacing, tones, camera)
 
     @classmethod
-    @checks_arguments
     def from_samples(
         cls,
         times: TensorLike,
@@ -165,7 +163,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         return cls.through(torch.from_numpy(even), torch.from_numpy(interpolated), tones, camera)
 
     @classmethod
-    @checks_arguments
     def stacked(cls, motions: Sequence["FreeMotion"]) -> "FreeMotion":
         """Motions with the same knots and number of tones as a batch; the new dimension is the first."""
         if len(motions) == 0:
@@ -246,7 +243,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         count = self.coefficients.shape[-1]
         return self.start + self.spacing * (torch.arange(count, dtype=torch.float64, device=self.device) - 1.0)
 
-    @checks_arguments
     def retimed(self, offset: float, scale: float = 1.0, gain: tuple[float, float] = (1.0, 1.0)) -> "FreeMotion":
         """The motion on another clock: ``gain D(scale t + offset)`` at time t.
 
@@ -271,7 +267,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         rest = (self.coefficients + moved[..., None]) * size[:, None]
         return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones, self.camera)
 
-    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""
         self._check_axes(order, signs)
@@ -293,7 +288,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         picked = self.coefficients.gather(-1, flat).unflatten(-1, index.shape[len(batch) :])
         return picked.movedim(len(batch), -2), (place - cell).expand(index.shape[:-1])
 
-    @checks_arguments
     def rest(self, times: Tensor) -> Tensor:
         """R(t) alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -301,17 +295,14 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         value: Tensor = (taps * bspline_weights(fraction, 3)[..., None, :]).sum(-1)
         return value
 
-    @checks_arguments
     def drift(self, times: Tensor) -> Tensor:
         """Displacement of the image motion alone in px; arguments and shapes as in ``displacement``."""
         return self.tones.drift(times)
 
-    @checks_arguments
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px; arguments and shapes as in ``Vibration.displacement``."""
         return self.tones.displacement(times) + self.rest(times)
 
-    @checks_arguments
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures in px; arguments and shapes as in ``Vibration.mean_displacement``.
 
@@ -331,7 +322,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
             mean = mean + weight * self.rest(starts + node * exposure_time)
         return mean
 
-    @checks_arguments
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -348,13 +338,11 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """Bound on the tones and the spline, (..., 2), in px: the sum of amplitudes and the largest coefficient."""
         return self.tones.largest_oscillation() + self.coefficients.detach().abs().amax(-1)
 
-    @checks_arguments
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` seconds apart, (..., 2), in px."""
         speed = self.coefficients.detach().diff(dim=-1).abs().amax(-1) / self.spacing
         return self.tones.displacement_within(duration) + speed * duration
 
-    @checks_arguments
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2)."""
         return self.tones.periods_within(duration)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import as_numbers, check_broadcast, checks_arguments
+from rsvib_torch.core.arguments import as_numbers, check_broadcast, checked_methods, checks_arguments
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows
 from rsvib_torch.core.text import measured_text, text_table
@@ -115,6 +115,7 @@ def _check_values(values: dict[str, Tensor]) -> None:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+@checked_methods
 class Vibration(Motion, units=_UNITS):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
@@ -163,7 +164,6 @@ class Vibration(Motion, units=_UNITS):
     image_shift: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))  # in files without it
     camera: Camera | None = None
 
-    @checks_arguments
     def __init__(
         self,
         amplitude: TensorLike,
@@ -199,7 +199,6 @@ class Vibration(Motion, units=_UNITS):
         object.__setattr__(self, "camera", camera)
 
     @classmethod
-    @checks_arguments
     def still(cls, batch_shape: Sequence[int] = (), device: torch.device | str | None = None, *, axes: int = 2) -> Self:
         """No vibration and no image motion: the camera stands still."""
         sizes = [check_whole_number("batch_shape", size, at_least=1, at_most=MAX_BATCH) for size in batch_shape]
@@ -209,7 +208,6 @@ class Vibration(Motion, units=_UNITS):
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0], zeros[..., 0])
 
     @classmethod
-    @checks_arguments
     def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
         """Vibrations with the same shape and camera as a batch; the new dimension is the first.
 
@@ -286,14 +284,12 @@ class Vibration(Motion, units=_UNITS):
         shape = (*self.batch_shape, *(1,) * (times.ndim - 1 - len(self.batch_shape)), self.amplitude.shape[-2])
         return values.reshape(shape)
 
-    @checks_arguments
     def drift(self, times: Tensor) -> Tensor:
         """Displacement v t + a t^2 / 2 of the image motion alone in px; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)[..., None]
         velocity, acceleration = self._at(times, self.image_motion), self._at(times, self.image_acceleration)
         return torch.addcmul(velocity, acceleration, times, value=0.5) * times
 
-    @checks_arguments
     def displacement(self, times: Tensor) -> Tensor:
         """Displacement D(t) in px (Eq. 1).
 
@@ -307,7 +303,6 @@ class Vibration(Motion, units=_UNITS):
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times[..., None], self.image_shift)
 
-    @checks_arguments
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
         """Mean displacement over exposures [start, start + T_e] in px (Eq. 2).
 
@@ -328,7 +323,6 @@ class Vibration(Motion, units=_UNITS):
         curvature = self._at(middle[..., None], self.image_acceleration) * (_with_trailing(exposure_time, 1) ** 2 / 24)
         return tones + self.drift(middle) + curvature + self._at(middle[..., None], self.image_shift)
 
-    @checks_arguments
     def velocity(self, times: Tensor) -> Tensor:
         """Velocity dD/dt in px/s; arguments and shapes as in ``displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
@@ -337,7 +331,6 @@ class Vibration(Motion, units=_UNITS):
         oscillation = (2 * math.pi * frequency * amplitude * angle.cos()).sum(-1)
         return oscillation + self._at(times, self.image_motion) + self._at(times, self.image_acceleration) * times
 
-    @checks_arguments
     def gain(self, interval: float) -> Tensor:
         """Gain 2 sin(pi f m T_row) from displacement to offset over ``interval`` seconds (Eq. 7), (..., 2, K).
 
@@ -349,7 +342,6 @@ class Vibration(Motion, units=_UNITS):
         """Sum of the amplitudes of the tones and of the constant displacement, (..., 2), in px."""
         return self.amplitude.detach().sum(-1) + self.image_shift.detach().abs()
 
-    @checks_arguments
     def displacement_within(self, duration: float) -> Tensor:
         """Bound on the displacement between two times ``duration`` apart, (..., 2), in px (Eq. 24, sum of tones).
 
@@ -361,7 +353,6 @@ class Vibration(Motion, units=_UNITS):
         path = torch.where(cycles < 0.5, 2.0 * torch.sin(math.pi * cycles), 4.0 * cycles)
         return (self.amplitude.detach() * path).sum(-1) + self.image_motion.detach().abs() * duration
 
-    @checks_arguments
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count.
 
@@ -371,7 +362,6 @@ class Vibration(Motion, units=_UNITS):
         visible = self.amplitude.detach() > smallest[:, None]
         return torch.where(visible, self.frequency.detach() * duration, 0.0).amax(-1)
 
-    @checks_arguments
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The vibration whose component k is ``signs[k]`` times component ``order[k]`` of this one.
 
@@ -392,6 +382,7 @@ class Vibration(Motion, units=_UNITS):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+@checked_methods
 class VibrationStd(
     Result,
     units=_UNITS | {"displacement": "px"},
@@ -436,7 +427,6 @@ class VibrationStd(
         head = [*axis_head(self.batch_shape), *tone_head(axes=self.amplitude.shape[-2])]
         return "standard deviations\n" + text_table(head, rows)
 
-    @checks_arguments
     def from_row_order(self, timing: SensorTiming) -> "VibrationStd":
         """The standard deviations, given in row order, in image axes: as ``Motion.from_row_order`` without signs."""
         order, axes = row_axes(timing, self.amplitude.shape[-2])[0], self.image_motion.ndim

@@ -1,14 +1,11 @@
-"""The methods of band registration: cross-correlation, phase correlation and gray projection, and their options."""
+"""The methods of band registration: cross-correlation, phase correlation and gray projection."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import Registration
 from rsvib_torch.registration.bands import (
     BINNING,
     LAGS,
@@ -23,8 +20,6 @@ from rsvib_torch.registration.bands import (
 
 __all__ = [
     "BAND_METHODS",
-    "Registration",
-    "RegistrationOptions",
     "register_ncc",
     "register_phase",
     "register_projection",
@@ -386,11 +381,11 @@ def _correlate_profiles(template: Tensor, search: Tensor) -> Tensor:
     return _normalise(cross, energy, template.square().sum(-1, keepdim=True), typical)
 
 
-# Table and options
+# Table
 
 
 # Contract of a band registration method. To add one, write ``register_<name>``, here or in a file of its own, add it to
-# this table, and its name to ``Registration`` in core/option_types.py, from which configuration files take the names.
+# this table, and its name to ``Registration`` in options.py, from which configuration files take the names.
 #
 #   register(task: BandTask) -> (offsets, quality)
 #
@@ -408,29 +403,3 @@ BAND_METHODS: dict[str, Callable[[BandTask], tuple[Tensor, Tensor]]] = {
     "ncc": register_ncc,
     "phase": register_phase,
 }
-
-
-@dataclass(frozen=True)
-class RegistrationOptions:
-    """How the offsets of row bands between frames are measured.
-
-    Args:
-        method: ``"projection"`` (gray projection), ``"ncc"`` or ``"phase"``: a name of ``BAND_METHODS``.
-        band_rows: Rows of a band, at least 4.
-        band_step: Rows from one band to the next, at least 1.
-        search: Search range in px around the whole-frame offset, at least 2.
-
-    Raises:
-        TypeError: If a number is not a whole number.
-        ValueError: If the method is unknown or a number is too small.
-    """
-
-    method: Registration = "ncc"
-    band_rows: int = 32
-    band_step: int = 16
-    search: int = 16
-
-    def __post_init__(self) -> None:
-        check_choice("registration", self.method, tuple(BAND_METHODS))
-        for name, least in (("band_rows", 4), ("band_step", 1), ("search", 2)):
-            check_whole_number(name, getattr(self, name), at_least=least)

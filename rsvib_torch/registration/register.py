@@ -14,18 +14,19 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Channels
+from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
+from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
 from rsvib_torch.registration.bands import BandTask, template_margin
-from rsvib_torch.registration.methods import BAND_METHODS, Registration, RegistrationOptions
+from rsvib_torch.registration.methods import BAND_METHODS
 
 __all__ = ["OffsetCurve", "check_frame_size", "fits_frame", "register_bands", "register_rows"]
 
@@ -103,18 +104,8 @@ class OffsetCurve(
         return torch.isfinite(self.offsets).all(-1)
 
 
-@checks_arguments
-def register_bands(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    *,
-    method: Registration = "ncc",
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    full_scale: float | None = None,
-    channels: Channels = None,
-) -> OffsetCurve:
+@frames_options(BandRegistrationOptions)
+def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandRegistrationOptions) -> OffsetCurve:
     """Measure the offset of every row band between consecutive frames (Sec. 2.2 of Liu et al. 2023).
 
     The whole-frame offset is found first and may be hundreds of px (image motion); the search range counts from it.
@@ -123,12 +114,7 @@ def register_bands(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) with T >= 2; tensor, array, list of these, or
             files.
         timing: The sensor.
-        method: ``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.
-        band_rows: Rows of a band (the paper's window size).
-        band_step: Rows from one band to the next (the paper's window interval).
-        search: Search range in px; a peak at its edge counts as failed.
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``detect_vibration``.
+        options: Options; ``band_rows`` and ``band_step`` are the paper's window size and window interval.
 
     Returns:
         The offset curve, axes (x, y) of the image, rows in readout order.
@@ -145,11 +131,13 @@ def register_bands(
         >>> curve.offsets.nanmean((0, 1)).round(decimals=2).tolist()
         [4.0, 0.0]
     """
-    options = RegistrationOptions(method, band_rows, band_step, search)
     prepared = prepare_frames(
-        frames, timing, full_scale=full_scale, channels=channels, minimum_frames=2, allow_missing=False
+        frames, timing, full_scale=options.full_scale, channels=options.channels, minimum_frames=2, allow_missing=False
     )
-    batch = register_rows(prepared.images.mean(2), prepared.timing, options)
+    bands = RegistrationOptions(
+        registration=options.method, band_rows=options.band_rows, band_step=options.band_step, search=options.search
+    )
+    batch = register_rows(prepared.images.mean(2), prepared.timing, bands)
     curve = batch if prepared.batched else batch[0]
     height_x, height_y = sequence_from_row_order(curve.heights, timing)
     return replace(curve, offsets=offsets_from_row_order(curve.offsets, timing), heights=(height_x, height_y))
@@ -192,6 +180,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     Returns:
         A batch of B offset curves, axes (x, y) in row order.
     """
+    check_choice("registration", options.registration, tuple(BAND_METHODS))
     band_rows, search = options.band_rows, options.search
     batch, num_frames, num_rows, width = grey.shape
     timing.check_rows(num_rows)
@@ -216,7 +205,7 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     advance = steps(len(first), "pairs")
     for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(at_once)]:
         task = BandTask(first[pairs], second[pairs], coarse[pairs], tops, band_rows, search)
-        measured, correlation = BAND_METHODS[options.method](task)
+        measured, correlation = BAND_METHODS[options.registration](task)
         good = (correlation > 0.1) & (overlap[pairs, None] >= search)  # chance reaches correlations of 0.1
         offsets[pairs] = torch.where(good[..., None], measured, torch.nan).double()
         quality[pairs] = torch.where(good, correlation, 0.0).double()

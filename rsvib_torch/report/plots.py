@@ -116,6 +116,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         >>> path.exists()
         True
     """
+    check_whole_number("dpi", dpi, at_least=1, at_most=10_000)
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 

@@ -10,12 +10,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.splines import bspline_weights, mirrored
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.options import BandedOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
 
@@ -51,8 +52,7 @@ _TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], i
 def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
     """Weight of the gradient prior of each stack, (B,); estimated from the frames for ``"auto"``."""
     if value != "auto":
-        number = check_number("noise_to_signal", value, at_least=0.0)
-        return torch.full((frames.shape[0],), number, dtype=frames.dtype, device=frames.device)
+        return torch.full((frames.shape[0],), value, dtype=frames.dtype, device=frames.device)
     variance = estimate_noise(frames).square().flatten(1).mean(1)
     energy = frames.new_zeros(frames.shape[:-2])
     for dim in (-2, -1):
@@ -110,12 +110,7 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
 def restore_banded(
     frames: Tensor,
     motion: FrameMotion,
-    *,
-    half_rows: int = 16,
-    stride: int = 2,
-    interpolation: Literal["linear", "cubic"] = "cubic",
-    noise_to_signal: float | Literal["auto"] = "auto",
-    chunk_rows: int | None = None,
+    options: BandedOptions,
 ) -> Tensor:
     """Restore frames slab by slab (Sec. 3.2 of Liu et al. 2023).
 
@@ -129,24 +124,18 @@ def restore_banded(
     Args:
         frames: (B, T, C, H, W) in row order.
         motion: Motion of the frames.
-        half_rows: Half height l of a slab, in rows.
-        stride: Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise 0.003).
-        interpolation: Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own
-            blur is deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them.
-        noise_to_signal: w, the variance of the noise over that of the scene gradients; ``"auto"`` estimates it.
-        chunk_rows: Slabs filtered at a time; bounds the memory, does not change the result.
+        options: Options of the method; ``half_rows`` is l, ``noise_to_signal`` w.
 
     Returns:
         Restored frames of the same shape.
 
     Raises:
-        TypeError: If an option has the wrong type.
-        ValueError: If an option is out of range.
+        ValueError: If slabs or their steps are larger than the frames.
     """
-    half_rows = check_whole_number("half_rows", half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
-    stride = check_whole_number("stride", stride, at_least=1, at_most=max(2, frames.shape[-2]))
-    check_choice("interpolation", interpolation, tuple(_TRANSFERS))
-    weights = _noise_to_signal(frames, noise_to_signal)
+    half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
+    stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))
+    interpolation, chunk_rows = options.interpolation, options.chunk_rows
+    weights = _noise_to_signal(frames, options.noise_to_signal)
     B, T, C, H, W = frames.shape
     length = extended_length(
         W, motion.displacement_bound() + 8
@@ -156,7 +145,6 @@ def restore_banded(
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)
     if chunk_rows is None:
         chunk_rows = max(1, _CHUNK_ELEMENTS.get(frames.device.type, 1 << 22) // (size * len(u)))
-    chunk_rows = check_whole_number("chunk_rows", chunk_rows, at_least=1)
 
     # one slab for every `stride` scene rows: its middle, the frame row at which it appears, the motion relative to it
     centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]

@@ -7,16 +7,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import gathered, runs
 from rsvib_torch.core.fourier import extended_length, phase_products, phase_tables, spline_spectra
 from rsvib_torch.core.splines import bspline_weights, mirrored
+from rsvib_torch.options import DewarpOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
 __all__ = ["restore_dewarp"]
 
 
-def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128) -> Tensor:
+_CHUNK_ROWS = 128  # interpolated at a time
+
+
+def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
     """Undo the displacement of every row, not its blur: fast, and sufficient for short exposures.
 
     Scene row s is interpolated at frame row r(s) by a quintic B-spline across rows and moved back along the row by the
@@ -25,12 +28,11 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128
     Args:
         frames: (B, T, C, H, W) in row order.
         motion: Motion of the frames.
-        chunk_rows: Rows interpolated at a time; bounds the memory, does not change the result.
+        options: Options of the method.
 
     Returns:
         Restored frames of the same shape.
     """
-    chunk_rows = check_whole_number("chunk_rows", chunk_rows, at_least=1)
     degree = 5
     B, T, C, H, W = frames.shape
     rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
@@ -58,6 +60,6 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, *, chunk_rows: int = 128
         image: Tensor = torch.fft.irfft(moved, n=length)[..., :W]
         return image
 
-    parts = ((part, restored(part)) for part in runs(H, chunk_rows))
+    parts = ((part, restored(part)) for part in runs(H, options.chunk_rows or _CHUNK_ROWS))
     stacked: Tensor = gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
     return stacked

@@ -1,18 +1,15 @@
 """Noise gain of a restoration, measured with a noise probe."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Channels
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.frames.entry_points import vibration_options
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import NoiseGainOptions
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
@@ -20,17 +17,9 @@ from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 __all__ = ["predict_noise_gain"]
 
 
-@checks_arguments
+@vibration_options(NoiseGainOptions)
 def predict_noise_gain(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    vibration: Motion | DetectedVibration,
-    *,
-    method: str = "exact",
-    columns: int = 256,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    **options: Any,
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, options: NoiseGainOptions
 ) -> Tensor:
     """Ratio of the standard deviation of noise after restoration to that before it.
 
@@ -42,11 +31,7 @@ def predict_noise_gain(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W).
         timing: The sensor.
         vibration: The motion, or a detection, as in ``restore``.
-        method: As in ``restore``.
-        columns: Width of the strip across the scan, from the middle of the frames.
-        full_scale: As in ``restore``.
-        channels: As in ``restore``.
-        **options: Options of the method.
+        options: Options of ``restore``, and the width of the strip.
 
     Returns:
         Scalar, float64.
@@ -59,8 +44,10 @@ def predict_noise_gain(
         1.0
     """
     rim = 16  # px at the borders that are excluded
-    count = check_whole_number("columns", columns, at_least=4 * rim)
-    prepared = prepare_frames(frames, timing, full_scale=full_scale, channels=channels, allow_missing=False)
+    count = options.columns
+    prepared = prepare_frames(
+        frames, timing, full_scale=options.full_scale, channels=options.channels, allow_missing=False
+    )
     first = max(0, (prepared.images.shape[-1] - count) // 2)
     strip = prepared.images[..., first : first + count].to(torch.float64)
     vibration, _ = vibration_to_undo(vibration, timing, strip.shape[1], strip.shape[-2])
@@ -68,7 +55,7 @@ def predict_noise_gain(
     generator = torch.Generator(strip.device).manual_seed(0)
     probe = level * torch.randn(strip.shape, generator=generator, dtype=strip.dtype, device=strip.device)
     plain, probed = (
-        restore_prepared(prepared.with_images(images), vibration, method, options)[..., rim:-rim, rim:-rim]
+        restore_prepared(prepared.with_images(images), vibration, options)[..., rim:-rim, rim:-rim]
         for images in (strip, strip + probe)
     )
     return (probed - plain).square().mean().sqrt() / probe.square().mean().sqrt()

@@ -4,23 +4,22 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
 from rsvib_torch.core.fourier import waves
 from rsvib_torch.core.presentation import AXIS_NAMES, Result
 from rsvib_torch.core.text import text_table
-from rsvib_torch.frames.prepare import Saturation, prepare_frames
+from rsvib_torch.frames.entry_points import vibration_options
+from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import RestorationMtfOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
@@ -120,17 +119,9 @@ def _inner(image: Tensor, points: int) -> slice:
     return slice(rim, image.shape[-2] - rim)
 
 
-@checks_arguments
+@vibration_options(RestorationMtfOptions)
 def restoration_mtf(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    vibration: Motion | DetectedVibration,
-    *,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    ignore: ArrayLike | None = None,
-    saturation: Saturation = "auto",
-    **options: Any,
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, options: RestorationMtfOptions
 ) -> RestorationMtf:
     """MTF and noise gain of ``restore`` with method ``"exact"`` for these frames.
 
@@ -144,11 +135,7 @@ def restoration_mtf(
         frames: Stack (T, H, W) or (T, C, H, W), as in ``restore``.
         timing: The sensor.
         vibration: The motion along x and y, or a detection.
-        full_scale: As in ``restore``.
-        channels: As in ``restore``.
-        ignore: As in ``restore``.
-        saturation: As in ``restore``.
-        **options: Options of method ``"exact"`` with ``prior="gaussian"``, for instance ``joint`` and ``scale``.
+        options: Options of ``restore`` with method ``"exact"`` and ``prior="gaussian"``.
 
     Returns:
         MTF along x and y, effective resolution, and noise gain; means over the frame and over all restored frames.
@@ -168,10 +155,15 @@ def restoration_mtf(
         >>> mtf.frequency.max().item() > 0.9, bool((mtf.resolution > 0.4).all()), mtf.noise_gain < 1
         (True, True, True)
     """
-    if options.get("method", "exact") != "exact" or options.get("prior", "gaussian") != "gaussian":
+    if options.method != "exact" or options.prior != "gaussian":
         raise ValueError("restoration_mtf requires a linear restoration: method='exact' with prior='gaussian'")
     prepared = prepare_frames(
-        frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation
+        frames,
+        timing,
+        full_scale=options.full_scale,
+        channels=options.channels,
+        ignore=options.ignore,
+        saturation=options.saturation,
     )
     timing = prepared.image_timing
     _, count, colours, *size = prepared.images.shape
@@ -180,7 +172,7 @@ def restoration_mtf(
     vibration, _ = vibration_to_undo(vibration, timing, count, size[0])
     check_two_axes(vibration, "the MTF of a restoration")
     motion = frame_motion(motion_in_row_order(prepared, vibration), prepared.timing, count, size[0])
-    points = options.get("scale", 1)
+    points = options.scale
     # neighbours and their aliases 1 - u are at least half a step apart: more than the taper mixes
     cycles = max(4, min(40, min(size) // 5))
     frequency = torch.arange(0.25, cycles * points / 2, dtype=torch.float64, device=prepared.images.device) / cycles
@@ -189,14 +181,14 @@ def restoration_mtf(
     probes = torch.cat([_probes(motion, frequency, (size[0], size[1])), noise.to(frequency.device)], dim=1)
     level = _LEVEL * float(estimate_noise(prepared.filled).square().nanmean().sqrt().clamp(min=1e-4))
     images = torch.cat([prepared.images, level * probes[None].to(prepared.images.dtype)], dim=2)
-    if options.get("noise", "auto") != "auto":  # estimates are means over all channels
-        options["noise"] *= (colours / images.shape[2]) ** 0.5
+    if options.noise != "auto":  # estimates are means over all channels
+        options = replace(options, noise=options.noise * (colours / images.shape[2]) ** 0.5)
     missing, saturated = (
         None if mask is None else torch.cat([mask, mask.any(2, keepdim=True).expand_as(images[:, :, colours:])], dim=2)
         for mask in (prepared.missing, prepared.saturated)
     )
     probed = replace(prepared, images=images, missing=missing, saturated=saturated)
-    restored = restore_prepared(probed, vibration, "exact", options)[0, :, colours:]
+    restored = restore_prepared(probed, vibration, options)[0, :, colours:]
     gains = _gains(restored[:, :-1], frequency, points) / level
     if timing.scan_axis == -1:
         gains = gains.flip(0)

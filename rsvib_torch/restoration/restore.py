@@ -1,34 +1,25 @@
 """Restoration of frames: input preparation, one of the methods, and a check of the result."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Required, TypedDict, Unpack, overload
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import check_options, checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.checks import described
-from rsvib_torch.core.option_types import (
-    METHOD_SETTINGS,
-    BandedSettings,
-    DewarpSettings,
-    ExactSettings,
-    Mosaic,
-    RichardsonLucySettings,
-    method_options,
-)
+from rsvib_torch.core.arrays import ArrayLike
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.frames.entry_points import module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
-from rsvib_torch.frames.prepare import PreparedFrames, Saturation, prepare_frames
+from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.options import OpticsOptions, RestorationOptions, RestoreOptions, RestorerOptions
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
@@ -43,48 +34,11 @@ __all__ = [
     "METHODS",
     "RestorationMethod",
     "VibrationRestorer",
-    "check_method_options",
     "check_optics",
     "restore",
     "restore_prepared",
     "unchanged_frames",
 ]
-
-
-class CommonOptions(TypedDict, total=False):
-    """Options of ``restore`` and ``VibrationRestorer`` for all methods; ``ignore`` is one of ``restore`` only."""
-
-    full_scale: float | None
-    channels: Channels
-    ignore: ArrayLike | None
-    saturation: Saturation
-    check: bool
-    mosaic: Mosaic | None
-    optics: Optics | Mapping[str, Any] | None
-
-
-class ExactOptions(CommonOptions, ExactSettings, total=False):
-    """Options of method ``"exact"``, see ``restore_exact``."""
-
-    method: Literal["exact"]
-
-
-class BandedOptions(CommonOptions, BandedSettings, total=False):
-    """Options of method ``"banded"``, see ``restore_banded``."""
-
-    method: Required[Literal["banded"]]
-
-
-class DewarpOptions(CommonOptions, DewarpSettings, total=False):
-    """Options of method ``"dewarp"``, see ``restore_dewarp``."""
-
-    method: Required[Literal["dewarp"]]
-
-
-class RichardsonLucyOptions(CommonOptions, RichardsonLucySettings, total=False):
-    """Options of method ``"richardson-lucy"``, see ``restore_richardson_lucy``."""
-
-    method: Required[Literal["richardson-lucy"]]
 
 
 @dataclass(frozen=True)
@@ -95,29 +49,29 @@ class RestorationMethod:
         function: The method, see the contract above ``METHODS``.
         masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
         strips: Whether it takes ``strips``, and estimates once what strips of the same frames have in common.
-        sharpens: Whether its result estimates the scene after the optics, so that option ``optics`` can sharpen it.
         mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
     """
 
     function: Callable[..., Tensor]
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
     strips: bool = False
-    sharpens: bool = False
     mosaic: "RestorationMethod | None" = None
 
 
 # Restoration methods. A method is called as
 #
-#     function(frames, motion, *, ignore=None, clipped=None, **options) -> Tensor
+#     function(frames, motion, options, *, ignore=None, clipped=None) -> Tensor
 #
 #     frames: (B, T, C, H, W) float32 or float64 in row order, full scale 1, finite; local means at missing pixels.
 #     motion: FrameMotion of the B stacks, whose displacement depends on the row only: frames with roll or zoom are cut
 #         into strips of columns, which are stacks of one batch.
+#     options: the group of its options, in ``METHOD_OPTIONS`` of options.py.
 #     ignore, clipped: bool tensors shaped like the frames, passed only if listed in ``masks`` and such pixels exist.
 #         Without ``"ignore"``, the local means count as measured; without ``"clipped"``, saturated pixels do.
 #     strips: number of neighbouring stacks that are strips of the same frames, passed only if declared.
 #     colours: integer tensor shaped like the frames, the colour that each pixel of a mosaic measures; passed
-#         to ``mosaic`` only. A method without it has no option ``mosaic``.
+#         to ``mosaic`` only. Methods without it, and those whose result does not estimate the scene after the optics,
+#         have no options ``mosaic`` and ``optics``.
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
@@ -128,7 +82,6 @@ METHODS: dict[str, RestorationMethod] = {
         restore_exact,
         masks=("ignore", "clipped"),
         strips=True,
-        sharpens=True,
         mosaic=RestorationMethod(restore_mosaic, masks=("ignore", "clipped")),
     ),
     "banded": RestorationMethod(restore_banded),
@@ -137,79 +90,24 @@ METHODS: dict[str, RestorationMethod] = {
 }
 
 
-def check_method_options(method: str, options: Mapping[str, Any]) -> None:
-    """Refuse a method that does not exist, and options that the method does not have or that have another type."""
-    valid = method_options(method)
-    for name in options:
-        if name not in valid:
-            raise TypeError(f"method={method!r} has no option {name!r}; its options are {', '.join(valid)}")
-    check_options(options, METHOD_SETTINGS[method])
-
-
-def check_optics(optics: Optics | Mapping[str, Any] | None, method: str) -> Optics | None:
-    """Optics, or those with the given fields; refuse some that transmit nothing or that the method does not have."""
+def check_optics(optics: OpticsOptions | None) -> Optics | None:
+    """The optics that an option states; refuse some that transmit nothing."""
     if optics is None:
         return None
-    if not METHODS[method].sharpens:
-        names = " or ".join(repr(name) for name, entry in METHODS.items() if entry.sharpens)
-        raise ValueError(f"optics goes with method={names}, not with method={method!r}")
-    if isinstance(optics, Mapping):
-        unknown = sorted(optics.keys() - Optics.__dataclass_fields__.keys())
-        if unknown:
-            fields = ", ".join(Optics.__dataclass_fields__)
-            raise TypeError(f"optics has no field {unknown[0]!r}; its fields are {fields}")
-        optics = Optics(**optics)
-    if not isinstance(optics, Optics):
-        raise TypeError(f"optics must be rsv.Optics(...) or a mapping of its fields, got {described(optics)}")
-    passed = float(optics.transfer(torch.tensor(0.1, dtype=torch.float64), torch.zeros((), dtype=torch.float64)))
+    camera = optics if isinstance(optics, Optics) else Optics(**vars(optics))
+    passed = float(camera.transfer(torch.tensor(0.1, dtype=torch.float64), torch.zeros((), dtype=torch.float64)))
     if passed < 0.01:
         raise ValueError(
             f"optics transmit {passed:.2g} at 0.1 cycles per px, at least 0.01 is needed: there is no detail that can "
             "be sharpened; check the unit of sigma (px) and of frequencies (cycles per px)"
         )
-    return optics
+    return camera
 
 
-@overload
-def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, **options: Unpack[ExactOptions]
-) -> Tensor: ...
-@overload
-def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, **options: Unpack[BandedOptions]
-) -> Tensor: ...
-@overload
-def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, **options: Unpack[DewarpOptions]
-) -> Tensor: ...
-@overload
-def restore(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    vibration: Motion | DetectedVibration,
-    **options: Unpack[RichardsonLucyOptions],
-) -> Tensor: ...
-@overload
-def restore(
-    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, *, method: str, **options: Any
-) -> Tensor: ...
-@outside_graphs
+@vibration_options(RestoreOptions)
 @full_precision
-@checks_arguments
 def restore(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    vibration: Motion | DetectedVibration,
-    *,
-    method: str = "exact",
-    full_scale: float | None = None,
-    channels: Channels = None,
-    ignore: ArrayLike | None = None,
-    saturation: Saturation = "auto",
-    check: bool = True,
-    mosaic: Mosaic | None = None,
-    optics: Optics | Mapping[str, Any] | None = None,
-    **options: Any,
+    frames: FramesOrFiles, timing: SensorTiming, vibration: Motion | DetectedVibration, options: RestoreOptions
 ) -> Tensor:
     """Restore frames taken by a vibrating rolling-shutter camera: geometry and sharpness.
 
@@ -230,27 +128,7 @@ def restore(
         vibration: The motion in image axes: one for all, or a batch (B,) for a batch of stacks. Or a
             ``DetectionResult``: axes without a reliable vibration are then not corrected, see ``trusted_vibration``.
             The results of the free and the swept model contain the motion as ``.motion``.
-        method: ``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row within
-            slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative,
-            non-negative, several frames jointly if requested.
-        full_scale: Count that means 1.0, for integer frames other than uint8.
-        channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes,
-            and frames that appear to have them last are refused; ``"first"`` omits this check.
-        ignore: Boolean mask shaped like the frames of pixels that do not count; they may hold any value. Mask stuck
-            columns and a dark rim here: they do not move with the scene, and bias the noise level.
-        saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
-            integer frames, none for floating-point frames, whose level is unknown; None for none.
-        check: Judge the result on a part of the frames, and warn if it is no better than the raw frames; needs two
-            frames. ``judge_restoration`` judges all of them.
-        mosaic: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind
-            colour filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels
-            R, G, B. Only with method ``"exact"``, see ``restore_mosaic``.
-        optics: Optics of the camera, pixel included: the restored frames are as sharp as from a camera with pixels of
-            the restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / scale)``, where
-            noise allows it. Only with method ``"exact"``, see ``sharpened``. None: the restored frames have the
-            sharpness of the camera at rest.
-        **options: Options of the method, see ``restore_exact``, ``restore_banded``, ``restore_dewarp`` and
-            ``restore_richardson_lucy``.
+        options: Options, see ``RestoreOptions``.
 
     Returns:
         Restored frames of the same shape and floating-point dtype (float32 with full scale 1 for integer frames); with
@@ -280,10 +158,15 @@ def restore(
         taken [23.0, 24.0] dB
         restored [62.0, 63.0] dB
     """
-    check_method_options(method, options)
-    camera = check_optics(optics, method)
+    camera = check_optics(options.optics)
     prepared = prepare_frames(
-        frames, timing, full_scale=full_scale, channels=channels, ignore=ignore, saturation=saturation, mosaic=mosaic
+        frames,
+        timing,
+        full_scale=options.full_scale,
+        channels=options.channels,
+        ignore=options.ignore,
+        saturation=options.saturation,
+        mosaic=options.mosaic,
     )
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
@@ -291,50 +174,44 @@ def restore(
     for reason in left_alone:
         warn_of_restoration(str(reason))
     if left_alone and not bool(vibration.moving_axes().any()):
-        return unchanged_frames(prepared, options.get("joint", False), options.get("scale", 1))
+        return unchanged_frames(prepared, options.joint, options.scale)
     motion = motion_in_row_order(prepared, vibration)
-    restored = _restored(prepared, motion, method, options)
-    if check:  # before frames are sharpened: the verdict compares them with raw frames, which the optics have blurred
-        _warn_if_worse(prepared, restored, motion, options.get("joint", False))
+    restored = _restored(prepared, motion, options)
+    if options.check:  # before frames are sharpened: the verdict compares them with raw frames, blurred by the optics
+        _warn_if_worse(prepared, restored, motion, options.joint)
     if camera is not None:
-        restored = sharpened(restored, camera, options.get("scale", 1))
+        restored = sharpened(restored, camera, options.scale)
     return prepared.from_row_order(restored)
 
 
 @outside_graphs
 @full_precision
-def restore_prepared(
-    frames: PreparedFrames, vibration: Motion, method: str = "exact", options: Mapping[str, Any] | None = None
-) -> Tensor:
+def restore_prepared(frames: PreparedFrames, vibration: Motion, options: RestorationOptions) -> Tensor:
     """``restore`` of prepared frames, without a check of motion and result, and without sharpening by ``optics``.
 
     Args:
         frames: The frames.
         vibration: The motion in image axes, batch shape () or (B,).
-        method: As in ``restore``.
-        options: Options of the method.
+        options: Method and its options.
 
     Returns:
         Restored frames (B, T, C, H, W) in row order.
     """
-    options = dict(options or {})
-    check_method_options(method, options)
-    return _restored(frames, motion_in_row_order(frames, vibration), method, options)
+    return _restored(frames, motion_in_row_order(frames, vibration), options)
 
 
-def _restored(frames: PreparedFrames, motion: Motion, method: str, options: Mapping[str, Any]) -> Tensor:
+def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOptions) -> Tensor:
     """Frames restored with a motion (B) in row order, with the masks that the method takes."""
-    chosen = METHODS[method] if frames.colours is None else METHODS[method].mosaic
-    if chosen is None:
-        names = " or ".join(repr(name) for name, entry in METHODS.items() if entry.mosaic is not None)
-        raise ValueError(f"mosaic goes with method={names}, not with method={method!r}; demosaic the frames before")
+    method = METHODS[options.method]
+    chosen = method if frames.colours is None else method.mosaic
+    assert chosen is not None, "methods without mosaic have no option mosaic"
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
-    options = dict(options) | {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    more: dict[str, Any] = {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
-        options["colours"] = frames.colours
+        more["colours"] = frames.colours
     if chosen.strips:
-        options["strips"] = 1
-    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, options)
+        more["strips"] = 1
+    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, {"options": options, **more})
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
@@ -368,19 +245,11 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: Motion, joi
 class VibrationRestorer(nn.Module):
     """``restore`` as a module, for stacks (T, H, W) to batches of stacks (B, T, C, H, W).
 
-    It has no weights, ignores autocast, and is called by ``torch.compile`` unchanged, at one break of the graph.
-    Gradients flow to frames and vibration.
+    The options are those of ``restore``. It has no weights, ignores autocast, and is called by ``torch.compile``
+    unchanged, at one break of the graph. Gradients flow to frames and vibration.
 
     Args:
         timing: The sensor.
-        method: As in ``restore``.
-        full_scale: As in ``restore``.
-        channels: As in ``restore``.
-        saturation: As in ``restore``.
-        check: As in ``restore``.
-        mosaic: As in ``restore``.
-        optics: As in ``restore``.
-        **options: As in ``restore``.
 
     Example:
         >>> import torch
@@ -397,40 +266,15 @@ class VibrationRestorer(nn.Module):
         torch.Size([1, 2, 1, 284, 202])
     """
 
-    @overload
-    def __init__(self, timing: SensorTiming, **options: Unpack[ExactOptions]) -> None: ...
-    @overload
-    def __init__(self, timing: SensorTiming, **options: Unpack[BandedOptions]) -> None: ...
-    @overload
-    def __init__(self, timing: SensorTiming, **options: Unpack[DewarpOptions]) -> None: ...
-    @overload
-    def __init__(self, timing: SensorTiming, **options: Unpack[RichardsonLucyOptions]) -> None: ...
-    @overload
-    def __init__(self, timing: SensorTiming, *, method: str, **options: Any) -> None: ...
-    @checks_arguments
-    def __init__(
-        self,
-        timing: SensorTiming,
-        *,
-        method: str = "exact",
-        full_scale: float | None = None,
-        channels: Channels = None,
-        saturation: Saturation = "auto",
-        check: bool = True,
-        mosaic: Mosaic | None = None,
-        optics: Optics | Mapping[str, Any] | None = None,
-        **options: Any,
-    ) -> None:
+    @module_options(RestorerOptions)
+    def __init__(self, timing: SensorTiming, options: RestorerOptions) -> None:
         super().__init__()
-        check_method_options(method, options)
-        self.timing = timing
-        common = {"full_scale": full_scale, "channels": channels, "saturation": saturation, "check": check}
-        camera = {"mosaic": mosaic, "optics": check_optics(optics, method)}
-        self.options = {"method": method, **common, **camera, **options}
+        check_timing(timing)
+        check_optics(options.optics)
+        self.timing, self.options = timing, options
 
-    @checks_arguments
     def forward(
         self, frames: FramesOrFiles, vibration: Motion | DetectedVibration, ignore: ArrayLike | None = None
     ) -> Tensor:
         """Restore a stack of frames."""
-        return restore(frames, self.timing, vibration, ignore=ignore, **self.options)
+        return restore(frames, self.timing, vibration, ignore=ignore, **vars(self.options))

@@ -8,23 +8,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.progress import steps
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
+from rsvib_torch.options import RichardsonLucyOptions
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
 __all__ = ["restore_richardson_lucy"]
 
-_MAX_ITERATIONS = 1000  # each takes the time of four blurs; noise is amplified long before (docs/method.md)
-
 
 def restore_richardson_lucy(
     frames: Tensor,
     motion: FrameMotion,
+    options: RichardsonLucyOptions,
     *,
-    joint: bool | int = False,
-    iterations: int = 20,
     ignore: Tensor | None = None,
 ) -> Tensor:
     """Restore frames by Richardson-Lucy iterations on the row-varying blur.
@@ -38,18 +35,15 @@ def restore_richardson_lucy(
     Args:
         frames: (B, T, C, H, W) in row order, with local means at missing pixels; negative values count as 0.
         motion: Motion of the frames.
-        joint: ``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length
-            1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With
-            image motion, only the part that a frame shares with the restored one is used.
-        iterations: Number of iterations, at most 1000.
+        options: Options of the method.
         ignore: Boolean mask shaped like the frames of pixels that do not count.
 
     Returns:
         Non-negative restored frames of the same shape, or (B, 1, C, H, W).
     """
-    iterations = check_whole_number("iterations", iterations, at_least=1, at_most=_MAX_ITERATIONS)
+    iterations = options.iterations
     B, T, _, _, W = frames.shape
-    groups = joint_groups(T, joint)
+    groups = joint_groups(T, options.joint)
     psf = trajectory_psf(*motion.exposures, interpolation="cubic")
     weights = psf.weights.to(frames.dtype)[:, :, None]
     measured = torch.ones_like(frames) if ignore is None else (~ignore).to(frames.dtype)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import DEFAULT_WINDOW, BadFrames
 from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
@@ -24,6 +23,7 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import BadFrames, RestorationOptions, WindowOptions
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
@@ -125,7 +125,7 @@ class StackJob:
     bad_frames: BadFrames = "pass"
     force: bool = False
     device: str = "cpu"
-    window: int = DEFAULT_WINDOW
+    window: int = WindowOptions.window
 
     @property
     def joined(self) -> bool:
@@ -356,12 +356,12 @@ def plan_job(
         bad_frames,
         options.get("force", False),
         device,
-        options.get("window", DEFAULT_WINDOW),
+        options.get("window", WindowOptions.window),
     )
     if job.mosaic is not None:
         check_mosaic(job.mosaic, info.shape, str(source))
     if job.restoration is not None:
-        check_optics(job.restoration.get("optics"), job.restoration.get("method", "exact"))
+        check_optics(RestorationOptions(**job.restoration).optics)
     windows = cut_windows(info.shape[0], job.window)
     if options.get("workers") is not None:
         most = check_whole_number("workers", options["workers"], at_least=1)

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.option_types import BadFrames
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import BadFrames
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import (
     DetectOptions,

@@ -28,7 +28,7 @@ from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, s
 from rsvib_torch.io.video import CONTAINERS
 from rsvib_torch.io.video_parts import PartWriter, PlaneReader, join_parts, planes_of
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.restoration.restore import check_method_options
+from rsvib_torch.options import RestorationOptions
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, plan_job
@@ -252,25 +252,24 @@ def _planned(
     masks: bool,
 ) -> tuple[VideoPasses, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
-    options = dict(restoration or {})
+    given = dict(restoration or {})
     for name in ("joint", "scale", "mosaic", "optics"):
-        if options.pop(name, None) not in (None, False, 1):
+        if given.pop(name, None) not in (None, False, 1):
             raise ValueError(f"{name} is not available for videos that are followed frame by frame; use process_stack")
-    job, _, at_once = plan_job(source, timing, {**plan, "restoration": options, "window": 2})
+    job, _, at_once = plan_job(source, timing, {**plan, "restoration": given, "window": 2})
     reader: FrameReader = open_stack(source)
     try:
         planes = planes_of(reader)
     finally:
         reader.close()
-    method, saturation = options.pop("method", "exact"), options.pop("saturation", None)
-    check_method_options(method, options)
+    options = RestorationOptions(**given)
     white = None
-    if saturation is not None:
+    if isinstance(options.saturation, float):
         black, full = (0.0, job.full_scale or 1.0) if planes is None else (planes.black, planes.white)
-        white = black + check_number("saturation", saturation, above=0.0) * (full - black)
+        white = black + options.saturation * (full - black)
     scale = 255.0 if planes is not None else job.full_scale
     layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
-    restorer = VideoRestorer(layout, job.timing, method, options, job.device, masks)
+    restorer = VideoRestorer(layout, job.timing, options, job.device, masks)
     starts = job.timing.frame_starts(job.info.shape[0]).tolist()
     return VideoPasses(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking), at_once
 

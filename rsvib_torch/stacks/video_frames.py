@@ -1,7 +1,6 @@
 """Restoration of one frame of a video: its planes, the pixels that the sensor did not record, and margins."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import METHODS, restore_prepared
 from rsvib_torch.stacks.video_tracks import FrameTrack
@@ -97,16 +97,15 @@ class VideoRestorer:
     Args:
         layout: Layout of the frames.
         timing: The sensor.
-        method: As in ``restore``; chroma of half the resolution is only dewarped, because its blur is half as wide.
-        options: Options of the method.
+        options: Method of ``restore`` and its options; chroma of half the resolution is only dewarped, because its blur
+            is half as wide.
         device: Device for the computation.
         masks: Whether ``RestoredFrame.visible`` is needed.
     """
 
     layout: FrameLayout
     timing: SensorTiming
-    method: str
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: RestorationOptions
     device: str = "cpu"
     masks: bool = True
 
@@ -146,12 +145,12 @@ class VideoRestorer:
     def _plane(self, plane: Frame, number: int, timing: SensorTiming, motion: Vibration) -> Frame:
         if number == 1 and plane.min() == plane.max():  # no colours
             return plane
-        method = self.method if number == 0 else "dewarp"
-        level = self.layout.white if number == 0 and "clipped" in METHODS[method].masks else None
+        options = self.options if number == 0 else RestorationOptions(method="dewarp")
+        level = self.layout.white if number == 0 and "clipped" in METHODS[options.method].masks else None
         scale = self.layout.full_scale
         images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.device)
         saturation = None if level is None else level / (scale or 1.0)
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
-            restored = restore_prepared(prepared, motion, method, self.options if number == 0 else {})
+            restored = restore_prepared(prepared, motion, options)
         return frames_to_counts(prepared.from_row_order(restored)[0], self.layout.dtype, scale)

@@ -152,7 +152,7 @@ class VideoPasses:
         if not bool(motion.moving_axes().any()):
             return None
         with suppress(TooLittleInCommonError), torch.no_grad():
-            restored = restore_prepared(prepared, motion, self.restorer.method, self.restorer.options)
+            restored = restore_prepared(prepared, motion, self.restorer.options)
             return judge_prepared(prepared, restored, motion, most_pairs=1)
         return None
 

@@ -74,9 +74,9 @@ def followed(
         first.append(_Given(track, pixels, item))
         if start is None:
             start = index if track.known else None
-            if start is None and len(first) > 4 * tracker.window:  # the vibration is not known for a while
+            if start is None and len(first) > 4 * tracker.options.window:  # the vibration is not known for a while
                 yield first[0].track, first.popleft().item
-        elif index >= start + tracker.window:
+        elif index >= start + tracker.options.window:
             yield from _followed_backwards(first, tracker)
             first.clear()
     yield from _followed_backwards(first, tracker)
@@ -99,11 +99,7 @@ def _followed_backwards(frames: Sequence[_Given], tracker: VibrationTracker) -> 
     if known and unknown:
         backwards = VibrationTracker(
             replace(tracker.timing, readout_direction=_OPPOSITE[tracker.timing.readout_direction]),
-            window=tracker.window,
-            columns=tracker.columns,
-            wobble=tracker.wobble,
-            full_scale=tracker.full_scale,
-            channels=tracker.channels,
+            **vars(replace(tracker.options, steady=0.0, wobble=tracker.wobble)),
         )
         last = frames[-1].track.time
         for one in reversed(frames):

@@ -29,6 +29,7 @@ from rsvib_torch.io.full_scale import (
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
@@ -90,16 +91,12 @@ def restore_trusted(
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
     vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
     frames = frames if first_frames is None else frames[:first_frames]
-    joint, scale = options.get("joint", False), options.get("scale", 1)
-    method = options.get("method", "exact")
-    optics = check_optics(options.get("optics"), method)
-    prepared = prepare_frames(
-        frames, timing, saturation=options.get("saturation", "auto"), mosaic=options.get("mosaic")
-    )
+    chosen = RestorationOptions(**options)
+    joint, scale, optics = chosen.joint, chosen.scale, check_optics(chosen.optics)
+    prepared = prepare_frames(frames, timing, saturation=chosen.saturation, mosaic=chosen.mosaic)
     if not bool(vibration.moving_axes().any()):
         return RestoredFrames(unchanged_frames(prepared, joint, scale), False, left_alone, None, False)
-    chosen = {name: options[name] for name in options if name not in ("method", "saturation", "mosaic", "optics")}
-    restored = restore_prepared(prepared, vibration, method, chosen)
+    restored = restore_prepared(prepared, vibration, chosen)
     verdict = None
     with suppress(TooLittleInCommonError):
         if len(frames) > 1:

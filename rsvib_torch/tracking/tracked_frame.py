@@ -1,9 +1,8 @@
 """Result of the tracker for one frame; the restored frame and the detection are computed when they are used."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.options import TrackerOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 
@@ -82,9 +82,7 @@ class TrackedFrame:
     measurements: Measurements | None
     frame: PreparedFrames
     tones: TrackedTones | None
-    window: int
-    method: str
-    options: Mapping[str, Any]
+    options: TrackerOptions
     latency: int = 0
 
     def moved_to(self, place: Tensor) -> "TrackedFrame":
@@ -104,7 +102,7 @@ class TrackedFrame:
             return unchanged_frames(self.frame, joint=False)[0]
         frame = self._timed_from_middle
         with torch.no_grad():
-            return frame.from_row_order(restore_prepared(frame, self.motion, self.method, self.options))[0]
+            return frame.from_row_order(restore_prepared(frame, self.motion, self.options))[0]
 
     @cached_property
     def visible(self) -> Tensor:
@@ -134,7 +132,15 @@ class TrackedFrame:
         interval, scale = float(np.diff(measurements.exposure_starts).mean()), FieldScale(2, width, height)
         user_timing, findings = self.frame.image_timing, (self.tones.findings,)
         results = assembled(
-            fit, std, curve, fitted, findings, user_timing, scale=scale, num_frames=self.window, interval=interval
+            fit,
+            std,
+            curve,
+            fitted,
+            findings,
+            user_timing,
+            scale=scale,
+            num_frames=self.options.window,
+            interval=interval,
         )
         return results[0]
 

@@ -14,16 +14,14 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
-from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.core.option_types import DetectionMethod
+from rsvib_torch.core.arguments import as_numbers
+from rsvib_torch.core.arrays import ArrayLike, as_tensor
 from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.core.tables import Array, table, tables, tensor
@@ -49,17 +47,18 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
 from rsvib_torch.detection.verdict import contradicted_axes, judged
+from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.options import DetectionMethod, RegistrationOptions, TrackerOptions
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
-from rsvib_torch.restoration.restore import METHODS, check_method_options
+from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.tracking.tone_filter import ToneFilter
 from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, time_to_middle
 
@@ -163,16 +162,6 @@ class VibrationTracker:
 
     Args:
         timing: The sensor, without ``frame_start_times``.
-        window: Number of frames from which the vibration is detected at the start, and again if tracking fails.
-        columns: As in ``detect_vibration``: the columns with the most detail that are measured; None for all.
-        method: Method of ``restore``; ``"dewarp"`` is the fastest.
-        steady: s; the image is moved to the straight line that fits its path during this time, so that slow shaking is
-            removed as well. 0: frames stay where they are.
-        wobble: Whether skew and wobble by slow motion are removed along axes without a reliable vibration as well, as
-            with ``steady``. Frames that move as a whole (stabilised in the camera) would be skewed by it.
-        full_scale: As in ``restore``.
-        channels: ``"last"`` for frames (H, W, C).
-        **options: Options of the method.
 
     Raises:
         TypeError: If the method does not have an option.
@@ -193,29 +182,13 @@ class VibrationTracker:
         [110.0, 90.0]
     """
 
-    @checks_arguments
-    def __init__(
-        self,
-        timing: SensorTiming,
-        *,
-        window: int = 8,
-        columns: int | None = 384,
-        method: str = "dewarp",
-        steady: float = 0.0,
-        wobble: bool = False,
-        full_scale: float | None = None,
-        channels: Channels = None,
-        **options: Any,
-    ) -> None:
+    @module_options(TrackerOptions)
+    def __init__(self, timing: SensorTiming, options: TrackerOptions) -> None:
+        check_timing(timing)
         if timing.frame_start_times is not None:
             raise ValueError("timing must not have frame_start_times: pass the time of each frame to update")
-        check_method_options(method, options)
-        self.timing, self.method, self.options = timing, method, options
-        self.window = check_whole_number("window", window, at_least=2)
-        self.columns = columns if columns is None else check_whole_number("columns", columns, at_least=64)
-        self.steady = check_number("steady", steady, at_least=0.0)
-        self.wobble = wobble or steady > 0
-        self.full_scale, self.channels = full_scale, channels
+        self.timing, self.options = timing, options
+        self.wobble = options.wobble or options.steady > 0
         self._rows = timing.in_row_order()
         self.reset()
 
@@ -226,7 +199,6 @@ class VibrationTracker:
     @outside_graphs
     @full_precision
     @without_gradients
-    @checks_arguments
     def update(self, frame: ArrayLike, time: float | None = None, *, measure: bool = True) -> TrackedFrame:
         """Process the next frame.
 
@@ -249,9 +221,9 @@ class VibrationTracker:
             prepared = prepare_frames(
                 as_tensor("frame", frame)[None],
                 self.timing,
-                full_scale=self.full_scale,
-                channels=self.channels,
-                saturation="auto" if "clipped" in METHODS[self.method].masks else None,
+                full_scale=self.options.full_scale,
+                channels=self.options.channels,
+                saturation="auto" if "clipped" in METHODS[self.options.method].masks else None,
             )
             latest = _GreyFrame.of(prepared, time)
         before = self._state.frames[-1] if self._state.frames else None
@@ -265,7 +237,7 @@ class VibrationTracker:
         if latest.shows_nothing_new(before):
             self._state = state
             return self._result(prepared, state, usable=False)
-        state = replace(state, frames=(*state.frames, latest)[-self.window :], untried=state.untried + 1)
+        state = replace(state, frames=(*state.frames, latest)[-self.options.window :], untried=state.untried + 1)
 
         # 2. Predict the motion of a late frame, measure that of any other; detect the vibration if it is not known, or
         # if the rows contradict it.
@@ -275,9 +247,9 @@ class VibrationTracker:
 
         # 3. The result, moved to where the steady image is.
         tracked = self._result(prepared, state)
-        if self.steady and tracked.tones is not None:
+        if self.options.steady and tracked.tones is not None:
             places = (*state.places, (time, tracked.path))
-            state = replace(state, places=tuple(place for place in places if place[0] >= time - self.steady))
+            state = replace(state, places=tuple(place for place in places if place[0] >= time - self.options.steady))
             tracked = tracked.moved_to(_end_of_line(state.places))
         self._state = state
         return tracked
@@ -347,7 +319,7 @@ class VibrationTracker:
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
         trusted = np.array([not against for against in tones.findings])
-        trusted_axes = (*track.trusted, trusted)[-self.window :]
+        trusted_axes = (*track.trusted, trusted)[-self.options.window :]
         track = _Track(corrected, spectra, frame.time, track.columns, scene, tones, trusted_axes)
         if any(contradicted_axes(tones.findings)):
             return replace(state, track=track, contradictions=state.contradictions + 1)
@@ -403,7 +375,7 @@ class VibrationTracker:
         new = state.contradictions
         if state.track is None:
             new = max(new, len(state.frames) if state.attempts == 0 else 0, state.untried)
-        needed = max(2, self.window // 2) * 2 ** min(state.attempts, _MAX_DOUBLED)
+        needed = max(2, self.options.window // 2) * 2 ** min(state.attempts, _MAX_DOUBLED)
         if new < needed or state.untried < needed // 2:
             return 0
         return min(new, len(state.frames))
@@ -449,12 +421,13 @@ class VibrationTracker:
         everywhere = torch.ones_like(frames[0].images, dtype=torch.bool)
         valid = torch.cat([everywhere if frame.valid is None else frame.valid for frame in frames], 1)
         height, width = images.shape[-2:]
-        is_large_enough = fits_frame(height, width if self.columns is None else min(width, self.columns), _BANDS)
+        columns = self.options.columns
+        is_large_enough = fits_frame(height, width if columns is None else min(width, columns), _BANDS)
         if not is_large_enough or bool((valid.float().mean((-2, -1)) < _MIN_VALID).any()):
             return None
         mask = None if bool(valid.all()) else valid
         stacks = GreyFrames(without_mosaic(images), mask, batched=False, timing=self._rows)
-        return stacks if self.columns is None else stacks.narrowed(self.columns)
+        return stacks if self.options.columns is None else stacks.narrowed(self.options.columns)
 
     def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
         """Start the filter with tones of a detection, and measure the last frame.
@@ -492,7 +465,9 @@ class VibrationTracker:
         started = ToneFilter.started(middle, coefficients, frequency, start, start_std, exposure_time)
         # 3. The last frame is compared with the one before.
         before, last = state.frames[-2:]
-        columns = slice(None) if self.columns is None else detailed_columns(last.images[0, 0], self.columns)
+        columns = (
+            slice(None) if self.options.columns is None else detailed_columns(last.images[0, 0], self.options.columns)
+        )
         track = _Track(started, before.spectra(columns), before.time, columns)
         return self._measured(replace(state, track=track))
 
@@ -528,8 +503,6 @@ class VibrationTracker:
             measurements=measurements,
             frame=prepared,
             tones=tones,
-            window=self.window,
-            method=self.method,
             options=self.options,
         )
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import BorderName
+from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.options import BorderName
 from rsvib_torch.tracking.tracked_frame import TrackedFrame
 
 __all__ = ["Margins", "VideoBorder"]
@@ -99,7 +99,6 @@ class VideoBorder:
 
     @checks_arguments
     def __init__(self, border: BorderName = "hold", margins: Margins | None = None) -> None:
-        check_choice("border", border, ("mirror", "hold", "crop"))
         if (border == "crop") != (margins is not None):
             raise ValueError(
                 f"margins go with border='crop' and only with it, got border={border!r}, margins={margins}"

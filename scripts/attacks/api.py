@@ -50,7 +50,7 @@ def _with_fields(value: Any) -> Call:
 
 def _methods(value: Any, **arguments: Any) -> dict[str, Call]:
     """All public methods of an object whose arguments are known by name."""
-    calls = {}
+    calls, arguments = {}, {"results": [value, value], **arguments}
     for name, method in inspect.getmembers(value, callable):
         of_package = str(getattr(method, "__module__", "")).startswith("rsvib_torch")
         if name.startswith("_") or name in _OF_THE_PACKAGE or not of_package:

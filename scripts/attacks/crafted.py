@@ -542,7 +542,9 @@ def _read(path: Path) -> None:
         config = read_config(path)
         if config.simulation is not None:
             scene = np.random.default_rng(0).random((96, 96), np.float32)
-            rsv.simulate_frames(scene, config.timing, config.simulation.vibration, config.simulation.num_frames)
+            rsv.simulate_frames(
+                scene, config.timing, config.simulation.vibration.to_vibration(), config.simulation.num_frames
+            )
     elif name.endswith(".csv"):
         rsv.read_motion(path, unit="px")
     elif name.endswith(".vibration.json"):

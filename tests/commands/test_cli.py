@@ -287,7 +287,7 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
     capsys.readouterr()
     for options, message in (
-        (("--method", "magic"), "method must be one of 'exact', 'banded', 'dewarp'"),
+        (("--method", "magic"), "'magic' is not one of 'exact', 'banded', 'dewarp'"),
         (("--method", "dewarp", "--joint", "2"), "method='dewarp' has no option 'joint'; its options are chunk_rows"),
         (("--method", "exact", "--joint", "many"), "--joint must be 'all' or a number of frames, got 'many'"),
         (("--saturation", "0"), "saturation must be larger than 0, got 0"),
@@ -437,7 +437,7 @@ BAD_INPUT = {
     "no such frames": (missing_frames, "none.tif does not exist"),
     "no such config": (missing_config, "none.toml: No such file or directory"),
     "missing key": (edit_config("frame_rows = 512", ""), "sensor: frame_rate or frame_rows is missing"),
-    "wrong value": (edit_config("search = 8", "search = 1"), "search must be at least 2, got 1"),
+    "wrong value": (edit_config("search = 8", "search = 1"), "detection.search: expected at least 2, got 1"),
 }
 
 

@@ -67,11 +67,11 @@ def test_report_of_a_finer_grid(place, tmp_path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (("--mosaic", "RGB"), "mosaic must be one of 'RGGB', 'BGGR', 'GRBG', 'GBRG'; got 'RGB'"),
-        (("--mosaic", "RGGB", "--method", "dewarp"), "mosaic goes with method='exact'"),
+        (("--mosaic", "RGB"), "'RGB' is not one of 'RGGB', 'BGGR', 'GRBG', 'GBRG'"),
+        (("--mosaic", "RGGB", "--method", "dewarp"), "method='dewarp' has no option 'mosaic'; its options are"),
         (("--optics-sigma", -1), "sigma must be at least 0, got -1"),
         (("--optics-sigma", 50), "optics transmit"),
-        (("--optics-sigma", 0.4, "--method", "dewarp"), "optics goes with method='exact'"),
+        (("--optics-sigma", 0.4, "--method", "dewarp"), "method='dewarp' has no option 'optics'; its options are"),
         (("--scale", 3), "scale must be one of 1, 2; got 3"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor, checks_arguments
+from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.evaluation.scenes import city_and_fields
 
@@ -96,16 +96,14 @@ def test_pixels_beyond_all_scales(value):
         (lambda: VIBRATION.displacement("now"), r"times must be a tensor, got 'now' \(str\)"),
         (lambda: VIBRATION.with_axes([0, 5], [1.0, 1.0]), "order must be a permutation"),
         (lambda: rsv.FreeMotion(torch.zeros(2, 9), 0.0, 1e-3).mean_displacement(torch.zeros(3), 1e9), "exposure_time"),
-        (lambda: rsv.detect_vibration(FRAMES, TIMING, harmonics=10**9), "harmonics must be at most"),
         (lambda: rsv.restore(FRAMES, "timing", VIBRATION), "timing must be a SensorTiming"),
         (
             lambda: rsv.restore(FRAMES, TIMING, 3),
             r"vibration must be a Motion or a DetectedVibration \(from .*\), got 3",
         ),
-        (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, noise=1e308), "noise must be at most"),
         (lambda: rsv.row_psf(VIBRATION, TIMING.row_starts(1, 4)[0], TIMING, num_nodes=10**9), "num_nodes must be at"),
         (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
-        (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be finite"),
+        (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be a number, got a very large int"),
         (lambda: rsv.comparison_figure(torch.tensor(1.0), FRAMES[0]), "raw must have shape"),
         (lambda: rsv.comparison_figure(FRAMES[0], FRAMES[None]), r"restored must have shape \(C, H, W\) with C = 1"),
         (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=1e-40), "flicker_frequency=1000 Hz is ambiguous"),
@@ -143,7 +141,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: blur().A_adjoint(torch.tensor(1.0)), r"y must have shape \(..., R, W\)"),
         (lambda: blur()(FRAMES[0].to(torch.uint16)), "scene must be a floating-point tensor, got torch.uint16"),
         (lambda: blur()((100 * FRAMES[0]).to(torch.int64)), "scene must be a floating-point tensor, got torch.int64"),
-        (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration .* or None"),
+        (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration"),
         (lambda: rsv.MotionCheck("x", torch.zeros(2), True, (), *CURVES), "before must be a tensor"),
         (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
     ],
@@ -157,7 +155,7 @@ def test_values_beyond_the_limits_of_an_argument(build, message):
 def test_nested_tensors_are_described():
     with pytest.raises(TypeError, match="frames must be a NumPy array, got a nested tensor"):
         rsv.restore_block(nested(), TIMING)
-    with pytest.raises(TypeError, match="displacement must be a dense tensor or None, got a nested"):
+    with pytest.raises(TypeError, match="displacement must be a dense tensor, got a nested"):
         replace(STD, displacement=nested())
 
 
@@ -175,7 +173,6 @@ def test_nested_tensors_are_described():
         ("swept", {"reliable": torch.ones(1, 2, dtype=torch.bool)}, r"reliable must have shape .* with \.\.\. = \(\)"),
         ("swept", {"std": {"a": 1}}, r"std\['a'\] must be a tensor, got 1 \(int\)"),
         ("swept", {"std": {"a": torch.zeros(2)}}, "std must have the keys amplitude, frequency, decay, chirp, phase"),
-        ("swept", {"std": {1: torch.zeros(2)}}, r"keys of std must be text, got 1 \(int\)"),
     ],
 )
 def test_results_of_contradicting_shapes(result, changes, message):
@@ -211,24 +208,6 @@ def test_exposure_of_many_knots():
     motion = rsv.FreeMotion.through(times, torch.stack([times**2, times], -1))
     mean = motion.mean_displacement(torch.tensor([0.2]), torch.tensor(1.6)).tolist()[0]
     assert mean == pytest.approx([(1.8**3 - 0.2**3) / 3 / 1.6, 1.0], abs=1e-6)
-
-
-def test_checks_leave_calls_unchanged():
-    @checks_arguments
-    def scaled(values: torch.Tensor, factor: float = 2.0, *, names: tuple[str, str] = ("a", "b")) -> torch.Tensor:
-        """Doc."""
-        return values * factor
-
-    values = torch.tensor([1.0], requires_grad=True)
-    scaled(values, 3).backward()
-    assert values.grad.tolist() == [3.0]
-    assert scaled.__doc__ == "Doc."
-    with pytest.raises(TypeError, match="missing 1 required positional argument: 'values'"):
-        scaled()
-    with pytest.raises(ValueError, match="names must have 2 values, got 1"):
-        scaled(values, names=("a",))
-    with pytest.raises(TypeError, match=r"names\[1\] must be text"):
-        scaled(values, names=("a", 1))
 
 
 def test_tensors_are_freed_without_garbage_collection():

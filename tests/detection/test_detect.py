@@ -304,7 +304,7 @@ def test_dropped_frame_times(paper_camera):
 
 
 def test_module_refuses_unknown_options(paper_camera):
-    with pytest.raises(TypeError, match=r"unknown option 'tone' of VibrationDetector; the options are .*tones"):
+    with pytest.raises(TypeError, match=r"unknown option 'tone'; the options are .*tones"):
         VibrationDetector(paper_camera, tone=2)
 
 
@@ -334,7 +334,7 @@ def test_columns_beyond_the_width_select_all(pairs, paper_camera):
     frames, _ = pairs[0]
     whole = detect_bands(frames, paper_camera).vibration.amplitude
     assert torch.equal(detect_bands(frames, paper_camera, columns=4000).vibration.amplitude, whole)
-    with pytest.raises(ValueError, match=r"columns=128 goes with model='tones', not with model='free'"):
+    with pytest.raises(TypeError, match="model='free' has no option 'columns'; its options are"):
         detect_vibration(frames, paper_camera, model="free", columns=128)
 
 
@@ -367,17 +367,8 @@ def with_pixel(value):
         (detail(2, 24, 128), {}, ValueError, "too small for bands of 32 rows searched over 16 px"),
         (detail(2, 256, 40), {}, ValueError, "too small for bands"),
         (detail(2, 2100, 128), {}, ValueError, "frame_rows=2048 is less than the 2100 rows"),
-        (detail(2, 256, 128), {"tones": 0}, ValueError, "tones must be at least 1, got 0"),
-        (detail(2, 256, 128), {"tones": 9}, ValueError, "tones must be 'auto' or 1 to 4, got 9"),
-        (detail(2, 256, 128), {"tones": "many"}, TypeError, "tones must be a whole number, got 'many'"),
-        (detail(2, 256, 128), {"tones": 1.5}, TypeError, "tones must be 'auto' or a whole number, got 1.5"),
         (detail(2, 256, 128), {"method": "magic"}, ValueError, "method must be one of .*got 'magic'"),
         (detail(2, 256, 128), {"registration": "orb"}, ValueError, "registration must be one of .*got 'orb'"),
-        (detail(2, 256, 128), {"band_rows": 2}, ValueError, "band_rows must be at least 4, got 2"),
-        (detail(2, 256, 128), {"band_step": 0}, ValueError, "band_step must be at least 1, got 0"),
-        (detail(2, 256, 128), {"search": 1}, ValueError, "search must be at least 2, got 1"),
-        (detail(2, 256, 128), {"columns": 20}, ValueError, "columns must be at least 64, got 20"),
-        (detail(2, 256, 128), {"columns": 70.5}, TypeError, "columns must be a whole number or None, got 70.5"),
     ],
 )
 def test_bad_input(paper_camera, frames, options, error, message):

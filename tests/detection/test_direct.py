@@ -23,7 +23,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.options import OffsetOptions, RegistrationOptions
 from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
 
@@ -228,8 +228,8 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
 def test_changes_of_the_last_rounds_count_as_errors(paper_camera):
     """Of a refinement that did not converge: here, fits whose amplitude along y was 0.3 and 0.4 px larger."""
     frames = noisy_frames(paper_camera, Motion(phase=(0.9, 2.2)), 42, 0.005, rows=512)
-    options = DetectionOptions("direct", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
-    stacks = grey_frames(frames, paper_camera, None, None, None)
+    options = DetectionOptions("direct", 1, MotionModel(), RegistrationOptions())
+    stacks = grey_frames(frames, paper_camera, OffsetOptions())
     translation = Hypothesis(FieldScale(2, frames.shape[-1], 512))
     rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.refined
     fit = rows.fit
@@ -330,8 +330,8 @@ def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
     """Compared with a refinement that is continued after it has converged."""
     frames = noisy_frames(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
     timing = paper_camera.in_row_order()
-    stacks = grey_frames(frames, paper_camera, None, None, None)
-    options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions("ncc", 32, 16, 16))
+    stacks = grey_frames(frames, paper_camera, OffsetOptions())
+    options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions())
     start = attempt(stacks, timing, options, Hypothesis(FieldScale(2, *frames.shape[:-3:-1]))).fitted.fit
     intervals = np.array([timing.frame_period])
     rows = grouped_frames(stacks.images, None, timing, motion_of_fit(shrunk(start, intervals)))
@@ -728,7 +728,6 @@ def test_batch_equals_single_stacks(paper_camera):
         ({"window": 1}, ValueError, "window must be at least 2, got 1"),
         ({"window": 5}, ValueError, "window of 5 frames is longer than the stack of 3"),
         ({"window": 2, "window_step": 0}, ValueError, "window_step must be at least 1, got 0"),
-        ({"harmonics": 0}, ValueError, "harmonics must be at least 1, got 0"),
         ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit"),
         ({"ignore": torch.zeros(256, 256)}, TypeError, "ignore must be a bool tensor"),
         ({"ignore": torch.ones(256, 256, dtype=torch.bool)}, ValueError, "frames have no pixel with data"),

@@ -16,7 +16,7 @@ from rsvib_torch.detection.recorded.band_vectors import band_vectors
 from rsvib_torch.detection.recorded.rotation_alignment import align_rates
 from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
 from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.options import OffsetOptions, RegistrationOptions
 
 FOCAL_LENGTH, SIZE, COUNT = 380.0, (200, 216), 4
 BIAS, OFFSET = (0.012, -0.02, 0.008), 0.35
@@ -82,8 +82,8 @@ def make_frames():
 
 @pytest.fixture(scope="module", name="vectors")
 def make_vectors(frames):
-    options = RegistrationOptions("phase", 32, 16, 16)
-    return band_vectors(grey_frames(frames, TIMING, None, None, None), TIMING, options)
+    options = RegistrationOptions(registration="phase")
+    return band_vectors(grey_frames(frames, TIMING, OffsetOptions()), TIMING, options)
 
 
 def aligned(vectors, rates, camera=None):

@@ -49,20 +49,6 @@ def test_noise_is_added_to_the_pattern():
     assert ((counts * 4095) - (counts * 4095).round()).abs().max() < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("values", "error", "message"),
-    [
-        ({"gain_spread": -0.1}, ValueError, "gain_spread must be at least 0"),
-        ({"column_offset": 2.0}, ValueError, "column_offset must be at most 1"),
-        ({"row_offset": "wide"}, TypeError, "row_offset must be a number"),
-        ({"pattern_seed": 0.5}, TypeError, "pattern_seed must be a whole number"),
-    ],
-)
-def test_bad_sensor(values, error, message):
-    with pytest.raises(error, match=message):
-        SensorNoise(**values)
-
-
 def test_a_wave_is_attenuated_by_the_transfer_function():
     optics = Optics(sigma=0.4, cutoff=0.9, pixel=1.0)
     height, width, k, m = 60, 80, 19, 7  # half cycles: cosines that are mirrored at the borders

@@ -188,20 +188,6 @@ def test_noise_follows_the_generator():
 
 
 @pytest.mark.parametrize(
-    ("values", "error", "message"),
-    [
-        ({"full_well": 0}, ValueError, "full_well must be larger than 0"),
-        ({"read_noise": -0.1}, ValueError, "read_noise must be at least 0"),
-        ({"bits": 0}, ValueError, "bits must be at least 1"),
-        ({"bits": 7.5}, TypeError, "bits must be a whole number, got 7.5"),
-    ],
-)
-def test_bad_noise(values, error, message):
-    with pytest.raises(error, match=message):
-        SensorNoise(**values)
-
-
-@pytest.mark.parametrize(
     ("vibration", "exposure_rows", "least"),
     [
         (MOTION.vibration(), 20, 4.0),

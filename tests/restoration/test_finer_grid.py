@@ -241,9 +241,7 @@ def test_stacks_in_windows(frames, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"scale": 3}, "scale must be one of 1, 2; got 3"),
         ({"scale": 2, "prior": "edges"}, "scale=2 has prior='gaussian' only"),
-        ({"scale": 2, "method": "dewarp"}, "method='dewarp' has no option 'scale'"),
     ],
 )
 def test_errors(frames, options, message):

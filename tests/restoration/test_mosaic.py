@@ -255,8 +255,6 @@ def test_stacks_in_windows(tmp_path):
     [
         (lambda frames: frames[:, 1:], {}, "repeats every 2 x 2 px, but frames have 71 x 72 px"),
         (lambda frames: frames[:, None].repeat(1, 3, 1, 1), {}, "but frames have 3 channels"),
-        (lambda frames: frames, {"mosaic": "RGBG"}, "mosaic must be one of 'RGGB'"),
-        (lambda frames: frames, {"method": "dewarp", "joint": None}, "mosaic goes with method='exact'"),
         (lambda frames: frames, {"prior": "edges"}, "mosaic has prior='gaussian' only"),
     ],
 )

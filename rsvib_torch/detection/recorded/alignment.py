@@ -4,20 +4,22 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypedDict, Unpack, overload
+from typing import Annotated, Any, ParamSpec, Protocol, overload
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.core.text import measured_text, wrapped
+from rsvib_torch.core.validation import Extensible, Number
+from rsvib_torch.core.validation import options as option_group
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.recorded.band_vectors import band_vectors
 from rsvib_torch.detection.recorded.clock_range import offset_range
@@ -26,6 +28,7 @@ from rsvib_torch.detection.rows.displacements import frame_groups, measure_group
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.verdict import recording_reasons
+from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import (
     magnitudes_from_row_order,
@@ -38,9 +41,11 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import Registration, RegistrationOptions
+from rsvib_torch.options import BandOptions, MaskedInputOptions, Registration, RegistrationOptions
 
-__all__ = ["ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_clock"]
+__all__ = ["AlignOptions", "ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_clock"]
+
+P = ParamSpec("P")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,50 +132,64 @@ class FittedClock:
         return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
 
 
-class _Options(TypedDict, total=False):
-    camera: Camera | None
-    offsets: tuple[float, float] | None
-    fit_scale: bool
-    fit_gain: bool
-    fit_row_time: bool
-    registration: Registration | None
-    band_rows: int
-    band_step: int
-    search: int
-    ignore: ArrayLike | None
-    full_scale: float | None
-    channels: Channels
+@option_group
+class AlignOptions(BandOptions, MaskedInputOptions):
+    """Options of ``align_motion``; bands are those of the start."""
+
+    registration: Annotated[Registration, Extensible] | None = Field(
+        default=None, description='Method of the bands; by default "ncc" for a motion, "phase" for angular rates.'
+    )
+    camera: Camera | None = Field(
+        default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
+    )
+    offsets: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames.",
+    )
+    fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
+    fit_gain: bool = Field(
+        default=False,
+        description="Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length "
+        "of the camera.",
+    )
+    fit_row_time: bool = Field(
+        default=False,
+        description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
+    )
+
+    def bands(self, default: Registration) -> RegistrationOptions:
+        """The row bands, with the default method of registration."""
+        return RegistrationOptions(
+            registration=self.registration or default,
+            band_rows=self.band_rows,
+            band_step=self.band_step,
+            search=self.search,
+        )
 
 
-@overload
-def align_motion(
-    frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion, **options: Unpack[_Options]
-) -> ClockAlignment: ...
-@overload
-def align_motion(
-    frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, **options: Unpack[_Options]
-) -> RotationAlignment: ...
-@outside_graphs
+class _AlignsMotion(Protocol[P]):
+    """Type of ``align_motion``."""
+
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion, *args: P.args, **kwargs: P.kwargs
+    ) -> ClockAlignment: ...
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, *args: P.args, **kwargs: P.kwargs
+    ) -> RotationAlignment: ...
+
+
+def _align_options(options: Callable[P, AlignOptions]) -> Callable[[Callable[..., Any]], _AlignsMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_align_options(AlignOptions)
 @full_precision
 @without_gradients
-@checks_arguments
 def align_motion(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    recorded: FreeMotion | AngularRates,
-    *,
-    camera: Camera | None = None,
-    offsets: tuple[float, float] | None = None,
-    fit_scale: bool = True,
-    fit_gain: bool = False,
-    fit_row_time: bool = False,
-    registration: Registration | None = None,
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
+    frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion | AngularRates, options: AlignOptions
 ) -> ClockAlignment | RotationAlignment:
     """Find offset and scale between the clock of a recorded motion and that of the frames.
 
@@ -189,19 +208,7 @@ def align_motion(
             marks missing pixels.
         timing: The sensor.
         recorded: The motion on its own clock, in image axes; or the rates of a gyroscope.
-        camera: Focal length and lens, for angular rates; by default the focal length is fitted.
-        offsets: Smallest and largest offset in seconds; by default all for which the recording covers the frames.
-        fit_scale: Whether to fit the ratio of the speeds of the clocks.
-        fit_gain: Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length of
-            the camera.
-        fit_row_time: Whether to fit the row time as well, with angular rates; ``timing`` has the start value.
-        registration: Method of the bands; by default "ncc" as the start for a motion, "phase" for angular rates.
-        band_rows: Rows of a band of the start.
-        band_step: Rows from one band to the next.
-        search: Search range of the start in px around the whole-frame offset.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``detect_vibration``.
+        options: Options.
 
     Returns:
         The motion on the clock of the frames, offset and scale with standard deviations, and a verdict.
@@ -232,41 +239,40 @@ def align_motion(
         )
     if isinstance(recorded, FreeMotion) and recorded.batch_shape:
         raise ValueError("align_motion takes one motion, not a batch")
-    if isinstance(recorded, FreeMotion) and (camera is not None or fit_row_time):
+    if isinstance(recorded, FreeMotion) and (options.camera is not None or options.fit_row_time):
         raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
-    stack = grey_frames(frames, timing, full_scale, ignore, channels)
+    stack = grey_frames(frames, timing, options)
     timing = stack.timing
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
     grey = stack.images
     if isinstance(recorded, AngularRates):
-        options = RegistrationOptions(registration or "phase", band_rows, band_step, search)
         return align_rates(
-            band_vectors(stack, timing, options),
+            band_vectors(stack, timing, options.bands("phase")),
             grey.shape[1:],
             timing,
             recorded,
-            camera,
-            offsets=offsets,
-            fit_scale=fit_scale,
-            fit_focal_length=camera is None or fit_gain,
-            fit_row_time=fit_row_time,
+            options.camera,
+            offsets=options.offsets,
+            fit_scale=options.fit_scale,
+            fit_focal_length=options.camera is None or options.fit_gain,
+            fit_row_time=options.fit_row_time,
         )
-    bands = RegistrationOptions(registration or "ncc", band_rows, band_step, search)
+    bands = options.bands("ncc")
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = recorded.to_row_order(timing).to("cpu")
-    low, high = offset_range(turned, first, last, offsets)
+    low, high = offset_range(turned, first, last, options.offsets)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = best_offset(measured, turned, low, high, rowwise)
     clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
-    clock, _, _ = fit_clock(measured, turned, clock, False, fit_gain)
+    clock, _, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-    clock, covariance, _ = fit_clock(weighed, turned, clock, fit_scale, fit_gain)
+    clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
         measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1).to(grey.device))
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-        clock, covariance, _ = fit_clock(weighed, turned, clock, fit_scale, fit_gain)
+        clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     aligned = clock.motion(turned)
     residual = residual_of_motion(measured, aligned)
     covariance = covariance / measured.independent_fraction(residual)

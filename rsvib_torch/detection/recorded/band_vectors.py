@@ -15,7 +15,7 @@ from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import RegistrationOptions
+from rsvib_torch.options import RegistrationOptions
 
 __all__ = ["BandVectors", "band_vectors"]
 

@@ -4,14 +4,15 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ParamSpec, Protocol
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.checks import described
+from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
@@ -20,16 +21,19 @@ from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import Registration, RegistrationOptions
+from rsvib_torch.options import OffsetOptions
 
 __all__ = ["MotionCheck", "check_motion"]
 
 _MIN_CHANGE = 0.05  # px, registration errors of bands
+
+P = ParamSpec("P")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,23 +85,23 @@ class MotionCheck(
         return "\n".join([table, "the motion reduces the offsets" if self.helps else "not reduced", *self.reasons])
 
 
-@outside_graphs
+class _ChecksMotion(Protocol[P]):
+    """Type of ``check_motion``."""
+
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, motion: Motion, *args: P.args, **kwargs: P.kwargs
+    ) -> MotionCheck:
+        """Call the function."""
+
+
+def _check_options(options: Callable[P, OffsetOptions]) -> Callable[[Callable[..., MotionCheck]], _ChecksMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_check_options(OffsetOptions)
 @full_precision
 @without_gradients
-@checks_arguments
-def check_motion(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    motion: Motion,
-    *,
-    registration: Registration = "ncc",
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-) -> MotionCheck:
+def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, options: OffsetOptions) -> MotionCheck:
     """Compare a given motion with the offsets of row bands between frames.
 
     A motion with the wrong sign, clock or focal length makes frames worse: its subtraction increases the offsets.
@@ -107,13 +111,7 @@ def check_motion(
             marks missing pixels.
         timing: The sensor.
         motion: A vibration or free motion in image axes, on the clock of the frames.
-        registration: Method of the band registration, as in ``register_bands``.
-        band_rows: Rows of a band.
-        band_step: Rows from one band to the next.
-        search: Search range in px around the whole-frame offset.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``detect_vibration``.
+        options: Options, as in ``detect_vibration``.
 
     Returns:
         Rms offsets with and without the motion, and a verdict.
@@ -132,13 +130,14 @@ def check_motion(
         >>> check.helps, bool((check.after < 0.2 * check.before).all())
         (True, True)
     """
-    stack = grey_frames(frames, timing, full_scale, ignore, channels)
+    if not isinstance(motion, Motion):
+        raise TypeError(f"motion must be a Motion, got {described(motion)}")
+    stack = grey_frames(frames, timing, options)
     timing = stack.timing
     if stack.batched or motion.batch_shape:
         raise ValueError("check_motion takes one stack and one motion, not a batch")
-    bands = RegistrationOptions(registration, band_rows, band_step, search)
-    rowwise, curve, _ = start_curve(stack, timing, bands)
-    measured = measurements_of_curve(curve, rowwise, band_step)
+    rowwise, curve, _ = start_curve(stack, timing, options)
+    measured = measurements_of_curve(curve, rowwise, options.band_step)
     turned = motion.to("cpu").to_row_order(timing)
     offsets = _offsets(tensor(measured.displacements))
     residual = offsets - _offsets(_averaged(turned, measured))

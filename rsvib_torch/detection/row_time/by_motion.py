@@ -4,57 +4,95 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, ParamSpec, Protocol
+
+from pydantic import Field
 
 from rsvib_torch.calibration import RowTimeCalibration
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.checks import check_choice, check_number
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.validation import Number, Positive
+from rsvib_torch.core.validation import options as option_group
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
 from rsvib_torch.detection.row_time.by_recording import row_time_of_recording
 from rsvib_torch.detection.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces, rows_of_frames
 from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
+from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
+from rsvib_torch.options import OffsetOptions, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["calibrate_row_time_by_motion"]
+__all__ = ["RowTimeOptions", "calibrate_row_time_by_motion"]
+
+P = ParamSpec("P")
 
 MAX_RELATIVE_STD = 0.01  # of the row time; frequencies and the distortion of frames have the same relative error
 _MIN_FRAMES = 3  # two frames determine the product of row time and frequency only
 SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 
 
-@outside_graphs
+@option_group
+class RowTimeOptions(OffsetOptions):
+    """Options of ``calibrate_row_time_by_motion``; bands are those of the start."""
+
+    frame_rate: Positive = Field(description="Frames per second.")
+    row_time: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="Shortest and longest possible row time in s. By default the rows of a frame are read within a "
+        "tenth to the whole of the frame period.",
+    )
+    exposure_time: Positive | None = Field(
+        default=None,
+        description="Exposure in s. None to measure it from the blur, if possible; it hardly affects the row time.",
+    )
+    scan_axis: Literal[-2, -1, "y", "x"] = Field(
+        default=-2, description="Axis along which rows follow each other, as in ``SensorTiming``."
+    )
+    readout_direction: Literal["forward", "reverse"] | None = Field(
+        default=None, description="None to determine it as well."
+    )
+    recorded: FreeMotion | None = Field(
+        default=None,
+        description="Motion that another instrument recorded, on its own clock, in image axes; its offset is then "
+        "fitted together with the row time, and two frames are enough.",
+    )
+    offsets: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="With ``recorded``: smallest and largest reading of its clock in s at the time when the middle row "
+        "of frame 0 is exposed; by default all for which the recording covers the frames.",
+    )
+    fit_gain: bool = Field(
+        default=False, description="With ``recorded``: whether to fit a factor of each axis (focal length)."
+    )
+
+
+class _CalibratesByMotion(Protocol[P]):
+    """Type of ``calibrate_row_time_by_motion``."""
+
+    def __call__(self, frames: FramesOrFiles, *args: P.args, **kwargs: P.kwargs) -> RowTimeCalibration:
+        """Call the function."""
+
+
+def _row_time_options(
+    options: Callable[P, RowTimeOptions],
+) -> Callable[[Callable[..., RowTimeCalibration]], _CalibratesByMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_row_time_options(RowTimeOptions)
 @full_precision
 @without_gradients
-@checks_arguments
-def calibrate_row_time_by_motion(
-    frames: FramesOrFiles,
-    *,
-    frame_rate: float,
-    row_time: tuple[float, float] | None = None,
-    exposure_time: float | None = None,
-    scan_axis: Literal[-2, -1, "y", "x"] = -2,
-    readout_direction: Literal["forward", "reverse"] | None = None,
-    recorded: FreeMotion | None = None,
-    offsets: tuple[float, float] | None = None,
-    fit_gain: bool = False,
-    registration: Registration = "ncc",
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-) -> RowTimeCalibration:
+def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions) -> RowTimeCalibration:
     """Row time and readout direction from the motion of the camera, without a lamp.
 
     A tone of frequency f advances by ``f T_row`` cycles from row to row, and by ``f P`` cycles, of which the whole
@@ -68,24 +106,7 @@ def calibrate_row_time_by_motion(
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) of three or more consecutive frames, as in ``detect_vibration``.
-        frame_rate: Frames per second.
-        row_time: Shortest and longest possible row time in s. By default the rows of a frame are read within a tenth
-            to the whole of the frame period.
-        exposure_time: Exposure in s. None to measure it from the blur, if possible; it hardly affects the row time.
-        scan_axis: Axis along which rows follow each other, as in ``SensorTiming``.
-        readout_direction: None to determine it as well.
-        recorded: Motion that another instrument recorded, on its own clock, in image axes; its offset is then fitted
-            together with the row time, and two frames are enough.
-        offsets: With ``recorded``: smallest and largest reading of its clock in s at the time when the middle row of
-            frame 0 is exposed; by default all for which the recording covers the frames.
-        fit_gain: With ``recorded``: whether to fit a factor of each axis (focal length).
-        registration: Method of the start, as in ``register_bands``.
-        band_rows: Rows of a band of the start.
-        band_step: Rows from one band to the next; tones of more than ``0.5 / band_step`` cycles per row are not found.
-        search: Search range of the start in px around the whole-frame offset.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out.
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``detect_vibration``.
+        options: Options; tones of more than ``0.5 / band_step`` cycles per row are not found.
 
     Returns:
         Row time with its standard deviation, readout direction, and the exposure where it is known. ``reliable`` is
@@ -109,28 +130,24 @@ def calibrate_row_time_by_motion(
         >>> two.reliable, two.findings[0].code
         (False, 'too_few_frames_for_row_time')
     """
-    period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-    if readout_direction is not None:
-        check_choice("readout_direction", readout_direction, ("forward", "reverse"))
-    exposure = None if exposure_time is None else check_number("exposure_time", exposure_time, above=0.0)
+    period, exposure, recorded = 1 / options.frame_rate, options.exposure_time, options.recorded
     if exposure is not None and exposure > period:
         raise ValueError(f"exposure_time={exposure:g} s exceeds the frame period of {period:.6g} s; give it in seconds")
-    if recorded is None and (offsets is not None or fit_gain):
+    if recorded is None and (options.offsets is not None or options.fit_gain):
         raise ValueError("offsets and fit_gain belong to a recorded motion: pass recorded")
     if recorded is not None and recorded.batch_shape:
         raise ValueError("recorded must be one motion, not a batch")
     # frames are converted with any row time: only scan axis and readout direction matter
-    sensor = SensorTiming(1e-9, 1.0, 10.0 * 2**20, scan_axis)
-    stack = grey_frames(frames, sensor, full_scale, ignore, channels)
+    sensor = SensorTiming(1e-9, 1.0, 10.0 * 2**20, options.scan_axis)
+    stack = grey_frames(frames, sensor, options)
     if stack.batched:
         raise ValueError(f"calibrate_row_time_by_motion takes one stack, got a batch of {len(stack.images)}")
     num_frames, num_rows = stack.images.shape[1:3]
-    low, high = _limits(row_time, period, num_rows)
-    directions = {None: (1.0, -1.0), "forward": (1.0,), "reverse": (-1.0,)}[readout_direction]
+    low, high = _limits(options.row_time, period, num_rows)
+    directions = {None: (1.0, -1.0), "forward": (1.0,), "reverse": (-1.0,)}[options.readout_direction]
     clock = CameraClock(period, num_rows, low, high, directions, exposure)
-    options = RegistrationOptions(registration, band_rows, band_step, search)
     notes = []
-    if row_time is None:
+    if options.row_time is None:
         notes.append(
             f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
             "whole of the frame period; pass row_time=(low, high) for other ones"
@@ -141,7 +158,9 @@ def calibrate_row_time_by_motion(
     if recorded is not None:
         places = _measured_freely(stack, clock, options, curve)
         turned = recorded.to_row_order(sensor).to(stack.images.device)
-        found = row_time_of_recording(places, turned, clock, num_frames, offsets=offsets, fit_gain=fit_gain)
+        found = row_time_of_recording(
+            places, turned, clock, num_frames, offsets=options.offsets, fit_gain=options.fit_gain
+        )
     elif num_frames < _MIN_FRAMES:
         found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
     else:

@@ -31,7 +31,8 @@ from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
 from rsvib_torch.detection.verdict import residual_reasons
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.registration import OffsetCurve, RegistrationOptions
+from rsvib_torch.options import RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 
 __all__ = ["CameraClock", "RowTimeFit", "bands_of_frames", "row_time_of_tones"]
 

@@ -17,11 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import bspline_weights, gauss_legendre
@@ -33,6 +30,7 @@ from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStri
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.verdict import rotation_reasons
+from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
     findings_from_row_order,
@@ -45,7 +43,8 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.registration import OffsetCurve, Registration, RegistrationOptions
+from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 
 __all__ = [
     "MotionDetection",
@@ -133,29 +132,10 @@ class MotionDetection(
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
 
-@outside_graphs
+@frames_options(FreeMotionOptions)
 @full_precision
 @without_gradients
-@checks_arguments
-def detect_motion(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    *,
-    registration: Registration = "ncc",
-    knot_rows: int = 24,
-    iterations: int = 4,
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    roll: bool = False,
-    zoom: bool = False,
-    focal_length: float | None = None,
-    principal_point: tuple[float, float] | None = None,
-    distortion: tuple[float, float, float, float, float] | None = None,
-) -> MotionDetection:
+def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMotionOptions) -> MotionDetection:
     """Detect a motion of any shape from consecutive frames: the free model.
 
     Row bands are registered between frames for a start. Then the frames are warped to the scene with the current
@@ -167,22 +147,7 @@ def detect_motion(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; tensor, array, list of
             these, or files; floats, or integers of known full scale. NaN marks missing pixels.
         timing: The sensor.
-        registration: Method of the band registration, as in ``register_bands``; for the initial value.
-        knot_rows: Row times from one knot of the spline to the next, which then resolves frequencies up to
-            ``1 / (2 knot_rows T_row)``. In long stacks the spacing is larger, for 3000 knots at most.
-        iterations: Rounds of measuring and fitting.
-        band_rows: Rows of a band of the start.
-        band_step: Rows from one band to the next.
-        search: Search range of the start in px around the whole-frame offset.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``detect_vibration``.
-        roll: Measure the rotation about the optical axis as a third component of the motion, in rad, from strips of
-            columns.
-        zoom: The same for the change of scale, as a fourth component; includes roll.
-        focal_length: Focal length in px, as in ``detect_vibration``.
-        principal_point: As in ``detect_vibration``.
-        distortion: As in ``detect_vibration``.
+        options: Options.
 
     Returns:
         The motion in image axes with its uncertainty over time.
@@ -210,18 +175,16 @@ def detect_motion(
         >>> found.reliable.tolist()
         [True, True]
     """
-    check_whole_number("knot_rows", knot_rows, at_least=4)
-    check_whole_number("iterations", iterations, at_least=1, at_most=100)
-    axes = 4 if zoom else 3 if roll else 2
-    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    axes = 4 if options.zoom else 3 if options.roll else 2
+    stacks = grey_frames(frames, timing, options)
     timing = stacks.timing
-    bands = RegistrationOptions(registration, band_rows, band_step, search)
     height, width = stacks.images.shape[-2:]
-    camera = camera_in_row_order(focal_length, principal_point, distortion, (height, width), timing)
+    camera = camera_in_row_order(options, (height, width), timing)
     scale = FieldScale(axes, width, height, camera)
     with threads_for(stacks.images):
         results = [
-            _detect(stacks.one(i), timing, bands, knot_rows, iterations, scale) for i in range(len(stacks.images))
+            _detect(stacks.one(i), timing, options, options.knot_rows, options.iterations, scale)
+            for i in range(len(stacks.images))
         ]
     return MotionDetection.stacked(results) if stacks.batched else results[0]
 

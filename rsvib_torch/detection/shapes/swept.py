@@ -8,11 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_shapes, checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.arguments import check_shapes
 from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
+from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
@@ -29,6 +27,7 @@ from rsvib_torch.detection.shapes.free import (
 )
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
+from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
     findings_from_row_order,
@@ -38,7 +37,7 @@ from rsvib_torch.frames.orientation import (
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration import Registration, RegistrationOptions
+from rsvib_torch.options import RegistrationOptions, SweptToneOptions
 
 __all__ = ["SweptTone", "detect_swept_tone"]
 
@@ -130,23 +129,10 @@ class SweptTone(
         return "\n".join(verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons))
 
 
-@outside_graphs
+@frames_options(SweptToneOptions)
 @full_precision
 @without_gradients
-@checks_arguments
-def detect_swept_tone(
-    frames: FramesOrFiles,
-    timing: SensorTiming,
-    *,
-    registration: Registration = "ncc",
-    iterations: int = 3,
-    band_rows: int = 32,
-    band_step: int = 16,
-    search: int = 16,
-    ignore: ArrayLike | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-) -> SweptTone:
+def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: SweptToneOptions) -> SweptTone:
     """Detect one tone an axis whose amplitude decays or grows exponentially and whose frequency changes linearly.
 
     Start values come from the offsets of row bands, over a grid of frequencies, sweeps and decays. The fit is then
@@ -156,14 +142,7 @@ def detect_swept_tone(
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; tensor, array, list of
             these, or files. NaN marks missing pixels.
         timing: The sensor.
-        registration: Method of the band registration, as in ``register_bands``; for the initial value.
-        iterations: Rounds of measuring and fitting.
-        band_rows: Rows of a band of the start.
-        band_step: Rows from one band to the next.
-        search: Search range of the start in px around the whole-frame offset.
-        ignore: Bool, broadcastable to (..., H, W) of the frames: True for pixels to leave out (dead, saturated).
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``detect_vibration``.
+        options: Options.
 
     Returns:
         Parameters of both axes at the time origin, with standard deviations and verdict.
@@ -189,12 +168,12 @@ def detect_swept_tone(
         >>> [round(value, 0) for value in (found.frequency[0].item(), found.decay[0].item())]
         [105.0, 20.0]
     """
-    check_whole_number("iterations", iterations, at_least=1, at_most=100)
-    stacks = grey_frames(frames, timing, full_scale, ignore, channels)
+    stacks = grey_frames(frames, timing, options)
     timing = stacks.timing
-    bands = RegistrationOptions(registration, band_rows, band_step, search)
     with threads_for(stacks.images):
-        fitted = [_detect(stacks.one(index), timing, bands, iterations) for index in range(len(stacks.images))]
+        fitted = [
+            _detect(stacks.one(index), timing, options, options.iterations) for index in range(len(stacks.images))
+        ]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots
     tones = [_report(one, timing, step).to(stacks.images.device) for one in fitted]
     return SweptTone.stacked(tones) if stacks.batched else tones[0]

@@ -30,14 +30,14 @@ from scipy.spatial.transform import Rotation
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
-from rsvib_torch.core.option_types import IsdModel
+from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import IsdModel
 from rsvib_torch.report.export.exported import check_exportable, num_rows_of
 
 __all__ = ["camera_isd", "write_isd"]
@@ -198,7 +198,6 @@ def write_isd(
         488
     """
     check_exportable(motion)
-    check_choice("model", model, ("auto", "frame", "line-scan"))
     check_whole_number("frame", frame, at_least=0)
     check_number("tolerance", tolerance, above=0.0)
     if timing.scan_axis != -2:

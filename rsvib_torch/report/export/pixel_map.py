@@ -14,12 +14,12 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.option_types import StmapConvention
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.motion.field import ColumnMotion, displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.options import StmapConvention
 from rsvib_torch.report.export.exported import check_exportable, num_rows_of
 from rsvib_torch.restoration.frame_motion import frame_motion
 
@@ -196,7 +196,6 @@ def write_stmap(
         >>> round(float(cv2.remap(frame, map_x, map_y, cv2.INTER_LINEAR)[25, 30]), 2)  # a quarter of a period: X = 2 px
         32.0
     """
-    check_choice("convention", convention, ("nuke", "opencv"))
     check_whole_number("num_frames", num_frames, at_least=1)
     digits = max(4, math.ceil(math.log10(num_frames + 1)))
     names = []

@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.checks import MAX_NUMBER, check_choice, check_number
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
+from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import (
     FILLED_BLUR_REACH,
     measured_values,
@@ -32,7 +32,7 @@ from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
-from rsvib_torch.restoration.scene_model.observation import GRIDS, SCALE, SCENE_REACH, TAPS, RowKernels
+from rsvib_torch.restoration.scene_model.observation import GRIDS, SCENE_REACH, TAPS, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import (
     PolynomialPrior,
     RowPrior,
@@ -49,16 +49,10 @@ _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the syste
 def restore_exact(
     frames: Tensor,
     motion: FrameMotion,
+    options: ExactOptions,
     *,
-    joint: bool | int = False,
-    prior: str = "gaussian",
-    noise: float | Literal["auto"] = "auto",
-    regularisation: float = 1.0,
     ignore: Tensor | None = None,
     clipped: Tensor | None = None,
-    chunk_frequencies: int | None = None,
-    segments: int | None = None,
-    scale: Literal[1, 2] = 1,
     strips: int = 1,
 ) -> Tensor:
     """Restore frames with all rows coupled: the most probable scene for its frames and a prior.
@@ -73,31 +67,9 @@ def restore_exact(
     Args:
         frames: (B, T, C, H, W) in row order, with local means at missing pixels.
         motion: Motion of the frames.
-        joint: ``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length
-            1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With image motion,
-            only what a frame has in common with the restored one is used.
-        prior: Name in ``PRIORS``. ``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``:
-            moreover, every patch of 8 x 8 px is a sum of few cosines, which separates edges and flat areas from noise;
-            several times slower.
-        noise: Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame. Noise and
-            texture are distinguished with two frames or with blur, and only within bounds with one sharp frame, see
-            ``noise_levels``.
-        regularisation: Factor on the prior; 1 is the strength estimated from the frames.
+        options: Options of the method.
         ignore: Boolean mask shaped like the frames of missing pixels, whose values are estimated from all others.
         clipped: Boolean mask of saturated pixels, whose values are lower bounds, which are held approximately.
-        chunk_frequencies: Frequencies solved at a time; fewer need less memory and do not change the result. None: as
-            many as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by
-            more than a pixel during an exposure. While missing values or the boundary extension are filled, the factors
-            of all frequencies stay in memory, and this option does not bound it.
-        segments: Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5;
-            None: segments of at least 512 rows on a CPU, 256 on a GPU.
-            Always one where the displacement changes by more than a pixel during an exposure: rows then depend on
-            distant rows.
-        scale: Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after
-            optics and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample
-            between each other's pixels contain detail beyond half a cycle per px, one frame does not. The prior is then
-            a polynomial in the Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which detail
-            the restored frames contain.
         strips: Number of neighbouring stacks of the batch that are strips of columns of the same frames. They have one
             noise level, and one strength of the prior for each level.
 
@@ -106,14 +78,15 @@ def restore_exact(
         (2 i, 2 j) at pixel (i, j).
     """
     # 1. Check the options, and select the frames of each scene.
-    factor = check_number("regularisation", regularisation, above=0.0)
-    check_choice("scale", scale, (1, SCALE))
+    factor, scale, prior = options.regularisation, options.scale, options.prior
     check_prior(prior, scale=scale)
-    groups = joint_groups(frames.shape[1], joint)
-    partition = Partition.of_options(chunk_frequencies, segments)
+    groups = joint_groups(frames.shape[1], options.joint)
+    partition = Partition(options.chunk_frequencies, options.segments)
 
     # 2. Estimate what all scenes of a stack have in common: noise levels and prior.
-    model = model_frames(frames, motion, noise=noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips)
+    model = model_frames(
+        frames, motion, noise=options.noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips
+    )
 
     # 3. Select the frames of each scene, and the strength of its prior by cross-validation.
     scenes = model.scenes(groups)
@@ -131,7 +104,7 @@ def restore_exact(
 
 def given_level(noise: float) -> float:
     """A stated noise level, at least the lowest that single precision supports."""
-    return max(check_number("noise", noise, at_least=0.0, at_most=MAX_NUMBER), _MIN_LEVEL)
+    return max(noise, _MIN_LEVEL)
 
 
 def scene_period(motion: FrameMotion, width: int) -> int:

@@ -4,16 +4,15 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
-from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows
 from rsvib_torch.core.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
+from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.exact import given_level, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
@@ -144,17 +143,11 @@ class MosaicSolver:
 def restore_mosaic(
     frames: Tensor,
     motion: FrameMotion,
+    options: ExactOptions,
     *,
     colours: Tensor,
-    joint: bool | int = False,
-    prior: str = "gaussian",
-    noise: float | Literal["auto"] = "auto",
-    regularisation: float = 1.0,
     ignore: Tensor | None = None,
     clipped: Tensor | None = None,
-    chunk_frequencies: int | None = None,
-    segments: int | None = None,
-    scale: Literal[1, 2] = 1,
 ) -> Tensor:
     """Colour images from mosaics, all frames of a group and all three colours together.
 
@@ -167,27 +160,21 @@ def restore_mosaic(
         frames: (B, T, 1, H, W) in row order, with local means at missing pixels.
         motion: Motion of the frames.
         colours: (B, T, 1, H, W), the colour that each pixel measures, 0 to 2.
-        joint: As in ``restore_exact``.
-        prior: One that declares ``mosaic`` in ``PRIORS``.
-        noise: As in ``restore_exact``; ``"auto"`` is estimated from the residual of the frames of a group. With one
-            frame it is hardly known, and too low rather than too high.
-        regularisation: Factor on the priors.
+        options: As in ``restore_exact``, with a prior that declares ``mosaic`` in ``PRIORS``. ``noise="auto"`` is
+            estimated from the residual of the frames of a group. With one frame it is hardly known, and too low rather
+            than too high.
         ignore: (B, T, 1, H, W) bool, missing pixels; None for none.
         clipped: (B, T, 1, H, W) bool, saturated pixels, whose values are lower bounds; None for none.
-        chunk_frequencies: As in ``restore_exact``.
-        segments: Segments of rows solved side by side.
-        scale: Points of the result per pixel.
 
     Returns:
         (B, groups, 3, scale H, scale W).
     """
     height, width = frames.shape[-2:]
-    factor = check_number("regularisation", regularisation, above=0.0)
-    check_choice("scale", scale, (1, SCALE))
-    check_prior(prior, scale=scale, mosaic=True)
-    groups = joint_groups(frames.shape[1], joint)
-    partition = Partition.of_options(chunk_frequencies, segments)
-    stated = None if noise == "auto" else given_level(noise)
+    factor, scale = options.regularisation, options.scale
+    check_prior(options.prior, scale=scale, mosaic=True)
+    groups = joint_groups(frames.shape[1], options.joint)
+    partition = Partition(options.chunk_frequencies, options.segments)
+    stated = None if options.noise == "auto" else given_level(options.noise)
     # displacement of each row during its exposure, and the period that it requires
     displacement, node_weights = motion.exposures
     length = scene_period(motion, width)

@@ -27,7 +27,6 @@ from rsvib_torch.core.banded_solver import (
     node_frequencies,
     solve_halves,
 )
-from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
@@ -73,15 +72,6 @@ class Partition:
     chunk: int | None = None
     segments: int | None = None
     _buffers: dict[int, Tensor] = field(default_factory=dict)
-
-    @classmethod
-    def of_options(cls, chunk_frequencies: int | None, segments: int | None) -> "Partition":
-        """The partition that options of ``restore_exact`` state; None lets the size of the scene decide."""
-        chunk, windows = (
-            None if value is None else check_whole_number(name, value, at_least=1)
-            for name, value in (("chunk_frequencies", chunk_frequencies), ("segments", segments))
-        )
-        return cls(chunk, windows)
 
     @staticmethod
     def threads(device: torch.device) -> int:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -115,4 +115,7 @@ def vibration_to_undo(
     """A given motion unchanged; of a detection the accurate part, and a reason for each axis not restored."""
     if isinstance(vibration, Motion):
         return vibration, ()
+    if not isinstance(vibration, DetectedVibration):
+        made_by = DetectedVibration._MADE_BY
+        raise TypeError(f"vibration must be a Motion or a DetectedVibration ({made_by}), got {described(vibration)}")
     return trusted_vibration(vibration, timing, num_frames, num_rows)

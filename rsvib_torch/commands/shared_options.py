@@ -1,23 +1,21 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
-import functools
-import inspect
 import itertools
 import statistics
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from rsvib_torch import io
-from rsvib_torch.commands.terminal import Answer, note
+from rsvib_torch.commands.flat_command import MadeBy, group_arguments
+from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.option_types import METHOD_SETTINGS, Mosaic, PriorName, method_options
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.options import RestorationOptions, method_options
 
 if TYPE_CHECKING:
     import torch
@@ -27,30 +25,20 @@ if TYPE_CHECKING:
 __all__ = [
     "READOUT_HELP",
     "SCAN_AXIS_HELP",
-    "DebugOption",
+    "CameraSettings",
     "DeviceName",
     "DeviceOption",
     "ExposureOption",
-    "FinerOption",
     "ForceOption",
     "FrameRateOption",
     "FramesArgument",
-    "JointOption",
-    "JsonOption",
     "MemoryOption",
-    "MethodOption",
-    "MosaicOption",
-    "OpticsOption",
-    "Overrides",
     "OverwriteOption",
-    "PriorOption",
-    "QuietOption",
+    "RestorationArguments",
     "RestoredArgument",
     "RowTimeOption",
-    "SaturationOption",
     "ScaleOption",
     "WorkersOption",
-    "camera_options",
     "check_new",
     "file_of_source",
     "full_scale_of",
@@ -156,33 +144,14 @@ ScaleOption = Annotated[
         show_default="from the file, or the configuration",
     ),
 ]
-MethodOption = Annotated[
-    str | None,
-    typer.Option(
-        help=f"Restoration method: {', '.join(METHOD_SETTINGS)}.", show_default="from the configuration, or exact"
-    ),
-]
-JointOption = Annotated[
+_JointOption = Annotated[
     str | None,
     typer.Option(
         help="Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
         "window).",
     ),
 ]
-FinerOption = Annotated[
-    int | None,
-    typer.Option(
-        "--scale", help="Points of the restored frames per pixel along both axes: 1 or 2.", show_default="1", min=1
-    ),
-]
-MosaicOption = Annotated[
-    str | None,
-    typer.Option(
-        help=f"Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames: {', '.join(get_args(Mosaic))}. The "
-        "restored frames have three channels.",
-    ),
-]
-OpticsOption = Annotated[
+_OpticsOption = Annotated[
     float | None,
     typer.Option(
         "--optics-sigma",
@@ -190,25 +159,10 @@ OpticsOption = Annotated[
         "are sharpened to half a point of their grid. Section [restoration.optics] describes other optics.",
     ),
 ]
-PriorOption = Annotated[
-    str | None,
-    typer.Option(help=f"Prior of the scene: {' or '.join(get_args(PriorName))}, for methods that have this option."),
-]
-SaturationOption = Annotated[
-    float | None,
-    typer.Option(help="Saturation level in the unit of the file.", show_default="full scale for integer formats"),
-]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Write the restored frames even if they are judged no better than the input.")
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace results that exist already.")]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print the answer as JSON on standard output, and nothing else there.")
-]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")]
-QuietOption = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors, and no progress.")
-]
 MemoryOption = Annotated[
     str | None,
     typer.Option(help="Memory limit of the process, e.g. 2GB.", show_default="three quarters of the free memory"),
@@ -231,11 +185,15 @@ def _read_camera(
     scan_axis: _ScanAxisOption = None,
     readout_direction: _ReadoutOption = None,
     frames: Path | None = None,
+    source: str | None = None,
+    full_scale: float | None = None,
 ) -> Config:
     """Configuration file and the options that replace its keys, or the options alone.
 
-    Without either the frame rate is the one that the file of the frames states.
+    Without either the frame rate is the one that the file of the frames states. The full scale is an argument of the
+    commands that follow.
     """
+    frames = frames if source is None else file_of_source(source)
     if config is None and frame_rate is None and None not in (row_time, exposure) and frames is not None:
         frame_rate = stated_rate(io.read_stack_info(frames))
         if frame_rate is not None:
@@ -260,7 +218,16 @@ def _read_camera(
     for name, value in given.items():
         option = "--exposure" if name == "exposure_time" else f"--{name.replace('_', '-')}"
         arguments += [option, f"{value:.10g}" if isinstance(value, float) else value]
+    if full_scale is not None:
+        arguments += ["--full-scale", f"{full_scale:.10g}"]
     return replace(settings, arguments=tuple(arguments))
+
+
+CameraSettings = Annotated[Config, MadeBy(_read_camera)]
+RestorationArguments = Annotated[
+    dict[str, Any],
+    MadeBy(group_arguments(RestorationOptions, {"joint": _JointOption, "optics": _OpticsOption})),
+]
 
 
 def stated_rate(info: "StackInfo") -> float | None:
@@ -270,32 +237,6 @@ def stated_rate(info: "StackInfo") -> float | None:
     intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
     period = statistics.median(intervals)
     return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
-
-
-def camera_options(command: Callable[..., Answer]) -> Callable[..., Answer]:
-    """Decorator of a command: the options that describe the camera take the place of its parameter ``settings``."""
-    camera = {
-        name: parameter for name, parameter in inspect.signature(_read_camera).parameters.items() if name != "frames"
-    }
-
-    stated = inspect.signature(command, eval_str=True).parameters
-    scaled = "full_scale" in stated and stated["full_scale"].annotation == ScaleOption
-
-    @functools.wraps(command)
-    def with_camera(**options: Any) -> Answer:
-        frames = file_of_source(options["source"]) if "source" in options else options.get("frames")
-        settings = _read_camera(**{name: options.pop(name) for name in camera}, frames=frames)
-        if options.get("full_scale") is not None and scaled:
-            scale = ("--full-scale", f"{options['full_scale']:.10g}")
-            settings = replace(settings, arguments=(*settings.arguments, *scale))
-        return command(settings=settings, **options)
-
-    parameters: list[inspect.Parameter] = []
-    for parameter in stated.values():
-        parameters += camera.values() if parameter.name == "settings" else [parameter]
-    with_camera.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    with_camera.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return with_camera
 
 
 def file_of_source(source: str) -> Path | None:
@@ -309,32 +250,6 @@ def file_of_source(source: str) -> Path | None:
     if not Path(source).exists():
         raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
     return Path(source)
-
-
-@dataclass(frozen=True)
-class Overrides:
-    """Restoration options of the command line; None leaves a value to the configuration file.
-
-    Attributes:
-        method: Restoration method.
-        joint: ``"all"``, or a number of frames.
-        prior: Prior for the scene.
-        saturation: Saturation level in the unit of the file.
-        scale: Points of the restored frames per pixel.
-        mosaic: Pattern of raw frames.
-        optics_sigma: Blur of the lens in px.
-    """
-
-    method: str | None
-    joint: str | None
-    prior: str | None
-    saturation: float | None
-    scale: int | None = None
-    mosaic: str | None = None
-    optics_sigma: float | None = None
-
-
-NO_OVERRIDES = Overrides(None, None, None, None)
 
 
 def check_new(
@@ -391,30 +306,30 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
 
 
 def restoration_options(
-    info: "StackInfo", full_scale: float | None, config: Config, overrides: Overrides = NO_OVERRIDES
+    info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Options of ``restore``: those of the configuration file, overridden by those of the command line.
+    """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line.
 
     Raises:
-        ValueError: If the method is unknown, or a value is out of range.
+        ValueError: If a value is out of range.
     """
-    options = dict(config.restoration)
-    if overrides.method is not None and overrides.method != options.get("method", "exact"):
-        # other options belong to the configured method
-        shared = ("saturation", "mosaic", "optics", *method_options(overrides.method))
-        options = {name: value for name, value in options.items() if name in shared}
-    for name in ("method", "prior", "saturation", "scale", "mosaic"):
-        if getattr(overrides, name) is not None:
-            options[name] = getattr(overrides, name)
-    if overrides.optics_sigma is not None:
-        options["optics"] = {"pixel": 1.0, **options.get("optics", {}), "sigma": overrides.optics_sigma}
-    if overrides.joint is not None:
-        if overrides.joint != "all" and not (overrides.joint.isdecimal() and int(overrides.joint) >= 1):
-            raise ValueError(f"--joint must be 'all' or a number of frames, got {overrides.joint!r}")
-        options["joint"] = overrides.joint == "all" or int(overrides.joint)
+    options, given = dict(config.restoration), dict(given or {})
+    method = given.get("method", options.get("method", "exact"))
+    if method != options.get("method", "exact"):  # other options belong to the configured method
+        options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
+    if "optics" in given:
+        given["optics"] = {"pixel": 1.0, **options.get("optics", {}), "sigma": given["optics"]}
+    if "joint" in given:
+        if given["joint"] != "all" and not (given["joint"].isdecimal() and int(given["joint"]) >= 1):
+            raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
+        given["joint"] = given["joint"] == "all" or int(given["joint"])
+    options |= given
+    RestorationOptions(**options)
+    if options.get("saturation", "auto") == "auto":
+        options.pop("saturation", None)
     if options.get("saturation") is not None:
-        level = check_number("saturation", options["saturation"], above=0.0)
-        options["saturation"] = level / full_scale if info.is_integer and full_scale is not None else level
+        if info.is_integer and full_scale is not None:
+            options["saturation"] /= full_scale
     elif info.is_integer and full_scale is not None:
         options["saturation"] = 1.0
     if options.get("mosaic") is not None:
@@ -424,7 +339,7 @@ def restoration_options(
     if options.get("optics") is not None:
         from rsvib_torch.restoration.restore import check_optics  # noqa: PLC0415
 
-        check_optics(options["optics"], options.get("method", "exact"))
+        check_optics(RestorationOptions(**options).optics)
     return options
 
 

@@ -1,0 +1,66 @@
+"""Functions whose options are a group, and flat keyword arguments for their callers."""
+
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from textwrap import fill
+from typing import Annotated, Any, get_args, get_origin
+
+from rsvib_torch.core.validation import fields_of
+
+__all__ = ["flat_options"]
+
+
+def flat_options(
+    group: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
+
+    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced.
+
+    Args:
+        group: The group.
+        function: Function or method with the keyword argument ``options``.
+        build: What makes the options of keyword arguments, if it is not the group.
+    """
+    own = inspect.signature(function).parameters
+    names = own.keys() - {"options"}
+
+    @wraps(function)
+    def flat(*args: Any, **given: Any) -> Any:
+        direct = {name: given.pop(name) for name in names & given.keys()}
+        return function(*args, **direct, options=(build or group)(**given))
+
+    flat.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [parameter for name, parameter in own.items() if name != "options"]
+        + [
+            inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.get_default(),
+                annotation=_without_bounds(field.annotation),
+            )
+            for name, field in fields_of(group).items()
+        ]
+    )
+    flat.__doc__ = _with_options(inspect.getdoc(function) or "", group)
+    return flat
+
+
+def _without_bounds(annotation: Any) -> Any:
+    """The annotation of an option as users read it."""
+    if get_origin(annotation) is Annotated:
+        return _without_bounds(get_args(annotation)[0])
+    if arguments := get_args(annotation):
+        plain = tuple(map(_without_bounds, arguments))
+        return annotation.copy_with(plain) if hasattr(annotation, "copy_with") else annotation
+    return annotation
+
+
+def _with_options(text: str, group: Any) -> str:
+    """A docstring in which the line ``options:`` is replaced by the options of a group; without text, only these."""
+    lines = (text or "Args:\n    options: Options.").splitlines()
+    place = next((number for number, line in enumerate(lines) if line.startswith("    options:")), len(lines))
+    entries = (f"{name}: {field.description}" for name, field in fields_of(group).items())
+    listed = [fill(entry, 116, initial_indent=" " * 4, subsequent_indent=" " * 8) for entry in entries]
+    return "\n".join([*lines[:place], *listed, *lines[place + 1 :]])

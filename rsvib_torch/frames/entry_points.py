@@ -1,0 +1,79 @@
+"""Public functions of frames: what they have in common, and types with which editors complete their options.
+
+The options of a function are a group (``options.py``). Its callers pass them as keyword arguments, and the function
+receives ``options``. A decorator has the type of the arguments that precede the options.
+"""
+
+from collections.abc import Callable
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+from rsvib_torch.core.flat_options import flat_options
+from rsvib_torch.core.precision import outside_graphs
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import SensorTiming
+
+__all__ = [
+    "FramesFunction",
+    "VibrationFunction",
+    "entry_point",
+    "frames_options",
+    "module_options",
+    "vibration_options",
+]
+
+P = ParamSpec("P")
+Module = TypeVar("Module")
+Options = TypeVar("Options")
+Result = TypeVar("Result")
+Result_co = TypeVar("Result_co", covariant=True)
+
+
+class FramesFunction(Protocol[P, Result_co]):
+    """A function of frames and their timing."""
+
+    def __call__(self, frames: FramesOrFiles, timing: SensorTiming, *args: P.args, **kwargs: P.kwargs) -> Result_co:
+        """Call the function."""
+
+
+class VibrationFunction(Protocol[P, Result_co]):
+    """A function of frames, their timing and their vibration."""
+
+    def __call__(
+        self,
+        frames: FramesOrFiles,
+        timing: SensorTiming,
+        vibration: Motion | DetectedVibration,
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Result_co:
+        """Call the function."""
+
+
+def frames_options(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[FramesOrFiles, SensorTiming, Options], Result]], FramesFunction[P, Result]]:
+    """Decorator of a function ``(frames, timing, options)``."""
+    return lambda function: entry_point(options, function)
+
+
+def vibration_options(
+    options: Callable[P, Options],
+) -> Callable[
+    [Callable[[FramesOrFiles, SensorTiming, Motion | DetectedVibration, Options], Result]], VibrationFunction[P, Result]
+]:
+    """Decorator of a function ``(frames, timing, vibration, options)``."""
+    return lambda function: entry_point(options, function)
+
+
+def module_options(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[Module, SensorTiming, Options], None]], Callable[Concatenate[Module, SensorTiming, P], None]]:
+    """Decorator of ``__init__(self, timing, options)`` of a module."""
+    return lambda function: flat_options(options, function)
+
+
+def entry_point(options: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None) -> Any:
+    """A function with flat options, outside of compiled graphs; arguments as of ``flat_options``."""
+    return outside_graphs(flat_options(options, function, build))

@@ -1,0 +1,490 @@
+"""All options of detection, restoration and stacks, in groups.
+
+A field of a group is the only statement of an option: arguments of public functions, keys of configuration files,
+options of the commands, their checks, help texts and reference pages follow from it. To add an option, add a field, and
+use it where the group is used.
+
+Configuration files and command lines are checked before torch is imported, which takes seconds. This module therefore
+imports no other part of the package. The tables of the packages hold the functions that belong to the names.
+"""
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, SkipValidation
+
+from rsvib_torch.core.validation import (
+    Count,
+    Extensible,
+    NotNegative,
+    Number,
+    Positive,
+    fields_of,
+    not_an_option,
+    options,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rsvib_torch.core.arrays import ArrayLike
+
+    Mask = ArrayLike | None
+    Curve = tuple[ArrayLike | Sequence[float], ArrayLike | Sequence[float]]
+else:  # arrays are checked where they are used
+    Mask = Any
+    Curve = list[list[float]]
+
+BorderName = Literal["mirror", "hold", "crop"]
+BadFrames = Literal["pass", "skip"]
+Channels = Literal["first", "last"] | None
+DetectionMethod = Literal["direct", "bands"]
+ExportFormat = Literal["gcsv", "stmap", "isd", "csv"]
+IsdModel = Literal["auto", "frame", "line-scan"]
+Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg/s"]
+PriorName = Literal["gaussian", "edges"]
+Registration = Literal["projection", "ncc", "phase"]
+RestorationName = Literal["exact", "banded", "dewarp", "richardson-lucy"]
+StmapConvention = Literal["nuke", "opencv"]
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+COMMAND_LINE: Any = {"command_line": True}  # mark of fields that are options of commands as well
+MAX_TONES = 4  # tones of one axis; more are not told apart in a record of a few frames
+MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
+
+
+@options
+class InputOptions:
+    """How frames are given."""
+
+    full_scale: Positive | None = Field(
+        default=None,
+        description="Count that means 1.0, for integer frames; by default that of the file, 255 for uint8.",
+    )
+    channels: Channels = Field(
+        default=None,
+        description='``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image '
+        'axes, and frames that appear to have them last are refused; ``"first"`` omits this check.',
+    )
+
+
+@options
+class MaskedInputOptions(InputOptions):
+    """How frames are given, with missing pixels."""
+
+    ignore: Annotated[Mask, SkipValidation] = Field(
+        default=None,
+        description="Boolean mask of pixels that do not count (dead, saturated, a dark rim), broadcastable to "
+        "(..., H, W) of the frames; they may hold any value. NaN marks missing pixels as well.",
+    )
+
+
+@options
+class BandOptions:
+    """Row bands whose offsets between frames are measured."""
+
+    band_rows: int = Field(default=32, ge=4, le=2**31, description="Rows of a band.")
+    band_step: Count = Field(default=16, description="Rows from one band to the next.")
+    search: int = Field(
+        default=16,
+        ge=2,
+        le=2**31,
+        description="Search range in px around the whole-frame offset; a peak at its edge fails.",
+    )
+
+
+@options
+class RegistrationOptions(BandOptions):
+    """Row bands, and how their offsets are measured."""
+
+    registration: Annotated[Registration, Extensible] = Field(
+        default="ncc",
+        description='Method of the band registration: ``"projection"`` (gray projection, the paper), ``"ncc"`` or '
+        '``"phase"``, as in ``register_bands``.',
+    )
+
+
+@options
+class ProjectionOptions:
+    """The camera, for a motion that is a rotation."""
+
+    focal_length: Positive | None = Field(
+        default=None,
+        description="Focal length in px, for a motion that is a rotation of the camera: displacements then follow from "
+        "the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result has "
+        "an ``attitude``. None: the displacement by translation is the same in the whole frame.",
+    )
+    principal_point: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the "
+        "frame.",
+    )
+    distortion: tuple[Number, Number, Number, Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none.",
+    )
+
+
+@options
+class ToneOptions(ProjectionOptions, RegistrationOptions):
+    """Detection of tones."""
+
+    method: Annotated[DetectionMethod, Extensible] = Field(
+        default="direct",
+        description='``"direct"``, or ``"bands"`` (of the paper), in half the time with ten times larger errors.',
+    )
+    tones: Annotated[int, Field(ge=1, le=MAX_TONES)] | Literal["auto"] = Field(
+        default="auto",
+        description='Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard '
+        "deviations then allow for a further tone.",
+    )
+    harmonics: int = Field(
+        default=1,
+        ge=1,
+        le=MAX_HARMONICS,
+        description="Number of multiples of every tone, with one common base frequency; 1 for independent tones.",
+    )
+    image_acceleration: bool = Field(default=False, description="Whether the image motion has a constant acceleration.")
+    columns: Annotated[int, Field(ge=64, le=2**31)] | None = Field(  # px; narrower bands are often registered wrongly
+        default=None,
+        description="Use only this number of neighbouring columns, those with the most detail: all columns contain the "
+        "same vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.",
+    )
+    roll: bool | Literal["auto"] = Field(
+        default="auto",
+        description="Measure the rotation about the optical axis as a third component of the motion, in rad: True, "
+        'False, or ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three '
+        "axes instead of two, see ``Vibration``.",
+    )
+    zoom: bool | Literal["auto"] = Field(
+        default="auto", description="The same for the change of scale, as a fourth component; includes roll."
+    )
+
+
+@options
+class VibrationOptions(ToneOptions, MaskedInputOptions):
+    """Options of ``detect_vibration`` for tones."""
+
+    model: Literal["tones"] = Field(
+        default="tones",
+        description='``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape, with the options '
+        'of ``detect_motion``; ``"swept"``: one tone per axis whose amplitude decays or grows and whose frequency '
+        "sweeps, with the options of ``detect_swept_tone``.",
+    )
+    window: int | None = Field(
+        default=None,
+        description="Number of frames of one result: the vibration is followed through the stack, and the result is a "
+        "batch with one entry per window (a leading dimension behind B). None for one result from all frames.",
+    )
+    window_step: int | None = Field(
+        default=None, description="Frames from one window to the next; half a window by default."
+    )
+
+
+@options
+class FreeMotionOptions(ProjectionOptions, RegistrationOptions, MaskedInputOptions):
+    """Options of ``detect_motion``; bands are those of the start."""
+
+    knot_rows: int = Field(
+        default=24,
+        ge=4,
+        le=2**31,
+        description="Row times from one knot of the spline to the next, which then resolves frequencies up to "
+        "``1 / (2 knot_rows T_row)``. In long stacks the spacing is larger, for 3000 knots at most.",
+    )
+    iterations: int = Field(default=4, ge=1, le=100, description="Rounds of measuring and fitting.")
+    roll: bool = Field(
+        default=False,
+        description="Measure the rotation about the optical axis as a third component of the motion, in rad, from "
+        "strips of columns.",
+    )
+    zoom: bool = Field(
+        default=False, description="The same for the change of scale, as a fourth component; includes roll."
+    )
+
+
+@options
+class SweptToneOptions(RegistrationOptions, MaskedInputOptions):
+    """Options of ``detect_swept_tone``; bands are those of the start."""
+
+    iterations: int = Field(default=3, ge=1, le=100, description="Rounds of measuring and fitting.")
+
+
+@options
+class OffsetOptions(RegistrationOptions, MaskedInputOptions):
+    """Options of functions that measure the offsets of row bands."""
+
+
+@options
+class BandRegistrationOptions(BandOptions, InputOptions):
+    """Options of ``register_bands``."""
+
+    method: Annotated[Registration, Extensible] = Field(
+        default="ncc", description='``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.'
+    )
+
+
+@options
+class JointOptions:
+    """Frames that are restored together."""
+
+    joint: bool | Count = Field(
+        default=False,
+        json_schema_extra=COMMAND_LINE,
+        description="``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps "
+        "length 1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With image "
+        "motion, only what a frame has in common with the restored one is used.",
+    )
+
+
+@options
+class ChunkOptions:
+    """Memory of the methods that restore rows one after the other."""
+
+    chunk_rows: Count | None = Field(
+        default=None,
+        description="Rows (``banded``: slabs) restored at a time; bounds the memory, does not change the result. None: "
+        "a suitable number.",
+    )
+
+
+@options
+class OpticsOptions:
+    """Transfer function of a lens and of square pixels, see ``Optics``."""
+
+    sigma: NotNegative = Field(default=0.0, description="Standard deviation of the Gaussian blur of aberrations in px.")
+    cutoff: Positive | None = Field(
+        default=None,
+        description="Diffraction cutoff frequency in cycles/px (pixel pitch over wavelength and f-number); None for no "
+        "diffraction.",
+    )
+    pixel: NotNegative = Field(
+        default=0.0,
+        description="Width of the light-sensitive square in px; 0 for none, for a scene that was recorded by pixels "
+        "before.",
+    )
+    mtf: Annotated[Curve, SkipValidation] | None = Field(
+        default=None,
+        description="Measured MTF: frequencies in cycles/px, increasing from above 0 or from 0 with an MTF of 1, and "
+        "values; 0 beyond the last one. The curve of ``slanted_edge_mtf`` contains the pixel: "
+        "``Optics(mtf=(curve.frequency, curve.mtf))``.",
+    )
+
+
+@options
+class ExactOptions(JointOptions):
+    """Options of method ``"exact"``."""
+
+    prior: Annotated[PriorName, Extensible] = Field(
+        default="gaussian",
+        json_schema_extra=COMMAND_LINE,
+        description='``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``: moreover, every '
+        "patch of 8 x 8 px is a sum of few cosines, which separates edges and flat areas from noise; several times "
+        "slower.",
+    )
+    noise: NotNegative | Literal["auto"] = Field(
+        default="auto",
+        description='Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame. Noise '
+        "and texture are distinguished with two frames or with blur, and only within bounds with one sharp frame, see "
+        "``noise_levels``.",
+    )
+    regularisation: Positive = Field(
+        default=1.0, description="Factor on the prior; 1 is the strength estimated from the frames."
+    )
+    chunk_frequencies: Count | None = Field(
+        default=None,
+        description="Frequencies solved at a time; fewer need less memory and do not change the result. None: as many "
+        "as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by more "
+        "than a pixel during an exposure. While missing values or the boundary extension are filled, the factors of "
+        "all frequencies stay in memory, and this option does not bound it.",
+    )
+    segments: Count | None = Field(
+        default=None,
+        description="Overlapping segments of rows that are solved side by side, which changes the result by about "
+        "1e-5; None: segments of at least 512 rows on a CPU, 256 on a GPU. Always one where the displacement changes "
+        "by more than a pixel during an exposure: rows then depend on distant rows.",
+    )
+    scale: Literal[1, 2] = Field(
+        default=1,
+        json_schema_extra=COMMAND_LINE,
+        description="Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene "
+        "after optics and pixel on a grid of half pixels, and aliasing is part of the model: several frames that "
+        "sample between each other's pixels contain detail beyond half a cycle per px, one frame does not. The prior "
+        "is then a polynomial in the Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which "
+        "detail the restored frames contain.",
+    )
+    mosaic: Mosaic | None = Field(
+        default=None,
+        json_schema_extra=COMMAND_LINE,
+        description="Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) "
+        'behind colour filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three '
+        "channels R, G, B, see ``restore_mosaic``.",
+    )
+    optics: OpticsOptions | None = Field(
+        default=None,
+        json_schema_extra=COMMAND_LINE,
+        description="Optics of the camera, pixel included: the restored frames are as sharp as from a camera with "
+        "pixels of the restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / "
+        "scale)``, where noise allows it, see ``sharpened``. None: the restored frames have the sharpness of the "
+        "camera at rest.",
+    )
+
+
+@options
+class BandedOptions(ChunkOptions):
+    """Options of method ``"banded"``."""
+
+    half_rows: Count = Field(default=16, description="Half height of a slab, in rows.")
+    stride: Count = Field(
+        default=2,
+        description="Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise "
+        "0.003).",
+    )
+    interpolation: Literal["linear", "cubic"] = Field(
+        default="cubic",
+        description='Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own '
+        'blur is deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them.',
+    )
+    noise_to_signal: NotNegative | Literal["auto"] = Field(
+        default="auto",
+        description='Variance of the noise over that of the scene gradients; ``"auto"`` estimates it.',
+    )
+
+
+@options
+class DewarpOptions(ChunkOptions):
+    """Options of method ``"dewarp"``."""
+
+
+@options
+class RichardsonLucyOptions(JointOptions):
+    """Options of method ``"richardson-lucy"``."""
+
+    iterations: int = Field(
+        default=20,
+        ge=1,
+        le=1000,  # each takes the time of four blurs; noise is amplified long before (docs/method.md)
+        description="Number of iterations, at most 1000.",
+    )
+
+
+METHOD_OPTIONS: dict[str, type] = {
+    "exact": ExactOptions,
+    "banded": BandedOptions,
+    "dewarp": DewarpOptions,
+    "richardson-lucy": RichardsonLucyOptions,
+}
+
+
+def method_options(method: str) -> tuple[str, ...]:
+    """Names of the options of a restoration method.
+
+    Example:
+        >>> method_options("dewarp")
+        ('chunk_rows',)
+    """
+    return tuple(fields_of(METHOD_OPTIONS[method]))
+
+
+@options
+class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonLucyOptions):
+    """A restoration method and its options; those of other methods must have their default values."""
+
+    method: RestorationName = Field(
+        default="exact",
+        json_schema_extra=COMMAND_LINE,
+        description='``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row '
+        'within slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: '
+        "iterative, non-negative, several frames jointly if requested.",
+    )
+    saturation: Positive | Literal["auto"] | None = Field(
+        default="auto",
+        json_schema_extra=COMMAND_LINE,
+        description='Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for '
+        "integer frames, none for floating-point frames, whose level is unknown; None for none.",
+    )
+
+    def __post_init__(self) -> None:
+        names = method_options(self.method)
+        for group in METHOD_OPTIONS.values():
+            for name, field in fields_of(group).items():
+                if name not in names and getattr(self, name) != field.default:
+                    text = f"method={self.method!r} has no option {name!r}; its options are {', '.join(names)}"
+                    raise not_an_option(name, text)
+
+
+@options
+class RestorerOptions(RestorationOptions, InputOptions):
+    """Options of ``VibrationRestorer``."""
+
+    check: bool = Field(
+        default=True,
+        description="Judge the result on a part of the frames, and warn if it is no better than the raw frames; needs "
+        "two frames. ``judge_restoration`` judges all of them.",
+    )
+
+
+@options
+class RestoreOptions(RestorerOptions, MaskedInputOptions):
+    """Options of ``restore``."""
+
+
+@options
+class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
+    """Options of ``restoration_mtf``."""
+
+
+@options
+class NoiseGainOptions(RestorationOptions, InputOptions):
+    """Options of ``predict_noise_gain``."""
+
+    columns: int = Field(
+        default=256, ge=64, le=2**31, description="Width of the strip across the scan, from the middle of the frames."
+    )
+
+
+@options
+class TrackerOptions(RestorationOptions, InputOptions):
+    """Options of ``VibrationTracker``."""
+
+    method: RestorationName = Field(default="dewarp", description='Method of ``restore``; ``"dewarp"`` is the fastest.')
+    window: int = Field(
+        default=8,
+        ge=2,
+        le=2**31,
+        description="Number of frames from which the vibration is detected at the start, and again if tracking fails.",
+    )
+    columns: Annotated[int, Field(ge=64, le=2**31)] | None = Field(
+        default=384, description="Columns that are measured, those with the most detail; None for all."
+    )
+    steady: NotNegative = Field(
+        default=0.0,
+        description="s; the image is moved to the straight line that fits its path during this time, so that slow "
+        "shaking is removed as well. 0: frames stay where they are.",
+    )
+    wobble: bool = Field(
+        default=False,
+        description="Whether skew and wobble by slow motion are removed along axes without a reliable vibration as "
+        "well, as with ``steady``. Frames that move as a whole (stabilised in the camera) would be skewed by it.",
+    )
+
+
+@options
+class WindowOptions:
+    """Processing of stacks in windows."""
+
+    window: int = Field(
+        default=8,
+        ge=2,
+        le=2**31,
+        json_schema_extra=COMMAND_LINE,
+        description="Largest number of frames in which one vibration is detected.",
+    )
+    bad_frames: BadFrames = Field(
+        default="pass",
+        json_schema_extra=COMMAND_LINE,
+        description='Frames that cannot be read or used: ``"pass"`` writes them unchanged (a frame that cannot be read '
+        'as NaN, or 0 for integers), ``"skip"`` leaves them out.',
+    )

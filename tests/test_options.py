@@ -1,0 +1,71 @@
+"""Groups of options: flat arguments of functions, their checks, and tables from files."""
+
+import inspect
+import pickle
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+
+import rsvib_torch as rsv
+from rsvib_torch.core.validation import MistakesError, validate
+from rsvib_torch.options import RestorationOptions, ToneOptions
+
+
+@pytest.mark.parametrize(
+    ("function", "leading", "option"),
+    [
+        (rsv.detect_vibration, ["frames", "timing"], "tones"),
+        (rsv.restore, ["frames", "timing", "vibration"], "half_rows"),
+        (rsv.register_bands, ["frames", "timing"], "method"),
+        (rsv.align_motion, ["frames", "timing", "recorded"], "fit_scale"),
+        (rsv.VibrationTracker.__init__, ["self", "timing"], "steady"),
+    ],
+)
+def test_functions_have_the_fields_as_keyword_arguments(function, leading, option):
+    parameters = inspect.signature(function).parameters
+    assert list(parameters)[: len(leading)] == leading
+    assert parameters[option].kind is inspect.Parameter.KEYWORD_ONLY
+    assert parameters[option].default is not inspect.Parameter.empty
+    assert f"{option}: " in function.__doc__
+
+
+def test_values_are_kept_or_refused_but_not_converted():
+    options = ToneOptions(tones=np.int64(2), principal_point=np.array([1, 2.5]), focal_length=900)
+    assert (options.tones, options.principal_point, options.focal_length) == (2, (1.0, 2.5), 900.0)
+    assert pickle.loads(pickle.dumps(options)) == replace(options, harmonics=1)
+    with pytest.raises(FrozenInstanceError):
+        options.tones = 3
+    for value, error in ((2.0, TypeError), ("2", TypeError), (True, TypeError), (5, ValueError)):
+        with pytest.raises(error, match="tones must be"):
+            ToneOptions(tones=value)
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ({"half_row": 2}, TypeError, "unknown option 'half_row'; the options are joint"),
+        ({"method": "dewarp", "half_rows": 2}, TypeError, "method='dewarp' has no option 'half_rows'; its options are"),
+        ({"noise": -1.0}, ValueError, r"noise must be at least 0, got -1.0 \(float\)"),
+        ({"noise": float("nan")}, ValueError, "noise must be finite, got nan"),
+        ({"interpolation": "linea"}, ValueError, "interpolation must be one of 'linear', 'cubic'; got 'linea'"),
+        ({"optics": {"sigma": "wide"}}, TypeError, "optics.sigma must be a number, got 'wide'"),
+        ({"optics": {"width": 1.0}}, TypeError, "unknown option 'optics.width'; the options are sigma, cutoff"),
+    ],
+)
+def test_mistakes_have_name_value_and_remedy(values, error, message):
+    with pytest.raises(error, match=message):
+        RestorationOptions(**values)
+
+
+def test_tables_of_files_have_one_line_for_each_mistake():
+    table = {"registration": "sift", "band_rows": 2.5, "tones": 9, "principal_point": [1], "step": 3}
+    with pytest.raises(MistakesError) as caught:
+        validate(ToneOptions, table, "camera.toml")
+    assert [line.partition("; expected one")[0] for line in caught.value.lines] == [
+        "camera.toml: band_rows: expected a whole number, got 2.5",
+        "camera.toml: registration: expected 'projection' or 'ncc' or 'phase', got 'sift'",
+        "camera.toml: principal_point: expected 2 numbers, got [1]",
+        "camera.toml: tones: expected at most 4, got 9",
+        "camera.toml: step: unknown key",
+    ]
