@@ -127,7 +127,7 @@ def _correlation_area(order: int) -> float:
 
 
 # px, range of the displacement during an exposure below which its blur attenuates no frequency along any direction by
-# ``max_transfer``: at 0.7 cycles per px, the power transfer of a sinusoid of this range is 0.1
+# ``max_transfer``: at 0.7 cycles per px, the power transfer of a sinusoid of this range is 0.13
 _LEAST_BLUR = 0.8
 
 

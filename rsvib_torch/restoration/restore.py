@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rsvib_torch.core.arrays import ArrayLike
+from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs
 from rsvib_torch.frames.entry_points import module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
@@ -178,7 +179,8 @@ def restore(
     motion = motion_in_row_order(prepared, vibration)
     restored = _restored(prepared, motion, options)
     if options.check:  # before frames are sharpened: the verdict compares them with raw frames, blurred by the optics
-        _warn_if_worse(prepared, restored, motion, options.joint)
+        with threads_for(prepared.images):
+            _warn_if_worse(prepared, restored, motion, options.joint)
     if camera is not None:
         restored = sharpened(restored, camera, options.scale)
     return prepared.from_row_order(restored)
@@ -211,7 +213,8 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
         more["colours"] = frames.colours
     if chosen.strips:
         more["strips"] = 1
-    return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, {"options": options, **more})
+    with threads_for(frames.images):
+        return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, {"options": options, **more})
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:

@@ -27,8 +27,7 @@ from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
 from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.observation import FinerObservation, finer_kernels
-from rsvib_torch.restoration.scene_model.scene_prior import PolynomialPrior
+from rsvib_torch.restoration.scene_model.finer_grid import FinerObservation, PolynomialPrior, finer_kernels
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
 

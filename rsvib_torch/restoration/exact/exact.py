@@ -32,14 +32,9 @@ from rsvib_torch.restoration.exact.scene_solver import Partition, SceneProblem
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.scene_model.cross_validation import prior_strengths
-from rsvib_torch.restoration.scene_model.observation import GRIDS, SCENE_REACH, TAPS, RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import (
-    PolynomialPrior,
-    RowPrior,
-    brightness,
-    fit_polynomial_prior,
-    fit_prior,
-)
+from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrior, fit_polynomial_prior
+from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
+from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
 __all__ = ["FrameModel", "Scenes", "given_level", "model_frames", "restore_exact", "scene_period", "solve_scenes"]
 

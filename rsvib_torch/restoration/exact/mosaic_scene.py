@@ -22,8 +22,12 @@ from rsvib_torch.restoration.exact.similar_patches import similar_patches
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
-from rsvib_torch.restoration.scene_model.observation import SCALE, FinerObservation, finer_kernels
-from rsvib_torch.restoration.scene_model.scene_prior import fit_polynomial_prior
+from rsvib_torch.restoration.scene_model.finer_grid import (
+    SCALE,
+    FinerObservation,
+    finer_kernels,
+    fit_polynomial_prior,
+)
 
 __all__ = ["MosaicSolver", "restore_mosaic"]
 

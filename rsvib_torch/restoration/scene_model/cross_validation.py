@@ -154,7 +154,7 @@ def _add_row_prior(bands: Array, precision: Array, rows: int, width: int) -> Non
 def _factored(skewed: Array, count: int) -> tuple[Array, Array]:
     """U (K, b, S) right of the diagonal and D (K, S) of ``A = U^H D U``, as ``core.banded_solver.factor_banded``.
 
-    A step of the elimination takes a fifth of the time of the calls of PyTorch for the few systems of a sample.
+    For the few systems of a sample, the calls of PyTorch would take longer than the arithmetic.
     """
     width = skewed.shape[1] // 2
     line, entry, item = skewed.strides

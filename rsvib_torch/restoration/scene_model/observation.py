@@ -1,6 +1,5 @@
 """The observation operator: interpolation between scene rows, kernels of the rows of frames, and normal equations.
 
-``Observation`` has the scene on the pixel grid, ``FinerObservation`` on a grid of half pixels, in which frames alias.
 The kernel h interpolates the scene between its rows from the coefficients.
 
 A row that is displaced by (x_n, y_n) at N times of its exposure has, at horizontal frequency u, the kernel
@@ -8,21 +7,14 @@ A row that is displaced by (x_n, y_n) at N times of its exposure has, at horizon
 that kernels and their products are smooth in u: they are computed at a few Chebyshev nodes in double precision and
 interpolated to all frequencies by one matrix product. The phase of the middle is applied to the data.
 
-On the finer grid, the scene after optics and pixel contains detail beyond half a cycle per pixel. Along the rows, the
-spectrum of a frame at u (0 ... 1/2 cycles per px) is the sum of the spectra of the scene at u and at its alias u - 1,
-which have different kernels: ``K_a(u) = sum_n w_n h(. - 2 y_n) exp(-2 pi i (u - a) x_n)`` for a = 0, 1. Across the
-rows, the scene is a cubic B-spline h with a knot every half row. Unknowns are numbered 2 j + a for row j of the
-coefficients, so that the normal equations are one banded system per u. Relative to the middle x of a row, the alias has
-the phase ``exp(2 pi i x)``, which does not depend on u: kernels are smooth in u, as on the pixel grid.
-
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -30,20 +22,18 @@ from torch import Tensor
 
 from rsvib_torch.core.banded_solver import from_both_ends
 from rsvib_torch.core.fourier import shift_phases
-from rsvib_torch.core.splines import bspline_weights, correlated, gauss_legendre
+from rsvib_torch.core.splines import correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 
 __all__ = [
-    "GRIDS",
     "KERNEL_REACH",
-    "SCALE",
+    "MARGIN",
     "SCENE_REACH",
     "TAPS",
-    "FinerObservation",
     "Observation",
     "RowKernels",
     "SmoothBand",
-    "finer_kernels",
+    "about_middle",
     "interpolation_error",
     "interpolation_matrix",
     "kernel_samples",
@@ -53,16 +43,12 @@ __all__ = [
     "row_kernels",
     "scene_weights",
     "smooth_kernels",
-    "spline_transfer",
 ]
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH
 SCENE_REACH = 5  # rows on either side; support of the weights of a scene row
-SCALE = 2  # points per px of the finer grid, and unknowns per frequency
-_MARGIN = 16  # most rows by which a scene extends beyond the frame; rows displaced further have weight 0
-_FINER_DEGREE = 3
-_FINER_SCENE_REACH = 5  # half rows on either side; support of the weights of a scene row on the finer grid
+MARGIN = 16  # most rows by which a scene extends beyond the frame; rows displaced further have weight 0
 # The kernel is (1 - z^2)^2 times this polynomial in z^2, z the distance divided by the reach. It has the least error of
 # interpolation (gain and aliases, -52 dB of the power) for power spectra like frequency^-2 behind Gaussian optics of
 # sigma 0.6 px, of all such kernels with a transfer function of at least 5 % at half a cycle per row: less makes the
@@ -191,7 +177,7 @@ class RowKernels:
 
 
 def row_kernels(
-    displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int = _MARGIN
+    displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int = MARGIN
 ) -> RowKernels:
     """Kernels of rows with displacement (M, R, N, 2) during the exposure.
 
@@ -202,10 +188,10 @@ def row_kernels(
     first, taps = row_taps(place, node_weights, kernel_weights)
     first, low, high = first - (KERNEL_REACH - 1), -margin - taps.shape[-2], num_rows + margin
     weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
-    return RowKernels(first.clamp(low, high), taps, *_about_middle(displacement[..., 0]), weight)
+    return RowKernels(first.clamp(low, high), taps, *about_middle(displacement[..., 0]), weight)
 
 
-def _about_middle(along: Tensor) -> tuple[Tensor, Tensor]:
+def about_middle(along: Tensor) -> tuple[Tensor, Tensor]:
     """Middles (M, R) of the ranges of displacements (M, R, N), and the displacements relative to them."""
     middle = 0.5 * (along.detach().amin(-1) + along.detach().amax(-1))
     return middle, along - middle[..., None]
@@ -480,125 +466,3 @@ def _frequencies(period: int) -> Tensor:
     """Frequencies (U,) of rows of a period in cycles per px, on the CPU."""
     frequencies: Tensor = torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")
     return frequencies
-
-
-class FinerKernels(RowKernels):
-    """Kernels on the grid of half pixels: ``first`` and ``taps`` count unknowns 2 j + a."""
-
-    symmetric = False
-
-    @property
-    def blurred(self) -> bool:
-        """Whether the displacement changes by more than 1 px during an exposure."""
-        return max(2.0 * self.blur_reach, (self.taps.shape[-2] / SCALE - _FINER_DEGREE - 1) / SCALE) > 1.0
-
-    def needed(self, num_rows: int) -> tuple[int, int]:
-        """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
-        return -SCALE * _FINER_SCENE_REACH, SCALE * (SCALE * num_rows + _FINER_SCENE_REACH)
-
-    def at(self, frequencies: Tensor) -> Tensor:
-        """Kernels (M, R, 2 J, Q) without the phase of the middle at the frequency."""
-        both = torch.stack([frequencies, frequencies - 1])  # (a, Q)
-        angle = (-2 * math.pi) * self.along[..., None, :, None] * both[:, None]
-        alias = (2 * math.pi) * self.middle[..., None, None] * both.new_tensor([[0.0], [1.0]])
-        waves = torch.polar(torch.ones_like(angle), angle + alias[..., None])  # (M, R, a, N, Q)
-        taps = self.taps.unflatten(-2, (-1, SCALE)).transpose(-3, -2)  # (M, R, a, J, N)
-        kernels: Tensor = (taps.to(waves.dtype) @ waves).transpose(-3, -2).flatten(-3, -2)
-        return kernels
-
-
-def finer_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int) -> FinerKernels:
-    """Kernels of rows with displacement (M, R, N, 2) px during the exposure, as ``row_kernels`` on the finer grid."""
-    rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
-    place = SCALE * (rows[:, None] - displacement[..., 1])
-    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=_FINER_DEGREE))
-    first, low, high = first - _FINER_DEGREE // 2, -SCALE * _MARGIN - taps.shape[-2], SCALE * (num_rows + _MARGIN)
-    weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
-    first, taps = SCALE * first.clamp(low, high), taps.repeat_interleave(SCALE, -2)
-    return FinerKernels(first, taps, *_about_middle(displacement[..., 0]), weight)
-
-
-def spline_transfer(frequencies: Tensor) -> Tensor:
-    """Transfer function of the cubic B-spline on half pixels, at frequencies in cycles per px."""
-    return torch.sinc(frequencies / SCALE) ** (_FINER_DEGREE + 1)
-
-
-@cache
-def _finer_scene_weights() -> tuple[float, ...]:
-    """Weights of the coefficients of half rows -5 ... 5 in a row of the scene, as ``scene_weights``.
-
-    The least-squares fit to ``spline_transfer`` up to 0.9 cycles per px. Samples of the spline, weights 1/6, 4/6 and
-    1/6, include its aliases: gratings across the rows have 1.14 times their contrast at 0.75 cycles per px.
-    """
-    v = torch.linspace(0, 0.9, 181, dtype=torch.float64, device="cpu")
-    order = torch.arange(_FINER_SCENE_REACH + 1, dtype=torch.float64, device="cpu")
-    cosines = torch.cos(2 * torch.pi / SCALE * v[:, None] * order) * torch.where(order > 0, 2.0, 1.0)
-    half = torch.linalg.lstsq(cosines, spline_transfer(v)[:, None]).solution[:, 0]
-    return tuple((torch.cat([half.flip(0), half[1:]]) / (half[0] + 2 * half[1:].sum())).tolist())
-
-
-@dataclass(frozen=True, eq=False)
-class FinerBand(SmoothBand):
-    """Normal matrices at any frequencies; the prior is ``sum_m q_m(u - a) T^m`` with the Laplacian T across rows.
-
-    ``left`` contains the bands of ``T^m`` for both aliases behind the real and imaginary parts at the nodes.
-    """
-
-    def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
-        """Skewed bands as in ``SmoothBand.at``, for a precision (p + 1, 2, U) as of ``PolynomialPrior.precision``."""
-        prior = torch.stack([precision, torch.zeros_like(precision)], dim=-1).flatten(-2).flatten(0, 1)
-        interpolation = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=False)[1]
-        right = torch.cat([interpolation.to(prior), prior])
-        return torch.view_as_complex(self._product(right, out)).flatten(2)
-
-
-def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
-    """Bands (K, 2 p + 1, p + 1) of ``T^0 ... T^p``, ``[k, p + d] = T^m[k, k + d]``, T with mirrored ends."""
-    step = torch.full((count, 3), -1.0, dtype=torch.float64, device=device)  # T[k, k - 1], T[k, k], T[k, k + 1]
-    step[0, 0] = step[-1, 2] = 0.0
-    step[:, 1] = -step[:, 0] - step[:, 2]
-    powers = [torch.zeros(count, 2 * order + 1, dtype=torch.float64, device=device)]
-    powers[0][:, order] = 1.0
-    for _ in range(order):
-        powers.append(
-            sum((step[:, 1 + f, None] * powers[-1].roll((-f, f), (0, 1)) for f in (-1, 0, 1)), start=step.new_zeros(()))
-        )
-    return torch.stack(powers, dim=-1)
-
-
-class FinerObservation(Observation):
-    """``Observation`` of one scene on the grid of half pixels; all values count unknowns 2 j + a."""
-
-    def normal(self, order: int) -> SmoothBand:
-        """Normal matrices ``K^H W K``, with room for a polynomial of an order in the Laplacian across rows."""
-        if order not in self._normal:
-            width = max(self.kernels.taps.shape[-2] - 1, SCALE * order)
-            matrices = normal_matrices(self.kernels, self.top, self.count, width, self.dtype)[:, :, 0]
-            powers = _laplacian_powers(self.count // SCALE, order, matrices.device)
-            prior = matrices.new_zeros(*matrices.shape[:2], order + 1, SCALE)
-            for alias in range(SCALE):
-                place = slice(width - SCALE * order, width + SCALE * order + 1, SCALE)
-                prior[alias : self.count : SCALE, place, :, alias] = powers
-            left = torch.cat([matrices, prior.flatten(2)], dim=-1).to(self.dtype)
-            self._normal[order] = FinerBand(left[:, :, None], 2 * self.kernels.blur_reach)
-        return self._normal[order]
-
-    def image(self, coefficients: Tensor) -> Tensor:
-        """The scene at half pixels, (1, C, 2 R, 2 L): rows j / 2 and columns i / 2 of the frame at rest."""
-        first = -SCALE * _FINER_SCENE_REACH - self.top
-        count = SCALE * self.num_rows
-        rows = coefficients[first : first + SCALE * (count + 2 * _FINER_SCENE_REACH)].unflatten(0, (-1, SCALE))
-        sampled = sum(
-            (weight * rows[k : k + count] for k, weight in enumerate(_finer_scene_weights())), start=rows.new_zeros(())
-        )
-        low, alias = sampled.unbind(1)  # at u and u - 1; the scene is real
-        spectra = torch.cat([low, alias[..., :-1].flip(-1).conj()], dim=-1)
-        scene: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=SCALE * self.period) * SCALE
-        return scene
-
-
-# Functions that make the kernels of rows and the operator, for the points of the scene per px
-GRIDS: dict[int, tuple[Callable[..., RowKernels], type[Observation]]] = {
-    1: (row_kernels, Observation),
-    SCALE: (finer_kernels, FinerObservation),
-}

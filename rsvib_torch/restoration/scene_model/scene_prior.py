@@ -1,7 +1,4 @@
-"""Gaussian priors of a scene, fitted to the power spectra of pieces of the frames.
-
-``RowPrior``, for scenes on the pixel grid, is an autoregressive model across rows. ``PolynomialPrior``, for scenes on a
-grid of half pixels, has a precision that is a polynomial in the Laplacians of both axes.
+"""Gaussian prior of scenes on the pixel grid: an autoregressive model across rows, fitted to power spectra of frames.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -9,7 +6,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi
 from typing import Any
 
 import numpy as np
@@ -21,18 +17,16 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.core.splines import mirrored
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.observation import SCALE, interpolation_error, kernel_spectrum, spline_transfer
+from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
 
 __all__ = [
     "ORDER",
     "ObservedSpectrum",
-    "PolynomialPrior",
     "RowPrior",
     "autoregressive_prior",
     "bounded_ratio",
     "brightness",
     "cut_pieces",
-    "fit_polynomial_prior",
     "fit_prior",
     "observed_spectrum",
     "smeared",
@@ -181,7 +175,7 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
     if torch.is_grad_enabled() and any(table.requires_grad for table in tables):
         constants = [torch.as_tensor(table, device=observed.device) for table in (cosine, pooling)]
         power, *reflections, scene = _expectation_maximisation(tables, constants[0], constants[1])
-    else:  # small tables, which take a fifth of the time on the CPU without the calls of PyTorch
+    else:  # small tables, for which the calls of PyTorch would take longer than the arithmetic
         arrays = torch.stack([table.detach() for table in tables]).cpu().numpy()
         *fitted, expected = _expectation_maximisation(arrays, cosine, pooling)
         power, *reflections = torch.from_numpy(np.stack(fitted)).to(observed.device)
@@ -372,131 +366,3 @@ def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
     """
     power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2)).mean((1, 2, 3))
     return torch.nn.functional.adaptive_avg_pool1d(power, count).mT.to(torch.float64)
-
-
-# Degree 6 instead of 4: 0.6 to 1.0 dB for eight frames of scenes with little detail beyond half a cycle per px, -0.4 dB
-# for one with much; 8 gains less than 0.2 dB more (drawn scenes of three sharpnesses, noise 0.002).
-_DEGREE = 6
-_POWERS = [(m, n) for m in range(_DEGREE + 1) for n in range(_DEGREE + 1 - m)]  # of the Laplacians across and along
-_MAX_LAPLACIAN = 4.0  # of one axis, at half a cycle per grid point
-# Square pixels transmit sin(pi u) / (pi u), 0 at one cycle per px. Along the rows the prior has this factor, at least
-# the square root of the first number. Across them, the polynomial has the factor ``1 + 10 (lambda / 4)^4``, which rises
-# like the inverse. Frames do not contain it, as the alias of half a cycle per px is below it: without, the spectrum
-# near one cycle per px is estimated 100 times too large (sharp optics, noise 0.002, 8 frames: 0.5 to 5 dB).
-_LEAST_PIXEL, _RISE, _RISE_POWER = 0.005, 10.0, 4
-
-
-def _laplacian(frequencies: Tensor) -> Tensor:
-    """Discrete Laplacian on the grid, at frequencies in cycles per px."""
-    return 2 - 2 * torch.cos(2 * pi / SCALE * frequencies)
-
-
-def _pixel(u: Tensor) -> Tensor:
-    """Squared transfer function of a pixel along the row."""
-    return torch.sinc(u).square().clamp(min=_LEAST_PIXEL)
-
-
-def _rising_powers(device: torch.device) -> Tensor:
-    """Coefficients (p + 1, p + 1) of ``lambda^m (1 + 10 (lambda / 4)^4)``; terms of a degree above p have degree p."""
-    powers = torch.eye(_DEGREE + 1, dtype=torch.float64, device=device)
-    for m in range(_DEGREE + 1):
-        high = min(m + _RISE_POWER, _DEGREE)
-        powers[m, high] += _RISE * _MAX_LAPLACIAN ** (m - high)
-    return powers
-
-
-@dataclass(frozen=True, eq=False)
-class PolynomialPrior:
-    """Power spectrum ``sinc(u)^2 b(v)^2 / sum_mn a_mn lambda(v)^m lambda(u)^n`` of the scene, a_mn >= 0.
-
-    lambda is the discrete Laplacian on the grid, sinc the transfer function of a pixel and b that of the cubic
-    B-spline: without b it is the spectrum of the coefficients of the scene.
-
-    Attributes:
-        coefficients: (p + 1, p + 1) a_mn, in px^-2 over squared units of the frames, float64.
-        period: L, period of the rows in px.
-    """
-
-    coefficients: Tensor
-    period: int
-
-    def precision(self, noise_power: Tensor, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
-        """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
-
-        Args:
-            noise_power: Variance of the noise of data of weight 1.
-            strength: Factor on the precision.
-            blur_reach: Of ``RowKernels``.
-        """
-        u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise_power.device)
-        u = torch.stack([u, u - 1])
-        # bounds as for ``RowPrior.precision``: below, the elimination in single precision loses digits. The upper one
-        # must not bound the precision at half a cycle per px, where one coefficient of degree 6 has 1/4096 of its
-        # largest value: 1e3 lost 1.1 dB in soft scenes; 1e6 and single precision differ from double by -79 dB at most
-        m, n = torch.meshgrid(*(torch.arange(_DEGREE + 1, device=u.device),) * 2, indexing="ij")
-        a = self.coefficients * (noise_power.to(torch.float64) * strength / SCALE)
-        a = a.minimum(1e6 / _MAX_LAPLACIAN ** (m + n))
-        a[0, 0] += 1e-5 / (1 + blur_reach)
-        powers = _laplacian(u) ** torch.arange(_DEGREE + 1, device=u.device)[:, None, None]
-        return torch.einsum("mn,nau->mau", a, powers) / _pixel(u)
-
-
-@torch.no_grad()
-def fit_polynomial_prior(
-    frames: Tensor, motion: FrameMotion, levels: Tensor, length: int, iterations: int = 60
-) -> PolynomialPrior:
-    """Fit the prior to the frames of one stack, whose spectrum is blurred and aliased.
-
-    The expected power of a frame at (u, v) is that of the noise plus that of the scene, through the blur of the
-    exposure, at (u - a, v - b) for all aliases within 1 cycle per px. Observed powers are distributed like chi-squared
-    around it (Whittle likelihood): scoring for the logarithms of a_mn.
-
-    Args:
-        frames: (1, T, C, H, W) in row order.
-        motion: Motion of the frames.
-        levels: (1, T) standard deviation of the noise of each frame.
-        length: Length of the Fourier transform along rows.
-        iterations: Largest number of steps.
-    """
-    spectrum = observed_spectrum(frames, motion, levels, length)
-    u, v = spectrum.u[:, None], spectrum.v
-    observed, weight, noise = (
-        values[0] for values in spectrum.weighted(smeared(spectrum.blur(spectrum.u, spectrum.v)))
-    )
-    # transfer function and powers of the Laplacians at each alias
-    gains, features = [], []
-    rising, order = _rising_powers(frames.device), torch.arange(_DEGREE + 1, device=frames.device)
-    for alias_u in (0, 1):
-        for alias_v in (-1, 0, 1):
-            beyond = (v - alias_v).abs() > 1
-            along, across = u - alias_u, (v - alias_v).clamp(-1, 1)
-            blur = smeared(spectrum.blur(spectrum.u - alias_u, spectrum.v - alias_v))[0]
-            blur = (weight * blur).sum((0, 1)).masked_fill(beyond, 0.0)
-            gains.append(blur * _pixel(along) * spline_transfer(across).square())
-            rows = _laplacian(across)[:, None] ** order @ rising.T
-            features.append(torch.stack([rows[:, m] * _laplacian(along) ** n for m, n in _POWERS], dim=-1))
-    gain, feature = torch.stack(gains), torch.stack(features)  # (aliases, U, V), (aliases, U, V, powers)
-    # frequencies within the taper of zero contain the mean
-    used = (u > 1.5 * (u[1] - u[0])) | (v.abs() > 1.5 / len(v))
-    # start from a white spectrum of the mean level
-    middle = (observed - noise).clamp(min=0.01 * noise)[used].log().mean().exp()
-    logs = torch.full((len(_POWERS),), -float(middle.log()), dtype=torch.float64, device=frames.device)
-    for _ in range(iterations):
-        # expected power of the frames, and its derivative with respect to the logarithms
-        terms = feature * logs.exp()
-        polynomial = terms.sum(-1)
-        scene = gain / polynomial
-        expected = scene.sum(0) + noise
-        slope = ((scene / polynomial)[..., None] * terms).sum(0) / -expected[..., None]
-        jacobian, residual = slope[used], (observed / expected - 1)[used]
-        normal = jacobian.T @ jacobian
-        # damped: powers that do not matter for the spectrum have a singular matrix
-        normal.diagonal().add_(1e-3 * normal.diagonal().mean())
-        step = torch.linalg.solve(normal, jacobian.T @ residual).clamp(-1, 1)
-        logs = logs + step
-        if bool(step.abs().max() < 1e-2):
-            break
-    coefficients = torch.zeros(_DEGREE + 1, _DEGREE + 1, dtype=torch.float64, device=frames.device)
-    for (m, n), log in zip(_POWERS, logs, strict=True):
-        coefficients[m, n] = log.exp()
-    return PolynomialPrior(rising.T @ coefficients, length)

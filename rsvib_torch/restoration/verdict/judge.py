@@ -71,7 +71,7 @@ _DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
 
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
-_PIXELS = {"cpu": 1 << 22, "cuda": 1 << 26}  # judged at a time; the images and spectra of 2^22 px need 0.5 GB
+_PIXELS = {"cpu": 1 << 22, "cuda": 1 << 26}  # judged at a time; bounds the memory
 
 
 @dataclass(frozen=True, eq=False, repr=False)

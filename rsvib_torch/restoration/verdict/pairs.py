@@ -36,8 +36,7 @@ __all__ = [
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
 _MARGIN = 4  # px between the compared pixels and those outside the frame
-# values of the kernels in ``reblur`` at a time: 16 MB on a CPU. Eight times less takes 0.9 of the time for one pair of
-# frames of 2048 rows, but eight times as many operations for a batch
+# values of the kernels in ``reblur`` at a time, which bounds the memory: 16 MB on a CPU
 _ELEMENTS = {"cpu": 1 << 21, "cuda": 1 << 26}
 
 
