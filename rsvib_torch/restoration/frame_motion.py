@@ -113,7 +113,8 @@ class FrameMotion:
         """Displacement (B, T, R, N, 2) in px of the rows of the frames at N nodes of their exposures, weights (N,)."""
         rows = torch.arange(self.num_rows, dtype=torch.float64, device=self.frame_starts.device)
         starts = self.row_starts(rows).expand(*self.shift.shape[:2], self.num_rows)
-        return exposure_trajectory(self.vibration, starts, self.timing, "gauss")
+        with torch.enable_grad():  # the first use may be an estimate without gradients
+            return exposure_trajectory(self.vibration, starts, self.timing, "gauss")
 
     @cached_property
     def blur_lengths(self) -> NDArray[np.float64]:

@@ -55,8 +55,8 @@ PARTS: dict[str, list[tuple[str, str]]] = {
     ],
     "verdict": [("rsvib_torch.stacks.process_video", "VideoPasses.verdict")],
     "joining parts, checksums": [
-        ("rsvib_torch.stacks.process_video", "PartSink.finish"),
-        ("rsvib_torch.stacks.process_video", "PartSink.finish_part"),
+        ("rsvib_torch.stacks.process_video", "_Encoder.close"),
+        ("rsvib_torch.stacks.process_video", "_Encoder.finish_part"),
     ],
 }
 CODECS = "decoding, encoding and the rest"

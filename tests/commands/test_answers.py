@@ -390,7 +390,7 @@ def test_long_operations_report_their_progress(place, tmp_path):
         )
         assert unit in found
     _, found = units(lambda: rsv.judge_restoration(frames, restored, TIMING, detection))
-    assert found == {"pairs"}
+    assert found == {"stacks"}
     _, found = units(lambda: rsv.write_stack(tmp_path / "r.npy", restored))
     assert found == {"frames"}
 

@@ -133,12 +133,16 @@ def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
     assert cv2.imread(str(out / "before_after.png")).std() > 5
 
 
+def reason(text):
+    return {"code": "of a later version", "text": text}
+
+
 def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
     frames, config = place / "frames.tif", place / "camera.toml"
     assert rsvib("detect", frames, "--config", config, "--out", tmp_path) == 0
     path = tmp_path / "vibration.json"
     data = json.loads(path.read_text())
-    data.update(reliable=[False, False], findings=[["blind"], ["too short", "noisy"]])
+    data.update(reliable=[False, False], findings=[[reason("blind")], [reason("too short"), reason("noisy")]])
     path.write_text(json.dumps(data))
     capsys.readouterr()
     assert rsvib("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0

@@ -89,16 +89,16 @@ def test_offsets_before_and_after(place, tmp_path, capsys):
 def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     folder, _, size = place
     data = json.loads((folder / "vibration.json").read_text())
-    path = tmp_path / "doubtful.json"
+    path, blind = tmp_path / "doubtful.json", {"code": "of a later version", "text": "blind"}
     options = ("--format", "stmap", "--size", f"{size[0]}x{size[1]}", "--num-frames", 1, "--convention", "opencv")
-    path.write_text(json.dumps(data | {"reliable": [True, False], "findings": [[], ["blind"]]}))
+    path.write_text(json.dumps(data | {"reliable": [True, False], "findings": [[], [blind]]}))
     assert run(path, tmp_path / "maps", *options) == 0
     assert "y is not exported: its vibration is not reliable (blind)" in " ".join(capsys.readouterr().err.split())
     rows = np.arange(size[0])[:, None]
     assert np.abs(tifffile.imread(tmp_path / "maps" / "stmap_0000.tif")[..., 1] - rows).max() == 0
     assert run(path, tmp_path / "forced", *options, "--force") == 0
     assert np.abs(tifffile.imread(tmp_path / "forced" / "stmap_0000.tif")[..., 1] - rows).max() > 1
-    path.write_text(json.dumps(data | {"reliable": [False, False], "findings": [["blind"], ["blind"]]}))
+    path.write_text(json.dumps(data | {"reliable": [False, False], "findings": [[blind], [blind]]}))
     assert run(path, tmp_path / "none", *options) == 2
     assert "nothing to export" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

@@ -201,7 +201,7 @@ def sample_rows(
     # spectra of the rows, minus the mean of the image
     taper = np.hanning(width + 2)[1:-1]
     angles = -2 * np.pi * (np.arange(width)[:, None] * chosen % width) / width
-    tapered = torch.as_tensor(taper[:, None] * np.concatenate([np.cos(angles), np.sin(angles)], 1), dtype=images.dtype)
+    tapered = torch.from_numpy(taper[:, None] * np.concatenate([np.cos(angles), np.sin(angles)], 1)).to(images.dtype)
     tapered = tapered.to(images.device)
     mean = images.mean((-2, -1), keepdim=True)
     transformed = (images[..., : slabs * height, :] @ tapered - mean * tapered.sum(0)).cpu().numpy()
@@ -301,7 +301,7 @@ def prior_strengths(
     number = min(_FREQUENCIES, width // 4)
     chosen = np.linspace(0.02 * width, width // 2, number, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images[..., top : top + count, :], kernels.rows(top, count), chosen)
-    place = torch.as_tensor(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
+    place = torch.from_numpy(np.rint(chosen / width * 2 * (prior.power.shape[-1] - 1)).astype(np.int64))
     at = RowPrior(
         *(table[..., place.to(table.device)] for table in (prior.power, prior.reflections, prior.interpolation_power))
     )

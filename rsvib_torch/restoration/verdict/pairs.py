@@ -279,7 +279,7 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Ten
         correlated_values = 4 * math.pi * (_SMOOTHING / step) ** 2
         scatter = scatter * (correlated_values * 2.0 * solution[..., :1, None] ** 2)
         variance = np.diagonal(inverse @ scatter @ inverse, axis1=-2, axis2=-1)[..., 1:3].clip(0.0)
-    figures = torch.as_tensor(np.stack([solution[..., 1:3].clip(0.0) ** 0.5, (2.0 * variance**0.5) ** 0.5]))
+    figures = torch.from_numpy(np.stack([solution[..., 1:3].clip(0.0) ** 0.5, (2.0 * variance**0.5) ** 0.5]))
     size, resolution = figures.to(first.device)
     # rounding is no contrast
     largest = torch.maximum(first.abs().amax((-3, -2, -1)), second.abs().amax((-3, -2, -1)))
