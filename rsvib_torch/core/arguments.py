@@ -34,7 +34,7 @@ from pydantic_core import core_schema
 from torch import Tensor
 
 from rsvib_torch.core.checks import MAX_NUMBER, described
-from rsvib_torch.core.validation import Number, members_of, validated
+from rsvib_torch.core.validation import Number, members_of, validated, without_alias
 
 __all__ = [
     "as_numbers",
@@ -344,6 +344,7 @@ def _adapter(kind: Any, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[An
 
 def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
     """The annotation without numbers beyond all physical quantities, with lists in place of tuples, for pydantic."""
+    kind = without_alias(kind)
     if kind is float and finite:
         return Number
     if kind is int:

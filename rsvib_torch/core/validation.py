@@ -37,6 +37,7 @@ __all__ = [
     "read_json",
     "validate",
     "validated",
+    "without_alias",
 ]
 
 _Group = TypeVar("_Group")
@@ -302,11 +303,21 @@ def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
 
 def members_of(annotation: Any) -> tuple[Any, ...]:
     """Members of a union without their bounds, and without None."""
+    annotation = without_alias(annotation)
     if get_origin(annotation) is Annotated:
         return members_of(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
         return tuple(member for part in get_args(annotation) for member in members_of(part))
     return () if annotation is type(None) else (annotation,)
+
+
+def without_alias(annotation: Any) -> Any:
+    """The annotation that a type alias stands for, as ``NDArray`` of NumPy 2.5 is one."""
+    alias = get_origin(annotation) or annotation
+    if type(alias).__name__ != "TypeAliasType":
+        return annotation
+    arguments = get_args(annotation)
+    return alias.__value__[arguments] if arguments else alias.__value__
 
 
 def _items(annotation: Any, index: int) -> Iterator[Any]:

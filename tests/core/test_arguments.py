@@ -3,14 +3,17 @@
 import gc
 import math
 from dataclasses import replace
+from typing import TypeVar, get_origin
 
 import numpy as np
 import pytest
 import torch
+from typing_extensions import TypeAliasType
 
 import rsvib_torch as rsv
 from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.validation import members_of
 from rsvib_torch.evaluation.scenes import city_and_fields
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
@@ -288,3 +291,11 @@ def test_samples_with_gradient_are_refused():
     times = torch.linspace(0, 0.1, 11, dtype=torch.float64)
     with pytest.raises(ValueError, match=r"from_samples has no gradient: pass displacement\.detach\(\)"):
         rsv.FreeMotion.from_samples(times, torch.zeros(11, 2, requires_grad=True))
+
+
+def test_arrays_of_numpy_with_a_type_alias_are_known():
+    """``NDArray`` is an alias from NumPy 2.5 on."""
+    parameter = TypeVar("parameter", bound=np.generic)
+    alias = TypeAliasType("alias", np.ndarray[tuple[int, ...], np.dtype[parameter]], type_params=(parameter,))
+    array, of_union = members_of(alias[np.float64] | int | None)
+    assert (get_origin(array), of_union) == (np.ndarray, int)
