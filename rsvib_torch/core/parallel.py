@@ -9,7 +9,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["in_parallel", "threads_for"]
+__all__ = ["allowed_threads", "in_parallel", "threads_for"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -19,6 +19,11 @@ Result = TypeVar("Result")
 # eight other processes, one thread and two take 0.34 and 2.1 s, with 1024 x 1024 px 0.43 and 1.6 s
 _SMALL = 1200 * 1200
 _allowed: ContextVar[int | None] = ContextVar("allowed", default=None)
+
+
+def allowed_threads() -> int:
+    """Number of threads for independent pieces of work on a CPU, also within ``threads_for``."""
+    return _allowed.get() or torch.get_num_threads()
 
 
 @contextmanager
@@ -60,7 +65,7 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
     """
     items = list(items)
     within = torch.get_num_threads()
-    allowed = _allowed.get() or within
+    allowed = allowed_threads()
     threads = min(allowed, len(items)) if device.type == "cpu" else 1
     if threads == 1:
         with torch.no_grad():

@@ -35,7 +35,7 @@ Stacks = TypeVar("Stacks", bound="DataclassInstance")
 
 
 def table(values: Tensor) -> Array:
-    """A tensor as an array on the CPU."""
+    """A tensor as an array on the CPU; one on the CPU shares its memory."""
     array: Array = values.detach().resolve_conj().cpu().numpy()
     return array
 
@@ -84,12 +84,12 @@ def pseudo_inverse(matrix: Array) -> Array:
 
 
 def tensor(values: Array) -> Tensor:
-    """An array as a tensor on the CPU, for motions, whose times are tensors."""
+    """An array as a tensor on the CPU, for motions and for indices of tensors."""
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
 def tables(*values: Tensor) -> list[Array]:
-    """Tensors as arrays on the CPU, by one transfer."""
+    """Tensors as arrays on the CPU, by one transfer; those of a GPU become float64."""
     if values[0].device.type == "cpu":
         return [table(part) for part in values]
     flat = table(torch.cat([part.to(torch.float64).flatten() for part in values]))

@@ -1,4 +1,6 @@
-"""The hypotheses that detection tries, one after the other; the only place of detection that repeats an attempt.
+"""The hypotheses that detection tries, one after the other.
+
+Only ``diagnosis``, which it calls, makes further attempts, with other timings.
 
 1. The motion is a translation: all columns of a row are displaced alike.
 2. If the halves of the rows move apart as roll and zoom cause it, or if roll and zoom are requested: a motion with

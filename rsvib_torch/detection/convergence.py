@@ -54,7 +54,7 @@ class Step:
 
 
 def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
-    """(B, A) bool, whether the next round is expected to change the tones of an axis by 8 % of their std.
+    """(B, A) bool, whether the last round changed the tones of an axis so little that the next one need not be made.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
     are therefore small enough, and up to three standard deviations if the measured ratio of two steps allows it.

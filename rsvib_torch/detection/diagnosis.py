@@ -184,7 +184,7 @@ def _diagnosis(
         else:
             turned = stack.with_timing(candidate)
         scale = FieldScale(2, turned.images.shape[-1], turned.images.shape[-2])
-        hypothesis = Hypothesis(scale, is_doubtful=True, bands=bands, frequencies=known)
+        hypothesis = Hypothesis(scale, is_doubtful=True, known_offsets=bands, frequencies=known)
         other = attempt(turned, candidate.in_row_order(), found.options, hypothesis)
         concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
         refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))

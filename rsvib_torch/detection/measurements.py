@@ -154,7 +154,7 @@ class Measurements:
         return self.mapped(lambda values: np.repeat(values, count, 0))
 
     def mapped(self, function: Callable[[Array], Array]) -> "Measurements":
-        """The measurements with a function of the stacks, their first axis, applied to all tensors."""
+        """The measurements with a function of the stacks, their first axis, applied to all arrays."""
         return replace(
             self,
             exposure_starts=function(self.exposure_starts),

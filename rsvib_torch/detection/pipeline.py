@@ -80,7 +80,7 @@ class Hypothesis:
             attempt is then abandoned early if a large residual remains.
         has_pattern: Whether the frames have a pattern of columns; None if it is not known.
         translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
-        bands: Offsets of the row bands of these frames, measured with another timing.
+        known_offsets: Offsets of the row bands of these frames, measured with another timing.
         frequencies: (B, A, 1) Hz of one tone of each axis.
     """
 
@@ -88,7 +88,7 @@ class Hypothesis:
     is_doubtful: bool = False
     has_pattern: bool | None = None
     translation: ToneFit | None = None
-    bands: OffsetCurve | None = None
+    known_offsets: OffsetCurve | None = None
     frequencies: Array | None = None
 
 
@@ -163,7 +163,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
         start = band_start(
-            stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.bands
+            stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.known_offsets
         )
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)

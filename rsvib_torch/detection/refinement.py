@@ -105,7 +105,7 @@ def refine(
     # one axis after the other.
     device = frames.groups[0].starts.device
     blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
-    tried = np.repeat(~blurred[:, None], start.active.shape[1], 1)
+    tried = np.repeat(~blurred[:, None], start.active.shape[1], 1)  # frames of equal blur count as tried
     while not tried.all():
         frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
         if not mirrored.any():
@@ -189,7 +189,6 @@ class Refinement:
         intervals: (M,) s, times between the frames that are compared.
         start: Fit to the offsets of row bands.
         tones: Number of tones of each axis; None to select it by significance.
-        max_rounds: Largest number of rounds; exposures of 400 rows need more than six.
         may_abandon: Whether the motion is possibly of another kind than assumed (parallax instead of roll). Stacks with
             a large residual after three rounds are then abandoned.
         has_pattern: Whether the frames have a pattern of columns: it is then subtracted after the first round instead
@@ -219,7 +218,6 @@ class Refinement:
         start: ToneFit,
         tones: int | None,
         *,
-        max_rounds: int = 12,
         may_abandon: bool = False,
         has_pattern: bool | None = None,
     ) -> None:
@@ -228,7 +226,7 @@ class Refinement:
         self.round, self.search_round = 0, 1
         self.stacks = np.arange(len(start.centre))
         self.ended = self.settled = self.converged = self.abandoned = np.zeros_like(start.centre, dtype=bool)
-        self._intervals, self._tones, self._max_rounds = intervals, tones, max_rounds
+        self._intervals, self._tones = intervals, tones
         self._may_abandon, self._has_pattern = may_abandon, has_pattern
         # exposures average out faster tones
         self._sample_interval = max(BLOCK_ROWS * frames.timing.row_time, 0.5 * frames.timing.exposure_time)
@@ -277,7 +275,7 @@ class Refinement:
         # large residual, and those whose residual remains although a pattern of columns was subtracted because of it.
         if self._may_abandon and self.round == _TRIED_ROUNDS:
             self.abandoned = _large_residual(self.frames, measured, self.fit)
-        self.ended = self.abandoned | ~(measurements.weights > 0).any((1, 2)) | (self.round == self._max_rounds)
+        self.ended = self.abandoned | ~(measurements.weights > 0).any((1, 2)) | (self.round == _MAX_ROUNDS)
         if self._refused is not None and self.round == self.search_round + 2:
             self.ended = self.ended | (size > 0.5 * self._refused).all(-1)
 
@@ -392,15 +390,17 @@ class Refinement:
         return stalled & (other.unexplained > other.permitted)
 
 
-# rounds; multiple of the residual that the verdict permits. Roll and zoom leave 0.1 of it, parallax 2 to 10 times it
-_TRIED_ROUNDS, _MAX_TRIED = 3, 2.0
+# rounds before the test; residual over the one that the verdict permits. Roll and zoom leave 0.1 of it, parallax 2 to
+# 10 times it
+_TRIED_ROUNDS, _MAX_RESIDUAL = 3, 2.0
+_MAX_ROUNDS = 12  # exposures of 400 rows need more than six
 _SAME_GRADIENTS = 0.05  # px; over smaller distances the gradients of the scene are the same
 
 
 def _large_residual(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Array:
     """(B,) bool, whether the fit leaves a residual that no further round would reduce enough."""
     other = conclude(frames, measured, fit).other_motion
-    return np.any(other.unexplained > _MAX_TRIED * other.permitted, -1)
+    return np.any(other.unexplained > _MAX_RESIDUAL * other.permitted, -1)
 
 
 # Conclusion
@@ -472,10 +472,10 @@ def covariance_of_changes(changes: Array) -> Array:
 
 
 def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFit, tried: Array) -> tuple[Array, Array]:
-    """Frequencies of the strongest tones, that of the less explained axis mirrored at the nearest blind frequency.
+    """Frequencies of the strongest tones, mirrored at the nearest blind frequency on the axis with the larger residual.
 
-    With two frames, tones equally far above and below a blind frequency ``j / (m T_row)`` have the same gain and differ
-    only within a frame.
+    With two frames a time T apart, tones equally far above and below a blind frequency ``j / T`` have the same gain and
+    differ only within a frame.
 
     Args:
         measurements: The measurements of the fit.

@@ -30,6 +30,9 @@ __all__ = [
 ]
 
 
+_START_COLUMNS = 320  # px, columns that give a start of sufficient accuracy
+
+
 def band_curve(
     frames: Tensor,
     valid: Tensor | None,
@@ -37,7 +40,6 @@ def band_curve(
     options: RegistrationOptions,
     *,
     mere_start: bool,
-    start_columns: int = 320,
 ) -> OffsetCurve:
     """Offsets of the row bands of grey frames, NaN for bands with more than half of their pixels missing.
 
@@ -46,14 +48,13 @@ def band_curve(
         valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
         timing: The sensor, in row order.
         options: How the bands are registered.
-        mere_start: Whether the offsets are only the start of a fit to rows. Of wide frames, the ``start_columns``
+        mere_start: Whether the offsets are only the start of a fit to rows. Of wide frames, the 320 columns
             with the most detail are used then, unless a fifth of their bands cannot be registered.
-        start_columns: Columns that give a start of sufficient accuracy.
     """
     check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
     curve = None
-    if mere_start and frames.shape[-1] > start_columns:
-        curve = register_rows(cut_columns(frames, detailed_parts(frames, start_columns)), timing, options)
+    if mere_start and frames.shape[-1] > _START_COLUMNS:
+        curve = register_rows(cut_columns(frames, detailed_parts(frames, _START_COLUMNS)), timing, options)
     if curve is None or float(curve.good.double().mean((1, 2)).amin()) <= 0.8:
         curve = register_rows(frames, timing, options)
     if valid is None:

@@ -34,7 +34,7 @@ __all__ = ["FrameMotion", "frame_motion", "joint_groups", "motion_in_row_order",
 
 @dataclass(frozen=True, eq=False)
 class FrameMotion:
-    """Motion of every frame of a batch of stacks, in row order, relative to the frame's own reference shift.
+    """Motion of every frame of a batch of stacks, in row order.
 
     A restored frame contains the scene at rest, moved by ``shift``: the displacement by the uniform image motion at
     the middle of the frame, rounded to whole pixels. A push-scan frame is thus restored in place. Without image motion
@@ -110,7 +110,7 @@ class FrameMotion:
 
     @cached_property
     def exposures(self) -> tuple[Tensor, Tensor]:
-        """Displacement (B, T, R, N, 2) in px of the rows of the frames at N nodes of their exposures, weights (N,)."""
+        """Displacement (B, T, R, N, 2) in px of all rows at N nodes of their exposures, with the shift; weights (N,)."""
         rows = torch.arange(self.num_rows, dtype=torch.float64, device=self.frame_starts.device)
         starts = self.row_starts(rows).expand(*self.shift.shape[:2], self.num_rows)
         with torch.enable_grad():  # the first use may be an estimate without gradients

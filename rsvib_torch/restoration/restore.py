@@ -76,8 +76,8 @@ class RestorationMethod:
 #     returns: frames at rest, of the same shape and dtype, in the coordinates of ``motion.shift``; (B, 1, C, H, W) for
 #         option ``joint=True``, and (..., S H, S W) for option ``scale=S``, with point (S i, S j) at pixel (i, j).
 #
-# Frames of one stack must not affect other stacks, ``frames`` must not be changed, and gradients must flow to frames
-# and motion. Recipe of a new method: docs/architecture.md.
+# Frames of one stack must not affect other stacks, but for the length to which rows are extended; ``frames`` must not
+# be changed, and gradients must flow to frames and motion. Recipe of a new method: docs/architecture.md.
 METHODS: dict[str, RestorationMethod] = {
     "exact": RestorationMethod(
         restore_exact,
@@ -142,7 +142,7 @@ def restore(
             frame is larger than the frame.
 
     Warns:
-        RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones. If both
+        RestorationWarning: If an axis is not restored, or the restored frames are no better than the raw ones. If all
             axes of a detection are refused, the frames are returned unchanged.
 
     Example:

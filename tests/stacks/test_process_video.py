@@ -268,7 +268,7 @@ def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
         ("restore", shaky, tmp_path / "again.mp4", *CAMERA, *vibration): "its parts are not windows; detect",
         steady: "results exist already",
         (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
-        (*steady, "--overwrite", "--joint", "3"): "--joint cannot be used with --video, which follows the frames one",
+        (*steady, "--overwrite", "--joint", "3"): "method='dewarp' has no option 'joint'",
         (*steady[:-1], "-1", "--overwrite"): "steady must be at least 0, got -1",
     }
     for command, message in wrong.items():

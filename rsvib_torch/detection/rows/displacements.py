@@ -56,6 +56,7 @@ __all__ = [
 ]
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
+_MIN_OVERLAP = 0.5  # part of a frame that all frames of a group contain
 MAX_GROUP_FRAMES = 8  # frames with one mean scene; more lower the noise of that scene by less than 1 / 16
 
 
@@ -158,7 +159,6 @@ def frame_groups(
     motion: Motion,
     *,
     pairs_if_blurred_differently: bool = False,
-    min_overlap: float = 0.5,
 ) -> list[FrameGroup]:
     """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
 
@@ -168,13 +168,12 @@ def frame_groups(
         motion: Motion of each stack (B); an image motion limits how many frames contain the same part of the scene.
         pairs_if_blurred_differently: Form pairs if exposures blur the frames differently, because only the blur of two
             frames can be equalised. Pairs are enough for a tone; a free motion needs all frames that contain a row.
-        min_overlap: Part of the frame that all frames of a group contain.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
     travelled = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     fraction = float((travelled / travelled.new_tensor([spectra.width, spectra.height])).amax())
-    most = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - min_overlap) // max(fraction, 1e-9))))
+    most = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - _MIN_OVERLAP) // max(fraction, 1e-9))))
     if pairs_if_blurred_differently:
         most = 2 if bool(differently_blurred(starts, spectra.height, timing, motion).any()) else most
     number = max(1, math.ceil((count - 1) / (most - 1)))
@@ -612,7 +611,7 @@ def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away
     steps_of_rows = torch.arange(height + 2 * margin, dtype=away.dtype, device=away.device)
     first = positions.scene_rows[..., :1] - margin
     starts = (positions.exposure_starts - positions.rows * timing.row_time)[..., :1]
-    table = _Positions.of_rows(first + steps_of_rows, positions.columns, starts, timing, motion)
+    positions_of_rows = _Positions.of_rows(first + steps_of_rows, positions.columns, starts, timing, motion)
     place = away + (positions.scene_rows - first)[..., None]
     row = place.floor()
     t = place - row
@@ -630,7 +629,7 @@ def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away
         neighbours = torch.stack([values.gather(2, index + step) for step in (-1, 0, 1, 2)])
         return (weights * neighbours.view_as(weights)).sum(0)
 
-    return at(table.rows), at(table.shift)
+    return at(positions_of_rows.rows), at(positions_of_rows.shift)
 
 
 def _warp_to_scene(

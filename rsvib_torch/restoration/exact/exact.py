@@ -1,6 +1,7 @@
 """Exact restoration: all rows of a frame, each with its own PSF, solved together.
 
-Every step treats all stacks of a batch, and all scenes that are restored from them, at a time.
+Every step treats all stacks of a batch at a time. Scenes with the same kind of missing data are solved together,
+as many as memory and threads allow.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -72,7 +73,7 @@ def restore_exact(
         Restored frames of the same shape, or (B, 1, C, H, W); with ``scale=2``, of twice the rows and columns, point
         (2 i, 2 j) at pixel (i, j).
     """
-    # 1. Check the options, and select the frames of each scene.
+    # 1. Check the options, and list the frames of each result.
     factor, scale, prior = options.regularisation, options.scale, options.prior
     check_prior(prior, scale=scale)
     groups = joint_groups(frames.shape[1], options.joint)
@@ -83,7 +84,7 @@ def restore_exact(
         frames, motion, noise=options.noise, ignore=ignore, clipped=clipped, scale=scale, strips=strips
     )
 
-    # 3. Select the frames of each scene, and the strength of its prior by cross-validation.
+    # 3. Build the scenes of all stacks, and select the strength of the prior of each by cross-validation.
     scenes = model.scenes(groups)
     scenes = replace(scenes, strength=factor * model.strengths(scenes))
 

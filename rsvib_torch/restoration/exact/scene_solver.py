@@ -28,7 +28,7 @@ from rsvib_torch.core.banded_solver import (
     solve_halves,
 )
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.core.parallel import allowed_threads, in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
 __all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
@@ -76,7 +76,7 @@ class Partition:
     @staticmethod
     def threads(device: torch.device) -> int:
         """Chunks that are solved side by side; more than two threads wait for each other's calls from Python."""
-        return min(torch.get_num_threads(), 2) if device.type == "cpu" else 1
+        return min(allowed_threads(), 2) if device.type == "cpu" else 1
 
     @staticmethod
     def most_values(rows: int, frequencies: int, device: torch.device, *, blurred: bool, single: bool) -> int:
