@@ -110,7 +110,7 @@ class FrameMotion:
 
     @cached_property
     def exposures(self) -> tuple[Tensor, Tensor]:
-        """Displacement (B, T, R, N, 2) in px of all rows at N nodes of their exposures, with the shift; weights (N,)."""
+        """Displacement (B, T, R, N, 2) in px of all rows at N nodes of exposures, with the shift; and weights (N,)."""
         rows = torch.arange(self.num_rows, dtype=torch.float64, device=self.frame_starts.device)
         starts = self.row_starts(rows).expand(*self.shift.shape[:2], self.num_rows)
         with torch.enable_grad():  # the first use may be an estimate without gradients

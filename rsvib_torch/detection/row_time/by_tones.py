@@ -36,7 +36,7 @@ from rsvib_torch.registration import OffsetCurve
 
 __all__ = ["CameraClock", "RowTimeFit", "bands_of_frames", "row_time_of_tones"]
 
-MAX_STARTS = 5  # row times that are tried; of the first 8 random pairs of scripts/trials/row_time.py, 2 need a second
+MAX_STARTS = 5  # row times that are tried; of 8 random pairs of `benchmark.py --only row_time`, 2 need a second
 
 
 @dataclass(frozen=True)
