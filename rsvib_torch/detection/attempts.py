@@ -101,11 +101,12 @@ def detect_tones(
     result = assembled_attempt(translation, timing, num_frames)
     if not diagnose:
         return result
-    diagnoses = other_timings(stacks, timing, translation)
-    for index, diagnosis in diagnoses.items():
-        # the axes have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong
-        result = result.refused(index, diagnosis.reason)
-    return result
+    # The axes of a stack have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong.
+    reliable, findings = result.reliable.clone(), list(result.findings)
+    for index, diagnosis in other_timings(stacks, timing, translation).items():
+        reliable[index] = False
+        findings[index] = tuple((diagnosis.reason, *of_axis) for of_axis in findings[index])
+    return replace(result, reliable=reliable, findings=tuple(findings))
 
 
 def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> DetectionResult:

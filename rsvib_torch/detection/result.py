@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
-from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -189,13 +188,6 @@ class DetectionResult(
         values["period"] = plain_values(self.vibration.period)
         curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
         return values | curve
-
-    def refused(self, index: int, reason: Reason) -> "DetectionResult":
-        """The results of a batch with a further reason against all axes of one stack."""
-        reliable, findings = self.reliable.clone(), list(self.findings)
-        reliable[index] = False
-        findings[index] = tuple((reason, *of_axis) for of_axis in findings[index])
-        return replace(self, reliable=reliable, findings=tuple(findings))
 
     def with_axes(self, count: int) -> "DetectionResult":
         """The result with the first axes of (x, y, roll, zoom) only."""
