@@ -69,6 +69,7 @@ def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected:
         width: Columns of the frames.
         neglected: As in ``finer_scene``.
     """
+    # 1. The residual and the gradients of the prediction, by the noise of each row, in blocks of rows.
     data, level = problem.data[0], problem.level[0]
     weight, rows = problem.observation.kernels.weight, data.shape[-2]
     inner = slice(min(16, rows // 4), -min(16, rows // 4)), slice(min(16, width // 4), width - min(16, width // 4))
@@ -80,12 +81,14 @@ def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected:
     count = values.shape[-2] // size
     values = values[..., : count * size, :].unflatten(-2, (count, size)).movedim(2, 3).flatten(3)  # (3, M, n, values)
     difference, slopes = values[0], values[1:].movedim(0, -1)
+    # 2. The displacement error of each block, and what noise causes in its square.
     power = difference.square().mean(-1)
     normal = slopes.transpose(-2, -1) @ slopes
     normal.diagonal(dim1=-2, dim2=-1).add_(1e-6 * level.to(torch.float64).square() * difference.shape[-1])
     error = torch.linalg.solve(normal, slopes.transpose(-2, -1) @ difference[..., None])[..., 0]
     chance = power[..., None] * torch.linalg.inv(normal).diagonal(dim1=-2, dim2=-1)
     squares = (error.square() - chance).mean((0, 1)).clamp(min=0.0)
+    # 3. Its effect on the frames, and that of the displacements that the problem neglects.
     steepness = slopes.square().mean((0, 1, 2))
     effect, expected = (squares * steepness).sum().sqrt(), neglected * steepness.amax().sqrt()
     figures = torch.stack([power.mean().sqrt() / level, squares.sum().sqrt(), effect / level, expected / level])
@@ -125,10 +128,12 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
     factor, relaxed, largest = 1.0, torch.ones_like(problem.precision[0, 0]), math.inf
     allowed, noticed = _MAX_EFFECT, False
     for _ in range(_SOLUTIONS):
+        # 1. The scene, and the differences of its frames from their prediction.
         solver = replace(problem, precision=factor / relaxed * problem.precision).solver()
         coefficients = solver.fit(problem.data)
         predicted = solver.predict(coefficients.detach())[0]
         difference, excess = _difference(problem, predicted, width, neglected), _excess(problem, predicted, width)
+        # 2. A pattern at a few frequencies: weaken the prior there, while the residual decreases.
         before, largest = largest, float(excess.amax())
         # a pattern leaves a tenth of its effect, a wrong motion at least a fifth
         allowed = max(_MAX_EFFECT, 0.15 * difference.effect) if before == math.inf else allowed
@@ -136,6 +141,7 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
         if narrow and factor == 1 and _MAX_EXCESS < largest < 0.7 * before:
             relaxed = relaxed * excess.clamp(min=1.0)
             continue
+        # 3. Other differences count as noise, and the prior is weakened nowhere.
         noticed = difference.exceeds(allowed, _MAX_RESIDUAL)
         differs = difference.effect > allowed or difference.residual > _MAX_RESIDUAL
         if not differs or difference.power < 1.2 * factor:

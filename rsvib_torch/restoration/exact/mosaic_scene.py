@@ -173,18 +173,20 @@ def restore_mosaic(
     Returns:
         (B, groups, 3, scale H, scale W).
     """
+    # 1. Check the options, and list the frames of each result.
     height, width = frames.shape[-2:]
     factor, scale = options.regularisation, options.scale
     check_prior(options.prior, scale=scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
     partition = Partition(options.chunk_frequencies, options.segments)
     stated = None if options.noise == "auto" else given_level(options.noise)
-    # displacement of each row during its exposure, and the period that it requires
+    # 2. The displacement of each row during its exposure, and the period that it requires.
     displacement, node_weights = motion.exposures
     length = scene_period(motion, width)
     advance = steps(len(frames) * len(groups), "frames")
     images: list[Tensor] = []
     for stack, mosaic in enumerate(frames):
+        # 3. The colours of a stack, interpolated where they are not measured, and the level of its noise.
         measured = measures(colours[stack])
         linear = interpolated_colours(mosaic, colours[stack])
         floor = None
@@ -196,6 +198,7 @@ def restore_mosaic(
             level = 2 * noise_levels(linear.detach()[None], motion.of([stack])).square().mean().sqrt()
         else:
             level = torch.as_tensor(stated, dtype=frames.dtype, device=frames.device)
+        # 4. The scene of each group of frames; its colours are interpolated first if the frames do not determine them.
         for members, reference in groups:
             shift = motion.shift[stack, members] - motion.shift[stack, reference]
             moved = displacement[stack, members] - motion.shift[stack, reference]
@@ -268,6 +271,7 @@ class _Frames:
             partition: Parts solved at a time.
             scale: Points of the result per pixel.
         """
+        # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
         count, width, level = len(self.images), self.images.shape[-1], self.level
         mean = self.images.mean((0, 2, 3))[:, None, None]
         data = extend_rows(self.images - mean, self.length)
@@ -281,7 +285,7 @@ class _Frames:
             precisions = self._precisions(full - mean, observation, level, strength)
             return MosaicSolver(observation, weights, precisions, partition)
 
-        # Twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
+        # 2. Fit twice, with priors fitted to predicted instead of interpolated colours: 1 to 3 dB for eight frames. The
         # interpolated ones lack detail, so that their prior is too strong: 0.01 instead of 1 gains 2 to 3 dB for eight
         # frames, 1.4 dB for two, 0.1 dB for one (noise 0.002; 0.0 dB at noise 0.01).
         first = solver(0.01 * regularisation)
@@ -300,7 +304,7 @@ class _Frames:
         scene = scene[:, :: SCALE // scale, : SCALE * width : SCALE // scale]
         if gain is None:
             return scene
-        # the points of each pixel are four images, one at a time: less memory
+        # 3. Remove the noise that is left; the points of each pixel are four images, one at a time: less memory.
         points = pixel_unshuffle(scene, scale).unflatten(0, (3, -1)).movedim(1, 0).split(1)
         points = [similar_patches(part, part, None, gain * level, rounds=2, steps=2) for part in points]
         image: Tensor = pixel_shuffle(torch.cat(points).movedim(0, 1).flatten(0, 1), scale)

@@ -51,6 +51,8 @@ def similar_patches(
 
 
 def _round(images: Tensor, values: Tensor, measured: Tensor | None, level: Tensor | float, steps: int) -> Tensor:
+    """Images whose overlapping patches are the means of their posteriors in all groups that contain them."""
+    # 1. All patches, as vectors (N patches, n), and the places of the pattern with the values measured at each.
     count, _, height, width = images.shape
     rows, columns = height - _PATCH + 1, width - _PATCH + 1  # of patches
     period = 1 if measured is None else 2
@@ -63,15 +65,17 @@ def _round(images: Tensor, values: Tensor, measured: Tensor | None, level: Tenso
         known = masks[:period, :period].flatten(0, 1).nonzero()[:, 1].view(period**2, -1)
     first = torch.arange(count, device=images.device) * (rows * columns)
     least = (_LEAST * images.detach().var()).clamp(min=1e-20)  # of constant images 0
+    # 2. The group of each reference patch, and the posterior of its patches; sums over the groups of a patch.
     total, weight = torch.zeros_like(patches), patches.new_zeros(len(patches))
     starts, places = _references(height, images.device), _references(width, images.device)
-    for some in starts.split(max(1, _REFERENCES // (count * len(places)))):
-        group = _similar(images.detach(), some, places, period)
+    for reference_rows in starts.split(max(1, _REFERENCES // (count * len(places)))):
+        group = _similar(images.detach(), reference_rows, places, period)
         group = (group + first[:, None, None, None]).flatten(0, 1)  # (references, phases, patches)
         result = _posterior(patches[group], given[group], known, level, least, steps)
         total = total.index_add(0, group.flatten(), result.flatten(0, -2))
         weight += torch.bincount(group.flatten(), minlength=len(weight))
 
+    # 3. Mean over the groups and over the patches that contain a pixel.
     def joined(parts: Tensor) -> Tensor:
         return functional.fold(parts.unflatten(0, (count, -1)).mT, (height, width), _PATCH)
 
@@ -94,6 +98,7 @@ def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Ten
         places: Their first columns.
         period: Of the pattern; patches of each place in it are chosen separately.
     """
+    # 1. The rows that contain the references, and the same with their surroundings, infinite outside of the image.
     height, width = images.shape[-2:]
     begin, end = int(starts[0]), int(starts[-1]) + _PATCH
     part = images[..., begin:end, :]
@@ -104,18 +109,19 @@ def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Ten
         (_REACH, _REACH, _REACH - above, _REACH - below),
         value=torch.inf,
     )
+    # 2. For each place in the pattern, the distances of the patches at all moves that lead to it, and the nearest ones.
     numbers = []
     for phase in product(range(period), repeat=2):
         moves = [
             move
             for move in product(range(-_REACH, _REACH + 1), repeat=2)
-            if all((m - p) % period == 0 for m, p in zip(move, phase, strict=True))
+            if all((step - place) % period == 0 for step, place in zip(move, phase, strict=True))
         ]
         distances = []
         for down, right in moves:
             top, left = _REACH + down, _REACH + right
-            other = wide[..., top : top + part.shape[-2], left : left + width]
-            difference = (other - part).square().sum(-3)
+            moved = wide[..., top : top + part.shape[-2], left : left + width]
+            difference = (moved - part).square().sum(-3)
             distance = functional.avg_pool2d(difference, _PATCH, stride=1)
             distances.append(distance[..., starts - begin, :][..., places].flatten(1))
         nearest = torch.stack(distances, -1).topk(_GROUP // period**2, dim=-1, largest=False).indices
