@@ -144,18 +144,18 @@ def field_start(
     count = _num_strips(frames.shape[-1])
     parts, columns = cut_into_strips(frames, count)
     valid_parts = None if valid is None else cut_into_strips(valid, count)[0]
-    each = band_curve(parts, valid_parts, timing, options, mere_start=False)
-    rows = (each.rows - 0.5 * (scale.height - 1)).repeat(len(each.pairs))
+    of_strips = band_curve(parts, valid_parts, timing, options, mere_start=False)
+    rows = (of_strips.rows - 0.5 * (scale.height - 1)).repeat(len(of_strips.pairs))
     factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
-    of_parts = measurements_of_curve(each, timing, options.band_step)
+    of_parts = measurements_of_curve(of_strips, timing, options.band_step)
     measurements = combined_strips(of_parts, np.repeat(table(factors)[None], len(frames), 0))
-    shape = each.quality.shape[1:]
+    shape = of_strips.quality.shape[1:]
     good = np.all(measurements.weights > 0, -1)
     offsets = measurements.displacements[:, :, 1] - measurements.displacements[:, :, 0]
     offsets = np.where(good[..., None], offsets, np.nan)
-    quality = each.quality.unflatten(0, (-1, count)).amin(1)
+    quality = of_strips.quality.unflatten(0, (-1, count)).amin(1)
     curve = replace(
-        each,
+        of_strips,
         offsets=torch.from_numpy(split_axis(offsets, 1, *shape)).to(frames.device),
         quality=quality * torch.from_numpy(split_axis(good, 1, *shape)).to(frames.device),
     )

@@ -125,14 +125,16 @@ def row_gradients(
     )
 
     def pixels(part: slice) -> _Rows:
-        own, part_visible = detail[:, part].contiguous(), visible[:, :, part]
-        planes = memory[:, : own.shape[1]]
-        planes[:, :, 0], planes[:, :, 1] = (torch.fft.irfft(one, n=length) for one in (own * along, across[:, part]))
+        of_scene, part_visible = detail[:, part].contiguous(), visible[:, :, part]
+        planes = memory[:, : of_scene.shape[1]]
+        planes[:, :, 0], planes[:, :, 1] = (
+            torch.fft.irfft(one, n=length) for one in (of_scene * along, across[:, part])
+        )
         if factors is not None:
             moved = factors(part).to(planes.dtype)
             by_component = moved[..., 0, :] * planes[:, :, 0, :, None] + moved[..., 1, :] * planes[:, :, 1, :, None]
             planes[:, :, : regressors - 1] = by_component.movedim(-1, 2)
-        for place, one in enumerate((own, *compared.differences[:, :, part].unbind(1)), regressors - 1):
+        for place, one in enumerate((of_scene, *compared.differences[:, :, part].unbind(1)), regressors - 1):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
         weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
@@ -200,12 +202,12 @@ def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) ->
         visible in fewer than two frames or have no detail.
     """
     right = -(torch.cat([products, -products], -1) if visible.shape[1] == 2 else products).permute(0, 3, 1, 2)
-    own = gradients.products
-    detail = own[..., -1, -1]
+    of_scene = gradients.products
+    detail = of_scene[..., -1, -1]
     safe = detail.clamp(min=1e-300)
     usable = (detail > 0) & (gradients.variance > 0)
-    matrix = own[..., :-1, :-1] - own[..., :-1, -1:] * own[..., -1:, :-1] / safe[..., None, None]
-    right = right[..., :-1] - own[:, None, :, :-1, -1] * (right[..., -1:] / safe[:, None, :, None])
+    matrix = of_scene[..., :-1, :-1] - of_scene[..., :-1, -1:] * of_scene[..., -1:, :-1] / safe[..., None, None]
+    right = right[..., :-1] - of_scene[:, None, :, :-1, -1] * (right[..., -1:] / safe[:, None, :, None])
     factor = torch.where(usable, 1 / torch.where(usable, gradients.variance, 1.0), 0.0)
     return matrix * factor[..., None, None], right * factor[:, None, :, None]
 
@@ -284,11 +286,11 @@ def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
         columns = slice(first, end)
         images, weight = weighted[..., columns], rows.weight[..., columns]
         planes = rows.planes[..., columns].transpose(-2, -1)
-        own = sums[:, :, part]
-        own[..., :count, :-1] = torch.matmul(images, planes)
-        own[..., count:, :-1] = torch.matmul(weight[:, :, None], planes)
-        own[..., :count, -1] = own[..., count, :count]
-        own[..., count, -1] = weight.sum(-1)
+        of_part = sums[:, :, part]
+        of_part[..., :count, :-1] = torch.matmul(images, planes)
+        of_part[..., count:, :-1] = torch.matmul(weight[:, :, None], planes)
+        of_part[..., :count, -1] = of_part[..., count, :count]
+        of_part[..., count, -1] = weight.sum(-1)
     return sums
 
 
@@ -352,8 +354,8 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
     images, ones = solution[:, :, None].transpose(-2, -1).split((count, 1), dim=-2)
     right = sums[..., :2, count:-1] - sums[..., :2, :count] @ images - sums[..., :2, -1:] @ ones  # (B, s, parts, 2, G)
     change = right[..., -1] - right[..., 0] if right.shape[-1] > 1 else -2 * right[..., 0]
-    own = torch.stack([sums[..., 0, 0], sums[..., 0, 1], sums[..., 1, 1]], dim=-1)
-    return torch.cat([own, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
+    products = torch.stack([sums[..., 0, 0], sums[..., 0, 1], sums[..., 1, 1]], dim=-1)
+    return torch.cat([products, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
 
 
 @dataclass(frozen=True, eq=False)

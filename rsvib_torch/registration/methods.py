@@ -106,9 +106,9 @@ def _correlate_bands(
     step = 8  # rows of templates per product: in products of more, most row pairs belong to no lag
     for top in range(0, height, step):
         rows = template[:, top : top + step]
-        own = search[:, top : top + rows.shape[1] + lags_y - 1]
+        searched = search[:, top : top + rows.shape[1] + lags_y - 1]
         for lag in range(lags_x):
-            product = rows @ own[..., lag : lag + width].transpose(-2, -1)  # (M, h, h + 2 reach)
+            product = rows @ searched[..., lag : lag + width].transpose(-2, -1)  # (M, h, h + 2 reach)
             diagonals = product.as_strided(
                 (len(product), rows.shape[1], lags_y), (product.stride(0), product.stride(1) + 1, 1)
             )

@@ -250,9 +250,9 @@ def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
     pitch, yaw, roll = (part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T).unbind(-1)
     focal_length = float(parameters[5])
     moved = torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
-    own = (part.times - parameters[3]) / parameters[4] + model.middle
+    recorded_times = (part.times - parameters[3]) / parameters[4] + model.middle
     camera = replace(model.camera, focal_length=focal_length)
-    return FreeMotion.from_samples(own, moved, spacing=float(own.diff().median()), camera=camera)
+    return FreeMotion.from_samples(recorded_times, moved, spacing=float(recorded_times.diff().median()), camera=camera)
 
 
 def _reasons(

@@ -104,10 +104,10 @@ def search_orientations(
     for part in grid.split(64):
         turned = rates.rotation(part[:, None] + first, part[:, None] + last)
         for axis in range(3):
-            own = weights[:, axis : axis + 1].expand(-1, 3)
-            rest = without_drift(turned, own)
-            products.append((own * moved[:, axis, None] * rest).sum(-2))
-            squares.append((own * rest.square()).sum(-2))
+            of_axis = weights[:, axis : axis + 1].expand(-1, 3)
+            rest = without_drift(turned, of_axis)
+            products.append((of_axis * moved[:, axis, None] * rest).sum(-2))
+            squares.append((of_axis * rest.square()).sum(-2))
     # (offset, component, axis of the gyroscope)
     product, square = (
         torch.cat([torch.stack(values[at : at + 3], 1) for at in range(0, len(values), 3)])

@@ -143,10 +143,12 @@ class _Problem:
             solution = torch.cholesky_solve((columns.mT @ values)[:, None], factor)[:, 0]
             residual = values - columns @ solution
             by_row_time = (root * record.relative((slope @ solution) * record.rows)).flatten()
-            own = by_row_time - columns @ torch.cholesky_solve((columns.mT @ by_row_time)[:, None], factor)[:, 0]
+            unexplained = (
+                by_row_time - columns @ torch.cholesky_solve((columns.mT @ by_row_time)[:, None], factor)[:, 0]
+            )
             cost += float(residual.square().sum()) * float(record.independent)
-            step += float(own @ residual) * float(record.independent)
-            information += float(own @ own) * float(record.independent)
+            step += float(unexplained @ residual) * float(record.independent)
+            information += float(unexplained @ unexplained) * float(record.independent)
         information = max(information, 1e-300)
         return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
 

@@ -267,8 +267,8 @@ def measure_strips(
     positions = _Positions.of(group, timing, of_strips)
 
     def over_strips(values: Tensor) -> Tensor:
-        each: Tensor = values.unflatten(0, (-1, count))
-        return each
+        split: Tensor = values.unflatten(0, (-1, count))
+        return split
 
     visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
     warp = _warp_to_scene(spectra, positions, timing, of_strips)

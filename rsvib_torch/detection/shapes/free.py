@@ -587,7 +587,7 @@ def _report(
 
     def variance(of: Tensor) -> Tensor:
         """Variances (S, 2) of linear functions (S, N) of the coefficients of each axis."""
-        return torch.stack([((of @ own) * of).sum(-1).clamp(min=0.0) for own in fit.covariance], -1)
+        return torch.stack([((of @ covariance) * of).sum(-1).clamp(min=0.0) for covariance in fit.covariance], -1)
 
     std = variance(columns - mean).sqrt().unflatten(0, times.shape)
     std_seen = variance(visible).mean(0).sqrt()

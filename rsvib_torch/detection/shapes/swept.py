@@ -330,14 +330,14 @@ def _start(measured: Measurements, axis: int, record: tuple[float, float], highe
     chosen: list[int] = []
     order = torch.cat(gains).argsort(descending=True).tolist()
     for decay in sorted({entry[3] for entry in grid}):
-        alike: list[int] = []
+        of_decay: list[int] = []
         for place in order:
-            if len(alike) == 4:
+            if len(of_decay) == 4:
                 break
-            apart = all(abs(grid[place][2] - grid[other][2]) > 0.6 / span for other in alike)
+            apart = all(abs(grid[place][2] - grid[other][2]) > 0.6 / span for other in of_decay)
             if grid[place][3] == decay and apart:
-                alike.append(place)
-        chosen += alike
+                of_decay.append(place)
+        chosen += of_decay
     return _settle(measured, axis, record, fits[chosen])[0]
 
 
@@ -369,8 +369,8 @@ def _settle(
 
     def averaged(function: Callable[[Tensor, Tensor], Tensor], at: Tensor) -> Tensor:
         """(S, N, G, P) relative means over exposures of a function (N, G, S, P) of times and parameters."""
-        each = [share * function((first + duration * node)[..., None], at) for node, share in quadrature]
-        relative: Tensor = _relative(measured, torch.stack(each).sum(0).flatten(2)).unflatten(-1, (len(at), -1))
+        at_nodes = [share * function((first + duration * node)[..., None], at) for node, share in quadrature]
+        relative: Tensor = _relative(measured, torch.stack(at_nodes).sum(0).flatten(2)).unflatten(-1, (len(at), -1))
         return relative.movedim(2, 0)
 
     def residual_of(at: Tensor) -> Tensor:

@@ -244,8 +244,8 @@ class FrameModel:
         chosen: list[int] = []
         representative = []
         for number, stack in enumerate(scenes.stack // self.strips):
-            alike = (one for one in chosen if scenes.stack[one] // self.strips == stack)
-            found = next((one for one in alike if abs(noise[one] - noise[number]) < 0.2), number)
+            of_frames = (one for one in chosen if scenes.stack[one] // self.strips == stack)
+            found = next((one for one in of_frames if abs(noise[one] - noise[number]) < 0.2), number)
             chosen += [found] if found == number else []
             representative.append(found)
         # cross-validation of as many scenes at a time as the memory allows
