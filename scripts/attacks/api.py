@@ -150,7 +150,14 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     # values of the parameters of all functions and methods, by name
     pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **bands}
     pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info, "manifest": manifest}
-    pool |= {"detected": detected, "result": detected, "restored": restored, "figure": figure, "psf": psf}
+    pool |= {
+        "detected": detected,
+        "detection": detected,
+        "result": detected,
+        "restored": restored,
+        "figure": figure,
+        "psf": psf,
+    }
     pool |= {"scene": scene, "noise": sensor_noise, "image": image, "reference": image, "roi": edge, "rim": 4}
     pool |= {"data_range": 1.0, "raw": frames[0], "measured": path, "truth": path * 0.9, "curves": {"raw": [curve]}}
     pool |= {"times": times, "starts": times, "later_starts": times + 0.01, "start": times, "end": times + 0.01}
