@@ -49,17 +49,6 @@ class TimingDiagnosis:
     agreeing: float | str
     timing: SensorTiming
 
-    @classmethod
-    def between(cls, stated: SensorTiming, agreeing: SensorTiming) -> "TimingDiagnosis":
-        """The setting in which two timings differ; another row time also changes what is counted in rows."""
-        if stated.readout_direction != agreeing.readout_direction:
-            return cls("readout_direction", stated.readout_direction, agreeing.readout_direction, agreeing)
-        if stated.scan_axis != agreeing.scan_axis:
-            return cls("scan_axis", *(("y", "x") if stated.scan_axis == -2 else ("x", "y")), agreeing)
-        if stated.row_time != agreeing.row_time:
-            return cls("row_time", stated.row_time, agreeing.row_time, agreeing)
-        return cls("frame_rows", stated.frame_rows, agreeing.frame_rows, agreeing)
-
     @property
     def reason(self) -> Reason:
         """The reason against all axes of a detection with the stated value."""
@@ -189,8 +178,20 @@ def _diagnosis(
         concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
         refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))
         if other.statuses[0] != "abandoned" and not refused:
-            return TimingDiagnosis.between(timing, candidate)
+            return _between(timing, candidate)
     return None
+
+
+def _between(stated: SensorTiming, agreeing: SensorTiming) -> TimingDiagnosis:
+    """The setting in which two timings differ; another row time also changes what is counted in rows."""
+    if stated.readout_direction != agreeing.readout_direction:
+        return TimingDiagnosis("readout_direction", stated.readout_direction, agreeing.readout_direction, agreeing)
+    if stated.scan_axis != agreeing.scan_axis:
+        axes = ("y", "x") if stated.scan_axis == -2 else ("x", "y")
+        return TimingDiagnosis("scan_axis", *axes, agreeing)
+    if stated.row_time != agreeing.row_time:
+        return TimingDiagnosis("row_time", stated.row_time, agreeing.row_time, agreeing)
+    return TimingDiagnosis("frame_rows", stated.frame_rows, agreeing.frame_rows, agreeing)
 
 
 # Frame period
