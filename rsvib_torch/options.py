@@ -49,7 +49,7 @@ StmapConvention = Literal["nuke", "opencv"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 COMMAND_LINE: Any = {"command_line": True}  # mark of fields that are options of commands as well
-MAX_TONES = 4  # tones of one axis; more are not told apart in a record of a few frames
+MAX_TONES = 4  # tones of one axis; a record of a few frames does not resolve more
 MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
 
 

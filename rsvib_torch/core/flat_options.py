@@ -23,8 +23,8 @@ def flat_options(
         function: Function or method with the keyword argument ``options``.
         build: What makes the options of keyword arguments, if it is not the group.
     """
-    own = inspect.signature(function).parameters
-    names = own.keys() - {"options"}
+    parameters = inspect.signature(function).parameters
+    names = parameters.keys() - {"options"}
 
     @wraps(function)
     def flat(*args: Any, **given: Any) -> Any:
@@ -32,7 +32,7 @@ def flat_options(
         return function(*args, **direct, options=(build or group)(**given))
 
     flat.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [parameter for name, parameter in own.items() if name != "options"]
+        [parameter for name, parameter in parameters.items() if name != "options"]
         + [
             inspect.Parameter(
                 name,

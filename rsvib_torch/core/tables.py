@@ -106,7 +106,7 @@ def take_stacks(parts: Sequence[Stacks], index: Array) -> Stacks:
     for field in fields(parts[0]):
         values = [getattr(part, field.name) for part in parts]
         if isinstance(values[0], np.ndarray):
-            taken[field.name] = np.concatenate(values)[index]
+            taken[field.name] = (np.concatenate(values) if len(values) > 1 else values[0])[index]
         elif is_dataclass(values[0]):
             taken[field.name] = take_stacks(values, index)
     return replace(parts[0], **taken)

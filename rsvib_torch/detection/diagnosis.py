@@ -8,14 +8,13 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import Literal
 
 import numpy as np
 
 from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.tables import Array, split_axis, table
+from rsvib_torch.core.tables import Array, split_axis, table, take_stacks
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -147,7 +146,7 @@ def _diagnosis(
     # 1. The candidates, each with the frequencies of one tone of each axis if they are known. The rows of a frame and
     # the phase from frame to frame agree with one period of the frames.
     candidates: list[tuple[SensorTiming, Array | None]] = []
-    measurements = found.fitted.measurements.mapped(itemgetter(only))
+    measurements = take_stacks([found.fitted.measurements], np.array([index]))
     agreeing = None
     if num_frames > 2:
         agreeing = period_factor(measurements, timing.in_row_order(), num_frames, BLOCK_ROWS)

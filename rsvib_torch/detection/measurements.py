@@ -4,14 +4,13 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, median, valid_mean, without_nan
+from rsvib_torch.core.tables import Array, median, take_stacks, valid_mean, without_nan
 
 __all__ = ["Measurements", "OtherMotion", "cholesky_root", "trimmed_mean"]
 
@@ -151,18 +150,7 @@ class Measurements:
 
     def repeated(self, count: int) -> "Measurements":
         """Every stack ``count`` times in a row."""
-        return self.mapped(lambda values: np.repeat(values, count, 0))
-
-    def mapped(self, function: Callable[[Array], Array]) -> "Measurements":
-        """The measurements with a function of the stacks, their first axis, applied to all arrays."""
-        return replace(
-            self,
-            exposure_starts=function(self.exposure_starts),
-            displacements=function(self.displacements),
-            visible=function(self.visible),
-            information=function(self.information),
-            independent=function(self.independent) if isinstance(self.independent, np.ndarray) else self.independent,
-        )
+        return take_stacks([self], np.arange(len(self.exposure_starts)).repeat(count))
 
     def thinned(self, every: int) -> "Measurements":
         """Every n-th row."""

@@ -33,13 +33,13 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
     with_unknown_errors,
 )
-from rsvib_torch.detection.tones.selection import MAX_TONES, find_tones, robust_fit
+from rsvib_torch.detection.tones.selection import find_tones, robust_fit
 from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
 from rsvib_torch.detection.verdict import BandOffsets, Findings, judged
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
-from rsvib_torch.options import DetectionMethod, RegistrationOptions
+from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
 __all__ = ["METHODS", "Attempt", "DetectionOptions", "Hypothesis", "Method", "Status", "attempt"]

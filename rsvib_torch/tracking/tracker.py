@@ -45,7 +45,7 @@ from rsvib_torch.detection.tones.fit import (
     tone_displacements,
     vibration_of_fit,
 )
-from rsvib_torch.detection.tones.selection import MAX_TONES, MIN_SIGNIFICANCE
+from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
 from rsvib_torch.detection.verdict import contradicted_axes, judged
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
@@ -54,7 +54,7 @@ from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.timing import SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.options import DetectionMethod, RegistrationOptions, TrackerOptions
+from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions, TrackerOptions
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra

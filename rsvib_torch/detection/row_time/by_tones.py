@@ -27,11 +27,11 @@ from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, motion_of_fit, residual_of, shrunk
-from rsvib_torch.detection.tones.selection import MAX_TONES, robust_fit
+from rsvib_torch.detection.tones.selection import robust_fit
 from rsvib_torch.detection.verdict import residual_reasons
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.options import RegistrationOptions
+from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
 __all__ = ["CameraClock", "RowTimeFit", "bands_of_frames", "row_time_of_tones"]

@@ -20,6 +20,7 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
+from rsvib_torch.core.tables import take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import (
     FILLED_BLUR_REACH,
@@ -40,6 +41,8 @@ from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness
 __all__ = ["FrameModel", "Scenes", "given_level", "model_frames", "restore_exact", "scene_period", "solve_scenes"]
 
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
+# values of frames of scenes that are treated at a time, beside the systems: 64 MB and 1 GB
+_VALUES_AT_A_TIME = {"cpu": 1 << 24, "cuda": 1 << 28}
 
 
 def restore_exact(
@@ -132,16 +135,6 @@ class Scenes:
     reference: NDArray[np.int64]
     contributes: NDArray[np.bool_]
     strength: NDArray[np.float64]
-
-    def of(self, numbers: list[int]) -> "Scenes":
-        """Some of the scenes."""
-        return Scenes(
-            self.stack[numbers],
-            self.members[numbers],
-            self.reference[numbers],
-            self.contributes[numbers],
-            self.strength[numbers],
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +244,8 @@ class FrameModel:
         # cross-validation of as many scenes at a time as the memory allows
         values = self.frames[0, 0].numel() * scenes.members.shape[1]
         strengths = np.ones(len(scenes.stack))
-        for part in runs(len(chosen), max(1, _SAMPLED.get(self.frames.device.type, 1 << 23) // values)):
-            some = scenes.of(chosen[part])
+        for part in runs(len(chosen), max(1, _VALUES_AT_A_TIME.get(self.frames.device.type, 1 << 24) // values)):
+            some = take_stacks([scenes], np.array(chosen[part]))
             stack_of, member_of = self._indices(some)
             strengths[chosen[part]] = prior_strengths(
                 self.frames.detach()[stack_of, member_of],
@@ -346,7 +339,7 @@ def model_frames(
         )
         powers = measured.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
-        powers = frames.new_full((B, T), given_level(noise) ** 2)
+        powers = frames.new_full((B, T), noise**2)
     powers = powers.clamp(min=_MIN_LEVEL**2)
     frame_weights = powers.reciprocal()
     unit_variance = frame_weights.mean(1).reciprocal()
@@ -376,10 +369,6 @@ def model_frames(
     )
 
 
-# values of frames of scenes that are treated at a time, beside the systems: 64 MB and 1 GB
-_SAMPLED = {"cpu": 1 << 24, "cuda": 1 << 28}
-
-
 def solve_scenes(
     model: FrameModel, scenes: Scenes, prior: Prior, regularisation: float, partition: Partition
 ) -> tuple[Tensor, list[FrameDifference]]:
@@ -407,7 +396,7 @@ def solve_scenes(
     def solve(block: tuple[str, list[int]], partition: Partition) -> None:
         """Solve the scenes of a block."""
         kind, numbers = block
-        some = scenes.of(numbers)
+        some = take_stacks([scenes], np.array(numbers))
         problem = model.problem(some, kind, partition)
         if model.scale == 1:
             deviations = prior.function(problem, regularisation)
@@ -445,7 +434,7 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
     most = Partition.most_values(rows, frequencies, device, blurred=False, single=False) // systems
     data = scenes.members.shape[1] * model.frames.shape[2] * height * model.period
-    most = max(1, min(most, _SAMPLED.get(device.type, 1 << 24) // data))
+    most = max(1, min(most, _VALUES_AT_A_TIME.get(device.type, 1 << 24) // data))
     threads = Partition.threads(device)
     return [
         (kind, numbers[part])
