@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-__all__ = ["gathered", "runs"]
+__all__ = ["at_once", "chunks", "gathered", "runs"]
 
 
 def runs(count: int, size: int) -> list[slice]:
@@ -16,6 +16,19 @@ def runs(count: int, size: int) -> list[slice]:
         [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
     """
     return [slice(first, min(first + size, count)) for first in range(0, count, size)]
+
+
+def at_once(bytes_per_item: int, device: torch.device, *, cpu_bytes: int = 2**23) -> int:
+    """Number of items to process at a time: those of ``cpu_bytes``, which stay in the cache of a CPU.
+
+    On other devices those of 1 GiB, which limits the memory. At least 1.
+    """
+    return max(1, (cpu_bytes if device.type == "cpu" else 2**30) // bytes_per_item)
+
+
+def chunks(count: int, bytes_per_item: int, device: torch.device, *, multiple: int = 1) -> list[slice]:
+    """Slices of consecutive items, a multiple of ``multiple`` each, to be processed at a time, see ``at_once``."""
+    return runs(count, at_once(bytes_per_item * multiple, device) * multiple)
 
 
 def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Tensor:

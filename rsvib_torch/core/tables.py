@@ -88,6 +88,24 @@ def tensor(values: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
+_MANY = 2048  # values; PyTorch is faster beyond
+
+
+def cos_sin(angle: Array) -> tuple[Array, Array]:
+    """Cosine and sine of float64 angles in rad; PyTorch takes a third of the time of NumPy for many, 5 us for one."""
+    if angle.size < _MANY:
+        return np.cos(angle), np.sin(angle)
+    values = torch.from_numpy(angle)
+    return values.cos().numpy(), values.sin().numpy()
+
+
+def unit_wave(angle: Array) -> Array:
+    """``exp(i angle)`` of float64 angles in rad."""
+    wave: Array = np.empty(angle.shape, np.complex128)
+    wave.real, wave.imag = cos_sin(angle)
+    return wave
+
+
 def tables(*values: Tensor) -> list[Array]:
     """Tensors as arrays on the CPU, by one transfer; those of a GPU become float64."""
     if values[0].device.type == "cpu":

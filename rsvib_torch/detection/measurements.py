@@ -176,10 +176,10 @@ class Measurements:
 
     def relative(self, values: Array) -> Array:
         """Values (B, N, G, ...) less their mean over the frames that contain the row; 0 in the other frames."""
-        ones = (1,) * (values.ndim - 3)
-        visible = self.visible.reshape(*self.visible.shape, *ones)
-        mean = (self._mean_weights.reshape(visible.shape) * values).sum(2, keepdims=True)
-        return visible * (values - mean)
+        mean = np.einsum("bng,bng...->bn...", self._mean_weights, values)  # over the frames g
+        relative: Array = values - mean[:, :, None]
+        relative *= self.visible.reshape(*self.visible.shape, *(1,) * (values.ndim - 3))
+        return relative
 
     # Residuals of a fit, (B, N, G, 2) px
 

@@ -300,7 +300,7 @@ def fit_directly(
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
             again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)
-    group_frames = [group.starts.shape[1] for group in refined.frames.groups]
+    group_frames = [group.size for group in refined.frames.groups for _ in range(group.count)]
     device = stacks.images.device
     offsets, predicted = offset_curve(refined.measurements, refined.fit, refined.robust_weights, group_frames, device)
     return Fitted(refined.fit, refined.measurements, offsets, predicted, refined)

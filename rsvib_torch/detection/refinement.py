@@ -18,7 +18,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rsvib_torch.core.tables import Array, median, select_stacks, table, take_stacks, valid_mean, without_nan
@@ -422,7 +421,7 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
         fit,
         other,
         robust_weights=weighted.weights / np.maximum(measurements.weights, 1e-300),
-        aliasing=table(torch.stack([gradients.aliasing for gradients in measured.gradients]).mean(0)),
+        aliasing=measured.aliasing(),
         uneven=measured.uneven(),
         frames=frames,
         has_pattern=False,

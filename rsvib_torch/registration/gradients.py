@@ -26,18 +26,26 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.chunking import chunks
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.registration.row_spectra import (
-    chunks,
     combined,
     differences,
     inner_columns,
     mean_over_frames,
 )
 
-__all__ = ["FrameComparison", "RowGradients", "residual_products", "row_equations", "row_gradients", "scene_detail"]
+__all__ = [
+    "BLOCK",
+    "FrameComparison",
+    "RowGradients",
+    "residual_products",
+    "row_equations",
+    "row_gradients",
+    "scene_detail",
+]
 
-_BLOCK = 16  # px, side of the blocks of pixels that share a weight
+BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
 # of the bias if A(u) was constant. Three drawn scenes behind optics of 0.3 and 0.4 px had biases of 6e-3 and 2.4e-3 px,
 # and 4e-2 and 2.5e-2 px with a constant A
@@ -118,7 +126,7 @@ def row_gradients(
     along = (2j * math.pi * spectra.frequencies).to(detail.dtype)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
-    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), _BLOCK, rows.device)
+    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), rows.device, multiple=BLOCK)
     regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
     memory = inner.new_empty(
         len(rows), parts[0].stop, regressors + (1 if rows.shape[1] == 2 else rows.shape[1]), length
@@ -151,10 +159,10 @@ def row_gradients(
     block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
     reweighted = (block_weight < 1).any(-1).any(0).tolist()
     for place, part in enumerate(parts):  # the fit is repeated where blocks lost weight
-        within = slice(part.start // _BLOCK, -(-part.stop // _BLOCK))
+        within = slice(part.start // BLOCK, -(-part.stop // BLOCK))
         if any(reweighted[within]):
             some = pixels(part)
-            spread = block_weight[:, within].repeat_interleave(_BLOCK, 1).repeat_interleave(_BLOCK, 2)
+            spread = block_weight[:, within].repeat_interleave(BLOCK, 1).repeat_interleave(BLOCK, 2)
             weight = some.weight * spread[:, : some.weight.shape[1], :length]
             fits[place], _ = _fit_rows(replace(some, weight=weight), edges, images[:, part])
     sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
@@ -317,10 +325,10 @@ def _solve(products: Tensor, right: Tensor) -> Tensor:
 def _sum_of_blocks(values: Tensor) -> Tensor:
     """Sums (B, N, M) over blocks of values (B, s, L); the last ones of either axis may be smaller."""
     rows, columns = values.shape[1:]
-    if -rows % _BLOCK:
-        values = functional.pad(values, (0, 0, 0, -rows % _BLOCK))
-    strips = values.unflatten(1, (-1, _BLOCK)).sum(2)
-    sums: Tensor = functional.pad(strips, (0, -columns % _BLOCK)).unflatten(2, (-1, _BLOCK)).sum(3)
+    if -rows % BLOCK:
+        values = functional.pad(values, (0, 0, 0, -rows % BLOCK))
+    strips = values.unflatten(1, (-1, BLOCK)).sum(2)
+    sums: Tensor = functional.pad(strips, (0, -columns % BLOCK)).unflatten(2, (-1, BLOCK)).sum(3)
     return sums
 
 
@@ -488,7 +496,7 @@ def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
     """Mean power (B, U / frequencies, S / 16) of blocks of a spectrum (B, U, S), up to a factor."""
     parts = torch.view_as_real(spectrum).flatten(-2)
     blocks = []
-    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), frequencies, parts.device):
+    for part in chunks(parts.shape[1], 4 * parts.shape[2] * len(parts), parts.device, multiple=frequencies):
         power = parts[:, part].square()
         whole = power.shape[1] // frequencies * frequencies
         blocks.append(power[:, :whole].unflatten(1, (-1, frequencies)).mean(2))

@@ -34,8 +34,7 @@ def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
 
     The contract is that of ``BAND_METHODS``.
     """
-    width = task.width // BINNING
-    factor = BINNING if width >= 64 else 1
+    factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
     reach = -(-task.search // factor)
     width = task.width // factor
     binned = [

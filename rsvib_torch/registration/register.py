@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, chunks
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
@@ -191,7 +191,8 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
     tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
-    parts = runs(num_frames - 1, max(1, 64 // batch))  # pairs; they need 5 MB each
+    # Pairs at a time: their transforms (2.5 MB each), and below their windows, stay in the cache of a CPU.
+    parts = chunks(num_frames - 1, batch * 2**21, grey.device)
     coarse = torch.cat([_coarse_offsets(grey[:, pair.start : pair.stop + 1]) for pair in parts], 1).flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
     # Templates are as wide as the least overlap of pairs that are registered together: pairs of similar overlap are,
@@ -199,11 +200,12 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     overlap = width - coarse[:, 0].abs() - 2 * template_margin(search)
     coarse = torch.where((overlap < search)[:, None], 0, coarse)
     quarter = 4 * coarse[:, 0].abs() // width
-    at_once = max(1, 2**27 // bytes_of_pair)  # pairs; 128 MiB of windows, because 256 MiB take a fifth longer
+    # 16 MiB of windows on a CPU; 128 MiB take 2.3 times as long
+    together = at_once(bytes_of_pair, grey.device, cpu_bytes=2**24)
     offsets = grey.new_full((len(first), len(tops), 2), torch.nan, dtype=torch.float64)
     quality = offsets.new_zeros(offsets.shape[:2])
     advance = steps(len(first), "pairs")
-    for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(at_once)]:
+    for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(together)]:
         task = BandTask(first[pairs], second[pairs], coarse[pairs], tops, band_rows, search)
         measured, correlation = BAND_METHODS[options.registration](task)
         good = (correlation > 0.1) & (overlap[pairs, None] >= search)  # chance reaches correlations of 0.1

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import gathered, runs
+from rsvib_torch.core.chunking import chunks, gathered
 from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases, squared_modulus
 from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
 
@@ -19,25 +19,16 @@ __all__ = [
     "EVERY",
     "MARGIN",
     "RowSpectra",
-    "chunks",
     "column_pattern",
     "combined",
     "differences",
     "inner_columns",
     "mean_over_frames",
+    "overlapping",
 ]
 
 DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
 MARGIN = 8  # px; rows and columns this close to an edge have no weight: they are interpolated from extended values
-
-
-def chunks(count: int, bytes_per_item: int, multiple: int, device: torch.device) -> list[slice]:
-    """Slices of consecutive rows or columns, a multiple of ``multiple`` each, to be processed at a time.
-
-    On a CPU a chunk fills 8 MiB, which stay in its cache; elsewhere 1 GiB, which limits the memory.
-    """
-    limit = 2**23 if device.type == "cpu" else 2**30
-    return runs(count, max(1, limit // (bytes_per_item * multiple)) * multiple)
 
 
 class RowSpectra:
@@ -84,6 +75,18 @@ class RowSpectra:
         part = copy(self)
         part.values, part._first_rows = self.values[:, frames], self._first_rows[:, frames]
         part.valid = None if self.valid is None else self.valid[:, frames]
+        return part
+
+    def in_groups(self, count: int) -> "RowSpectra":
+        """Spectra (B M, G) of M = ``count`` groups of the frames of each stack, see ``overlapping``.
+
+        ``values`` stay those of the frames.
+        """
+        if count == 1:
+            return self
+        part = copy(self)
+        part._first_rows = overlapping(self._first_rows, count)
+        part.valid = None if self.valid is None else overlapping(self.valid, count)
         return part
 
     def stacks(self, index: Tensor) -> "RowSpectra":
@@ -134,8 +137,9 @@ class RowSpectra:
 
     def runs(self, count: int, arrays: int) -> list[slice]:
         """Runs of ``count`` rows for computations that hold ``arrays`` arrays of the size of these spectra."""
-        row = self.values[:, :, 0]
-        return chunks(count, arrays * row.element_size() * row.numel(), 1, row.device)
+        row = self.values[0, 0, 0]
+        bytes_of_row = row.element_size() * row.numel() * self._first_rows.numel()  # of all frames
+        return chunks(count, arrays * bytes_of_row, row.device)
 
     def ramp(self, shift: Tensor) -> Tensor:
         """exp(2 pi i u shift) for all frequencies u, (..., U)."""
@@ -160,6 +164,18 @@ class RowSpectra:
             column = (columns + shift[:, frame, :, None].round().to(torch.int64)).clamp(0, self.width - 1)
             result = result & rows_of_frame.gather(2, column)
         return result
+
+
+def overlapping(values: Tensor, count: int) -> Tensor:
+    """Values (B, F, ...) of frames in ``count`` groups (B M, G, ...), the last frame of each the first of the next.
+
+    Example:
+        >>> overlapping(torch.arange(5)[None], 2).tolist()
+        [[0, 1, 2], [2, 3, 4]]
+    """
+    step = (values.shape[1] - 1) // count
+    groups: Tensor = values.unfold(1, step + 1, step)
+    return groups.movedim(-1, 2).flatten(0, 1)
 
 
 def combined(spectra: Tensor, factors: Tensor) -> Tensor:
@@ -219,9 +235,9 @@ def column_pattern(groups: list[_Group]) -> Tensor | None:
     ``p(u) = sum conj(r) d / sum |r|^2``.
 
     Args:
-        groups: Spectra of each group of frames with the rows, shifts and visibility (B, G, S each) that warp some of
-            its rows, and the residual variance (B, S) of these rows. Rows whose variance exceeds three times the
-            median (objects that move by themselves) are left out.
+        groups: Spectra of groups of frames, M of each stack, with the rows, shifts and visibility (B M, G, S each) that
+            warp some of their rows, and the residual variance (B M, S) of these rows. Rows whose variance exceeds three
+            times the median (objects that move by themselves) are left out.
 
     Returns:
         (B, U) spectrum of the pattern, shrunk by its noise; None if none is significant, or if it is too weak to bias
@@ -234,6 +250,13 @@ def column_pattern(groups: list[_Group]) -> Tensor | None:
 def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
     """``column_pattern`` from every ``step``-th row."""
     correlation, power, energy, count = (torch.zeros((), dtype=torch.float32, device="cpu") for _ in range(4))
+    stacks = len(groups[0][0].values)
+
+    def of_stacks(values: Tensor) -> Tensor:
+        """Sums (B, ...) over the groups of each stack of values (B M, ...)."""
+        total: Tensor = values.unflatten(0, (stacks, -1)).sum(1)
+        return total
+
     for spectra, *places in groups:
         rows, shift, visible, variance = (values[..., ::step] for values in places)
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
@@ -246,10 +269,10 @@ def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
             pixels = torch.fft.irfft(differences(warped, visible[..., run]), n=spectra.length)
             difference = torch.fft.rfft(pixels[..., : spectra.width] * inner, n=spectra.length)
             regressor = differences(ramp, visible[..., run])
-            correlation = correlation + (regressor.conj() * difference).sum((1, 2))
-            power = power + squared_modulus(regressor).sum((1, 2))
-            energy = energy + squared_modulus(difference).sum((1, 2))
-        count = count + (visible.sum((1, 2)) - (visible.sum(1) > 0).sum(-1)).to(energy.dtype)[:, None]
+            correlation = correlation + of_stacks((regressor.conj() * difference).sum((1, 2)))
+            power = power + of_stacks(squared_modulus(regressor).sum((1, 2)))
+            energy = energy + of_stacks(squared_modulus(difference).sum((1, 2)))
+        count = count + of_stacks(visible.sum((1, 2)) - (visible.sum(1) > 0).sum(-1)).to(energy.dtype)[:, None]
     pattern = correlation / power.clamp(min=1e-6)
     # power of the pattern over that of its noise, a mean over 17 neighbouring frequencies; 3 is beyond chance
     strength = pattern.abs().square() * power / (energy / count.clamp(min=1.0)).clamp(min=1e-30)

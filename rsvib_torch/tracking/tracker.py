@@ -28,7 +28,7 @@ from rsvib_torch.core.tables import Array, table, tables, tensor
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import (
-    FrameGroup,
+    FrameGroups,
     differential_motion,
     joined_groups,
     measure_group,
@@ -289,7 +289,7 @@ class VibrationTracker:
         # share a frame: after many pairs, the variance of a tone is gain^2 / 2 times that of independent offsets.
         spectra = frame.spectra(track.columns)
         starts, device = np.array([track.start, frame.time]) - centre, frame.images.device
-        group = FrameGroup(track.spectra.followed_by(spectra), tensor(starts)[None].to(device))
+        group = FrameGroups(track.spectra.followed_by(spectra), tensor(starts)[None].to(device))
         gain = offset_gain(fit.frequencies, np.diff(starts))[0] * fit.active[0]
         noise_factor = np.maximum(0.5 * np.square(gain.max(-1)), 1.0)
         for _ in range(_MAX_ROUNDS):
@@ -306,7 +306,7 @@ class VibrationTracker:
             if largest < _MAX_CHANGE:
                 break
             fit, path, scene = corrected.as_fit(centre), state.path - corrected.path(-step), None
-        scene = scene or _Scene(gradients, differential_motion([gradients]), path)
+        scene = scene or _Scene(gradients, differential_motion([gradients], 1), path)
         scene = replace(scene, age=scene.age + 1)
         state = replace(state, path=state.path - corrected.path(-step))
 

@@ -5,8 +5,14 @@ import pytest
 import torch
 from truth import Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch import SensorTiming, Vibration, simulate_frames
+from rsvib_torch.detection.rows.displacements import (
+    differential_motion,
+    frame_groups,
+    measure_groups,
+    stack_spectra,
+    uneven_motion,
+)
 
 MOTION = Motion((3.1, 5.2), (50.0, 30.0), (-1.39, -1.42))
 
@@ -35,6 +41,34 @@ def test_residual_displacements_about_the_true_motion_are_zero(pairs):
     wrong = (found.displacements - found.relative(moved.numpy()))[:, 8:-8, 0]
     wrong = wrong.reshape(len(wrong), -1, 8, 2).mean(2)  # of 64 rows each
     assert (np.sqrt(np.square(wrong).mean(1)) < [8e-4, 1.5e-3]).all()
+
+
+@pytest.mark.parametrize(("exposure_rows", "sizes"), [(2, [7, 6, 6]), (60, [2] * 16)])
+def test_groups_that_are_measured_together_equal_single_ones(exposure_rows, sizes):
+    """Long records consist of many groups; of 17 frames, 16 pairs if the exposure blurs them differently."""
+    camera = SensorTiming(row_time=1e-4, exposure_rows=exposure_rows, frame_rows=100).in_row_order()
+    motion = Vibration([1.0, 0.7], [70.0, 55.0], [0.3, 1.0], image_motion=(3.0, -2.0))
+    scenes = [torch.from_numpy(draw_scene(152, 184, seed)).float() for seed in (7, 8)]
+    taken = [simulate_frames(scene, camera, motion, 17, frame_size=(96, 128)) for scene in scenes]
+    of_stacks, spectra = motion.expanded(2), stack_spectra(torch.stack(taken), None)
+    together, single = (
+        frame_groups(spectra, camera, of_stacks, pairs_if_blurred_differently=True, one_at_a_time=one_at_a_time)
+        for one_at_a_time in (False, True)
+    )
+    assert [group.size for group in single] == sizes
+    assert len(together) < len(single)
+    measured, gradients = measure_groups(together, camera, of_stacks)
+    expected, of_single = measure_groups(single, camera, of_stacks)
+    np.testing.assert_allclose(measured.displacements, expected.displacements, atol=1e-5)
+    np.testing.assert_allclose(measured.information, expected.information, rtol=1e-3, atol=1e-2)
+    again, _ = measure_groups(together, camera, of_stacks, gradients)
+    np.testing.assert_allclose(again.displacements, expected.displacements, atol=1e-5)
+    for halves in (differential_motion, uneven_motion):
+        np.testing.assert_allclose(halves(gradients, 2), halves(of_single, 2), atol=1e-4)
+    later, of_later = together[0].stacks(torch.tensor([1])), motion.expanded(1)
+    part, _ = measure_groups([later], camera, of_later)
+    count = part.displacements.shape[1]
+    np.testing.assert_allclose(part.displacements, expected.displacements[1:, :count], atol=1e-5)
 
 
 @pytest.mark.parametrize("exposure_rows", [10, 60])

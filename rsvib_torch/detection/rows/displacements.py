@@ -8,7 +8,6 @@ residual displacement of every scene row in every frame and its information matr
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.chunking import chunks, runs
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.tables import Array, table, tables
@@ -28,17 +28,18 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.registration.gradients import (
+    BLOCK,
     RowGradients,
     residual_products,
     row_equations,
     row_gradients,
 )
-from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern
+from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern, overlapping
 
 __all__ = [
     "BLOCK_ROWS",
     "MAX_GROUP_FRAMES",
-    "FrameGroup",
+    "FrameGroups",
     "MeasuredGroup",
     "blur_ratio",
     "column_pattern_of",
@@ -61,16 +62,43 @@ MAX_GROUP_FRAMES = 8  # frames with one mean scene; more lower the noise of that
 
 
 @dataclass(frozen=True, eq=False)
-class FrameGroup:
-    """Consecutive frames that are compared with each other.
+class FrameGroups:
+    """M groups of G consecutive frames; those of a group are compared, and its last frame is the first of the next.
+
+    The groups of all stacks are measured as one batch (B M), group after group of each stack.
 
     Attributes:
-        spectra: Spectra of the G frames.
-        starts: (B, G) s, exposure starts of their first rows.
+        spectra: Spectra of the F = M (G - 1) + 1 frames of B stacks.
+        starts: (B, F) s, exposure starts of their first rows.
+        count: Number M of groups.
     """
 
     spectra: RowSpectra
     starts: Tensor
+    count: int = 1
+
+    @property
+    def size(self) -> int:
+        """Number G of frames of a group."""
+        return (self.starts.shape[1] - 1) // self.count + 1
+
+    @property
+    def starts_of_groups(self) -> Tensor:
+        """(B M, G) s."""
+        return overlapping(self.starts, self.count)
+
+    @property
+    def spectra_of_groups(self) -> RowSpectra:
+        """Spectra (B M, G)."""
+        return self.spectra.in_groups(self.count)
+
+    def motion_of_groups(self, motion: Motion) -> Motion:
+        """The motion (B) for each group (B M)."""
+        return motion if self.count == 1 else motion.mapped(lambda values: values.repeat_interleave(self.count, 0))
+
+    def stacks(self, index: Tensor) -> "FrameGroups":
+        """The groups of some stacks; the frames are copied."""
+        return replace(self, spectra=self.spectra.stacks(index), starts=self.starts[index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +120,21 @@ class _Positions:
     exposure_starts: Tensor
 
     @classmethod
-    def of(cls, group: FrameGroup, timing: RowTiming, motion: Motion, step: int = 1) -> "_Positions":
-        """Positions of every ``step``-th row of the scene that the middle of a group contains."""
-        height = group.spectra.height
-        rows = torch.arange(0, height, step, dtype=torch.float64, device=group.starts.device)
+    def of(cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1) -> "_Positions":
+        """Positions of every ``step``-th row of the scene that the middle of a group contains.
+
+        Args:
+            starts: (B, G) s, exposure starts of the first rows of the frames.
+            height: Rows of a frame.
+            timing: The sensor, in row order.
+            motion: Motion of each group (B).
+            step: Rows from one position to the next.
+        """
+        rows = torch.arange(0, height, step, dtype=torch.float64, device=starts.device)
         # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
-        middle = group.starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
+        middle = starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
         travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
-        return cls.of_rows(rows - travelled[..., 1], travelled[..., 0], group.starts[..., None], timing, motion)
+        return cls.of_rows(rows - travelled[..., 1], travelled[..., 0], starts[..., None], timing, motion)
 
     @classmethod
     def of_rows(
@@ -159,7 +194,8 @@ def frame_groups(
     motion: Motion,
     *,
     pairs_if_blurred_differently: bool = False,
-) -> list[FrameGroup]:
+    one_at_a_time: bool = False,
+) -> list[FrameGroups]:
     """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
 
     Args:
@@ -168,6 +204,7 @@ def frame_groups(
         motion: Motion of each stack (B); an image motion limits how many frames contain the same part of the scene.
         pairs_if_blurred_differently: Form pairs if exposures blur the frames differently, because only the blur of two
             frames can be equalised. Pairs are enough for a tone; a free motion needs all frames that contain a row.
+        one_at_a_time: Measure one group at a time; otherwise as many as fit in the cache.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
@@ -177,21 +214,28 @@ def frame_groups(
     if pairs_if_blurred_differently:
         most = 2 if bool(differently_blurred(starts, spectra.height, timing, motion).any()) else most
     number = max(1, math.ceil((count - 1) / (most - 1)))
-    ends = [round(i * (count - 1) / number) for i in range(number + 1)]
-    parts = [slice(first, last + 1) for first, last in itertools.pairwise(ends)]
-    return [FrameGroup(spectra.part(part), starts[:, part]) for part in parts]
+    # Groups of equal size follow each other, so that they are measured together.
+    steps_of_group, longer = divmod(count - 1, number)
+    parts, first = [], 0
+    for groups, size in ((longer, steps_of_group + 2), (number - longer, steps_of_group + 1)):
+        bytes_of_group = 4 * stacks * spectra.length * (4 + size) * 4 * BLOCK  # four rows of blocks, ``row_gradients``
+        for part in runs(groups, 1) if one_at_a_time else chunks(groups, bytes_of_group, starts.device):
+            frames = slice(first, first + (part.stop - part.start) * (size - 1) + 1)
+            parts.append(FrameGroups(spectra.part(frames), starts[:, frames], part.stop - part.start))
+            first = frames.stop - 1
+    return parts
 
 
 # Measurements
 
 
 def measure_group(
-    group: FrameGroup,
+    group: FrameGroups,
     timing: RowTiming,
     motion: Motion,
     gradients: RowGradients | None = None,
 ) -> tuple["MeasuredGroup", RowGradients]:
-    """Displacements of blocks of scene rows in the frames of a group, measured around a motion.
+    """Displacements of blocks of scene rows in the frames of groups, measured around a motion.
 
     The displacement of the motion is added to the measured residual displacement, so that the measurements do not
     depend on the motion to first order.
@@ -203,14 +247,15 @@ def measure_group(
         gradients: Gradients of the scene from a motion that differs by much less than a pixel; None to compute them.
 
     Returns:
-        The measurements, and the gradients for the next call.
+        The measurements, and the gradients (B M) for the next call.
     """
-    positions = _Positions.of(group, timing, motion)
-    visible = positions.visible(group.spectra.height, BLOCK_ROWS)
-    warp = _warp_to_scene(group.spectra, positions, timing, motion)
-    warped = ((run, warp(run)) for run in group.spectra.runs(positions.rows.shape[-1], 2))
+    spectra, motion = group.spectra_of_groups, group.motion_of_groups(motion)
+    positions = _Positions.of(group.starts_of_groups, spectra.height, timing, motion)
+    visible = positions.visible(spectra.height, BLOCK_ROWS)
+    warp = _warp_to_scene(spectra, positions, timing, motion)
+    warped = ((run, warp(run)) for run in spectra.runs(positions.rows.shape[-1], 2))
     if gradients is None:
-        gradients = row_gradients(group.spectra, warped, positions.rows, positions.shift, visible)
+        gradients = row_gradients(spectra, warped, positions.rows, positions.shift, visible)
         products = gradients.residual_products
     else:
         products = residual_products(warped, gradients, visible)
@@ -239,7 +284,7 @@ class _JoinedRows:
 
 
 def measure_strips(
-    group: FrameGroup,
+    group: FrameGroups,
     timing: RowTiming,
     motion: Motion,
     of_strips: Motion,
@@ -255,7 +300,7 @@ def measure_strips(
     further regressors.
 
     Args:
-        group: The strips of the frames.
+        group: The strips of the frames of one group.
         timing: The sensor, in row order.
         motion: Motion (B) whose components are measured.
         of_strips: The motions (B S) of the middles of the strips.
@@ -264,7 +309,7 @@ def measure_strips(
         gradients: As in ``measure_group``.
     """
     spectra, count = group.spectra, len(strips.firsts)
-    positions = _Positions.of(group, timing, of_strips)
+    positions = _Positions.of(group.starts, spectra.height, timing, of_strips)
 
     def over_strips(values: Tensor) -> Tensor:
         split: Tensor = values.unflatten(0, (-1, count))
@@ -306,7 +351,7 @@ def measure_strips(
 
 @dataclass(frozen=True, eq=False)
 class MeasuredGroup:
-    """Displacements of N blocks of rows in the G frames of a group, as ``Measurements`` on the device of the frames.
+    """Displacements of N blocks of rows of groups of G frames, as ``Measurements`` on the device of the frames.
 
     Attributes:
         exposure_starts: (B, N, G) s.
@@ -322,7 +367,7 @@ class MeasuredGroup:
 
 
 def _measured(
-    group: FrameGroup,
+    group: FrameGroups,
     timing: RowTiming,
     motion: Motion,
     exposure_starts: Tensor,
@@ -335,9 +380,9 @@ def _measured(
     Args:
         group: The frames.
         timing: The sensor, in row order.
-        motion: The motion with the components that are measured.
-        exposure_starts: (B, G, S) s.
-        visible: (B, G, S), 1 where a scene row is visible in a frame.
+        motion: The motion (B M) of the groups with the components that are measured.
+        exposure_starts: (B M, G, S) s.
+        visible: (B M, G, S), 1 where a scene row is visible in a frame.
         gradients: Gradients of the scene.
         products: As ``RowGradients.residual_products``.
     """
@@ -345,15 +390,21 @@ def _measured(
     exposure_starts = _in_blocks(exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
     # the record, and with it the frequency grid, as long (18 GB)
-    first, height_time = group.starts[: len(exposure_starts), :, None], group.spectra.height * timing.row_time
+    first = group.starts_of_groups[: len(exposure_starts), :, None]
+    height_time = group.spectra.height * timing.row_time
     exposure_starts = exposure_starts.clamp(first - height_time, first + 2 * height_time)
     around = motion.mean_displacement(exposure_starts, timing.exposure_time)
     return MeasuredGroup(
-        exposure_starts=exposure_starts.transpose(1, 2),
-        displacements=(around + residual).transpose(1, 2),
-        visible=_in_blocks(visible)[..., 0].transpose(1, 2),
-        information=information,
+        exposure_starts=_of_stacks(exposure_starts.transpose(1, 2), group.count),
+        displacements=_of_stacks((around + residual).transpose(1, 2), group.count),
+        visible=_of_stacks(_in_blocks(visible)[..., 0].transpose(1, 2), group.count),
+        information=_of_stacks(information, group.count),
     )
+
+
+def _of_stacks(values: Tensor, groups: int) -> Tensor:
+    """Values (B M, N, ...) of M groups of each stack as (B, M N, ...)."""
+    return values.unflatten(0, (-1, groups)).flatten(1, 2)
 
 
 def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
@@ -387,17 +438,17 @@ def _in_blocks(values: Tensor) -> Tensor:
 
 
 def measure_groups(
-    groups: list[FrameGroup],
+    groups: list[FrameGroups],
     timing: RowTiming,
     motion: Motion,
     gradients: list[RowGradients] | None = None,
 ) -> tuple[Measurements, list[RowGradients]]:
     """``measure_group`` of all groups, the measurements as one record."""
     known = [None] * len(groups) if gradients is None else gradients
-    measured, advance = [], steps(len(groups), "groups")
+    measured, advance = [], steps(sum(group.count for group in groups), "groups")
     for group, of_group in zip(groups, known, strict=True):
         measured.append(measure_group(group, timing, motion, of_group))
-        advance()
+        advance(group.count)
     return joined_groups([part for part, _ in measured], timing.exposure_time), [of_group for _, of_group in measured]
 
 
@@ -423,7 +474,7 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float) -> Measureme
 
 
 def column_pattern_of(
-    groups: list[FrameGroup], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
+    groups: list[FrameGroups], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
 ) -> Tensor | None:
     """Spectrum (B, U) of a pattern of columns that is fixed to the sensor; None if there is none.
 
@@ -431,42 +482,47 @@ def column_pattern_of(
     """
     parts = []
     for group, of_group in zip(groups, gradients, strict=True):
-        positions = _Positions.of(group, timing, motion, EVERY)
+        starts, of_groups = group.starts_of_groups, group.motion_of_groups(motion)
+        positions = _Positions.of(starts, group.spectra.height, timing, of_groups, EVERY)
         visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
-        parts.append((group.spectra, positions.rows, positions.shift, visible, of_group.variance[:, ::EVERY]))
+        variance = of_group.variance[:, ::EVERY]
+        parts.append((group.spectra_of_groups, positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
 
 
-def differential_motion(gradients: list[RowGradients], *, rows: int = 64) -> Array:
+def differential_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
     """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
 
     Rotation of the camera and parallax move the halves differently.
 
     Args:
         gradients: Gradients of all groups, from ``measure_groups``.
+        stacks: Number B of stacks.
         rows: Rows over which the sums are taken.
     """
-    return _rms_of_contrasts(gradients, rows, [[-1.0, 1.0]])
+    return _rms_of_contrasts(gradients, stacks, rows, [[-1.0, 1.0]])
 
 
-def uneven_motion(gradients: list[RowGradients], *, rows: int = 64) -> Array:
+def uneven_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
     """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
 
     Parallax, clouds and objects that move by themselves cause it, roll and zoom do not.
 
     Args:
         gradients: Gradients of all groups, from ``measure_groups``.
+        stacks: Number B of stacks.
         rows: Rows over which the sums are taken.
     """
     quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
-    return _rms_of_contrasts(gradients, rows, [quadratic, cubic])
+    return _rms_of_contrasts(gradients, stacks, rows, [quadratic, cubic])
 
 
-def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[list[float]]) -> Array:
+def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, weights: list[list[float]]) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
     Args:
         gradients: Gradients of all groups.
+        stacks: Number B of stacks.
         rows: Rows over which the sums are taken.
         weights: Weights of the parts in each contrast.
     """
@@ -475,7 +531,8 @@ def _rms_of_contrasts(gradients: list[RowGradients], rows: int, weights: list[li
         residual, noise, regular = displacements_of_parts(of_group, rows, len(weights[0]))
         contrasts = residual.new_tensor(weights)
         excess = ((contrasts @ residual).square() - contrasts.square() @ noise).sum(2)
-        excesses.append(torch.where(regular[..., None], excess, torch.nan))
+        excess = torch.where(regular[..., None], excess, torch.nan)
+        excesses.append(_of_stacks(excess, len(excess) // stacks))
     return np.sqrt(np.maximum(trimmed_mean(table(torch.cat(excesses, 1))), 0.0))
 
 
@@ -533,7 +590,7 @@ def _different(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> Te
 
 
 def blur_ratio(
-    groups: list[FrameGroup], timing: RowTiming, motion: Motion, *, block: int = 2, highest: float = 0.15
+    groups: list[FrameGroups], timing: RowTiming, motion: Motion, *, block: int = 2, highest: float = 0.15
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Difference of the blur of neighbouring frames, relative to that of the exposure time and the motion.
 
@@ -554,10 +611,11 @@ def blur_ratio(
     """
     sums: list[tuple[Tensor, ...]] = []
     for group in groups:
-        positions = _Positions.of(group, timing, motion)
+        of_groups = group.motion_of_groups(motion)
+        positions = _Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
         u = group.spectra.frequencies
         low = slice(int((u <= 1 / 64).sum()), int((u < highest).sum()))  # shading affects frequencies below 1/64
-        low_spectra = group.spectra.band(low)
+        low_spectra = group.spectra.band(low).in_groups(group.count)
 
         def averaged(values: Tensor) -> Tensor:
             rows = values.shape[2] // block
@@ -565,7 +623,7 @@ def blur_ratio(
             return rows_of_blocks.mean(3)
 
         spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
-        moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, motion)))
+        moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, of_groups)))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
         mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
         change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 1:-1, None]
@@ -578,8 +636,9 @@ def blur_ratio(
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
         weight = both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2]
         values = torch.view_as_real(torch.stack([expected, here, difference[:, :, 1:-1]], -2)).flatten(-2)
-        of_rows = (values @ values.mT).double()  # (B, G - 1, S, 3, 3)
-        products = torch.einsum("bgs,bgsij->bij", weight, of_rows)
+        of_rows = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
+        of_rows, weight = (_of_stacks(part, group.count) for part in (of_rows, weight))
+        products = torch.einsum("bgs,bgsij->bij", weight, of_rows)  # sum over pairs g and rows s of a stack b
         sums.append((products[:, :2, :2], products[:, :2, 2], products[:, 2, 2], values.shape[-1] * weight.sum((1, 2))))
     normal, right, square, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()

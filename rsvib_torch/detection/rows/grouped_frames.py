@@ -15,7 +15,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.core.tables import Array, table, take_stacks, tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
-    FrameGroup,
+    FrameGroups,
     blur_ratio,
     column_pattern_of,
     differential_motion,
@@ -58,22 +58,33 @@ class MeasuredRows:
 
     def stacks(self, stacks: Array) -> "MeasuredRows":
         """The measurements of some stacks."""
-        rows = tensor(stacks).to(self.gradients[0].variance.device)
+        count, gradients = len(self.measurements.visible), []
+        for part in self.gradients:
+            of_groups = np.arange(len(part.variance)).reshape(count, -1)[stacks].ravel()
+            gradients.append(part.stacks(tensor(of_groups).to(part.variance.device)))
         return MeasuredRows(
             take_stacks([self.measurements], stacks),
-            [part.stacks(rows) for part in self.gradients],
+            gradients,
             None if self.apart is None else self.apart[stacks],
         )
 
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
         if self.apart is None:
-            return differential_motion(self.gradients)
+            return differential_motion(self.gradients, len(self.measurements.visible))
         return np.sqrt(np.maximum(trimmed_mean(self.apart), 0.0))
 
     def uneven(self) -> Array:
         """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
-        return uneven_motion(self.gradients) if self.apart is None else self.differential()
+        if self.apart is None:
+            return uneven_motion(self.gradients, len(self.measurements.visible))
+        return self.differential()
+
+    def aliasing(self) -> Array:
+        """(B,) px, expected size of the bias by aliasing, see ``RowGradients``."""
+        stacks = len(self.measurements.visible)
+        parts = [gradients.aliasing.unflatten(0, (stacks, -1)) for gradients in self.gradients]
+        return table(torch.cat(parts, 1).mean(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +96,7 @@ class GroupedFrames:
         timing: The sensor, in row order.
     """
 
-    groups: list[FrameGroup]
+    groups: list[FrameGroups]
     timing: RowTiming
 
     def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> MeasuredRows:
@@ -103,9 +114,7 @@ class GroupedFrames:
     def stacks(self, stacks: Array) -> Self:
         """The frames of some stacks; they are copied."""
         rows = self.rows_of(stacks)
-        return replace(
-            self, groups=[FrameGroup(group.spectra.stacks(rows), group.starts[rows]) for group in self.groups]
-        )
+        return replace(self, groups=[group.stacks(rows) for group in self.groups])
 
     def column_pattern(self, motion: Vibration | FreeMotion, gradients: list[RowGradients]) -> Tensor | None:
         """Spectrum of a pattern of columns in each row of the batch, see ``column_pattern_of``."""
@@ -125,8 +134,11 @@ class GroupedFrames:
     def differently_blurred(self, motion: Vibration) -> Array:
         """(B,) bool, stacks in which the frames of a group are blurred differently."""
         view, height = self.view(motion), self.groups[0].spectra.height
-        rows = [differently_blurred(group.starts, height, self.timing, view) for group in self.groups]
-        return table(torch.stack(rows).any(0).unflatten(0, (len(motion.amplitude), -1)).any(1))
+        rows = [
+            differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))
+            for group in self.groups
+        ]
+        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in rows], 1).any(1))
 
 
 def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
@@ -216,7 +228,7 @@ class GroupedStrips(GroupedFrames):
         """
         place = torch.arange(len(self.groups[0].starts), device=self.columns.device)
         index = place[place % len(self.columns) % 2 == 0]
-        groups = [FrameGroup(group.spectra.stacks(index), group.starts[index]) for group in self.groups]
+        groups = [group.stacks(index) for group in self.groups]
         every_second = replace(self, groups=groups, columns=self.columns[::2])
         of_strips = GroupedFrames.blur_ratio(every_second, motion)
         ratio, std, size = of_strips.unflatten(0, (-1, len(every_second.columns))).unbind(-1)
@@ -263,6 +275,7 @@ def grouped_strips(
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
-    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs_if_blurred_differently)
+    pairs = pairs_if_blurred_differently
+    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs, one_at_a_time=True)
     slide = slope * float(columns[1] - columns[0])
     return GroupedStrips(groups, timing, scale, strips, columns, count, slide)

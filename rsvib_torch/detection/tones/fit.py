@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.linalg import block_diag
 
-from rsvib_torch.core.tables import Array, select_stacks, split_axis, tensor, without_nan
+from rsvib_torch.core.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
@@ -114,7 +114,7 @@ class ToneFit:
         drift = self.drift
         if drift.shape[-1] > 1:  # the constant of (s + moved)^2 / 2 cancels within the group
             drift = np.stack([drift[..., 0] + drift[..., 1] * moved, drift[..., 1]], -1)
-        turned = self.coefficients * np.exp(1j * turn)
+        turned = self.coefficients * unit_wave(turn)
         return replace(self, coefficients=turned, drift=drift, centre=centre)
 
 
@@ -135,7 +135,7 @@ def tone_response(measurements: Measurements, frequencies: Array) -> Array:
     """
     attenuation = np.sinc(frequencies * measurements.smearing_times).prod(0)[:, None, None]
     angle = 2 * math.pi * frequencies[:, None, None] * measurements.middles
-    return measurements.relative(attenuation * np.exp(1j * angle))
+    return measurements.relative(attenuation * unit_wave(angle))
 
 
 def drift_response(measurements: Measurements, order: int) -> Array:
@@ -175,7 +175,7 @@ def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Arra
     by_attenuation = np.moveaxis((tones[..., :2] * slope[..., None])[:, None, None], -1, 0)
     by_angle = np.moveaxis((tones[..., :2] * (2 * math.pi * attenuation)[..., None])[:, None, None], -1, 0)
     angle = (2 * math.pi * frequencies)[:, None, None] * time
-    cos, sin, attenuation = np.cos(angle), np.sin(angle), attenuation[:, None, None]
+    (cos, sin), attenuation = cos_sin(angle), attenuation[:, None, None]
     by_frequency = cos * (by_attenuation[0] - time * by_angle[1]) - sin * (by_attenuation[1] + time * by_angle[0])
     by_tones = np.stack([attenuation * cos, -attenuation * sin, by_frequency], -1)
     return by_tones.reshape(*angle.shape[:-1], -1)

@@ -32,7 +32,7 @@ import numpy as np
 from scipy import special
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, valid_mean, without_nan
+from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, unit_wave, valid_mean, without_nan
 from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
@@ -184,7 +184,7 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
 def _unit_bias(measurements: Measurements, displacements: Array) -> Array:
     """Bias (B, N, G, A) of relative displacements of that shape, for b = 1."""
     angle = 2 * math.pi * displacements
-    turn = np.ones_like(angle) * np.exp(1j * angle)
+    turn = unit_wave(angle)
     visible = measurements.visible[..., None]
     mean = (visible * turn).sum(2, keepdims=True) / np.maximum(visible.sum(2, keepdims=True), 1.0)
     return measurements.relative((turn * mean.conj()).imag)
@@ -315,7 +315,7 @@ def _wave(fit: ToneFit, exposure_starts: Array, frequencies: Array, exposure_tim
     time = exposure_starts + 0.5 * exposure_time - fit.centre[:, None]
     angle = 2 * math.pi * frequencies[:, None] * time[..., None]
     attenuation = np.sinc(frequencies * exposure_time)[:, None]
-    return _quadratures(attenuation * np.exp(1j * angle))
+    return _quadratures(attenuation * unit_wave(angle))
 
 
 def _without_trend(values: Array, times: Array) -> Array:
