@@ -78,6 +78,7 @@ from .report import (
     write_windows,
 )
 from .restoration import (
+    FixedDewarp,
     RestorationMtf,
     RestorationVerdict,
     RestorationWarning,
@@ -97,6 +98,7 @@ __all__ = [
     "Camera",
     "ClockAlignment",
     "DetectionResult",
+    "FixedDewarp",
     "FreeMotion",
     "Margins",
     "MotionCheck",

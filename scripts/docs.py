@@ -50,7 +50,7 @@ FIRST_NAMES = (
         "check_motion",
         "MotionCheck",
     ),
-    *("restore", "VibrationRestorer", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
+    *("restore", "VibrationRestorer", "FixedDewarp", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
     *("simulate_frames", "SensorNoise", "Optics", "row_psf", "RowVaryingBlur"),
     *("register_bands", "OffsetCurve"),
     *("calibrate_row_time", "calibrate_row_time_by_exposure", "RowTimeCalibration"),

@@ -54,7 +54,7 @@ def test_every_public_name_is_in_the_reference(docs):
 def test_reference_begins_with_the_main_function(docs):
     for package, first in (
         ("detection", ["detect_vibration", "DetectionResult", "VibrationDetector"]),
-        ("restoration", ["restore", "VibrationRestorer", "judge_restoration"]),
+        ("restoration", ["restore", "VibrationRestorer", "FixedDewarp"]),
         ("imaging", ["simulate_frames"]),
         ("motion", ["SensorTiming", "Vibration"]),
     ):

@@ -35,7 +35,7 @@ def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Te
     """Join pieces of a tensor, each with its slice along ``dim``, to one tensor of ``count`` indices.
 
     Each piece is copied as soon as it is computed, so that one piece at a time needs memory. Pieces that require
-    gradients are concatenated.
+    gradients, and those of a graph that is recorded, are concatenated. A piece that is the whole is returned.
 
     Example:
         >>> gathered(((slice(i, i + 1), torch.full((1, 2), float(i))) for i in range(3)), 3, 0).tolist()
@@ -44,7 +44,9 @@ def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Te
     kept: list[Tensor] = []
     whole: Tensor | None = None
     for place, piece in pieces:
-        if piece.requires_grad:
+        if piece.shape[dim] == count:
+            return piece
+        if piece.requires_grad or torch.compiler.is_compiling():
             kept.append(piece)
             continue
         if whole is None:

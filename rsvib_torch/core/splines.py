@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -86,19 +87,20 @@ def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(weight[power]) for weight in taps) for power in reversed(range(degree + 1)))
 
 
-@cache
+_PREFILTERS: dict[tuple[int, bool], tuple[float, ...]] = {}
+
+
 def _prefilter_taps(degree: int, double: bool) -> tuple[float, ...]:
     """Taps 0, 1, 2 ... of the symmetric inverse filter of the sampled B-spline."""
-    length = 1024
-    samples = bspline_weights(torch.zeros((), dtype=torch.float64, device="cpu"), degree)[:-1]
-    kernel = torch.zeros(length, dtype=torch.float64, device="cpu")
-    half = len(samples) // 2
-    for tap, value in enumerate(samples.tolist()):
-        kernel[(tap - half) % length] = value
-    inverse = torch.fft.irfft(1.0 / torch.fft.rfft(kernel).real, n=length)
-    smallest = 1e-9 if double else 3e-8  # of the largest tap; float32 has no more digits
-    reach = int((inverse[: length // 2].abs() > smallest).nonzero().max()) + 1
-    return tuple(inverse[:reach].tolist())
+    if (degree, double) not in _PREFILTERS:  # ``torch.compile`` looks into this table, but not into that of a cache
+        length = 1024
+        samples = np.array(_polynomials(degree)[-1][:-1])  # at fraction 0
+        kernel = np.roll(np.pad(samples, (0, length - len(samples))), -(len(samples) // 2))
+        inverse = np.fft.irfft(1.0 / np.fft.rfft(kernel).real, n=length)
+        smallest = 1e-9 if double else 3e-8  # of the largest tap; float32 has no more digits
+        reach = int(np.flatnonzero(np.abs(inverse[: length // 2]) > smallest).max()) + 1
+        _PREFILTERS[degree, double] = tuple(inverse[:reach].tolist())
+    return _PREFILTERS[degree, double]
 
 
 def _symmetric(taps: tuple[float, ...], like: Tensor) -> Tensor:

@@ -1,3 +1,4 @@
+from .dewarp import FixedDewarp
 from .frame_motion import visible_pixels
 from .noise import estimate_noise
 from .noise_gain import predict_noise_gain
@@ -8,6 +9,7 @@ from .verdict.pairs import TooLittleInCommonError
 from .verdict.trust import displacement_uncertainty, trusted_vibration
 
 __all__ = [
+    "FixedDewarp",
     "RestorationMtf",
     "RestorationVerdict",
     "RestorationWarning",

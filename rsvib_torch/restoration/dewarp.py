@@ -3,20 +3,58 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.chunking import gathered, runs
-from rsvib_torch.core.fourier import extended_length, phase_products, phase_tables, spline_spectra
-from rsvib_torch.core.splines import bspline_weights, mirrored
+from rsvib_torch.core.fourier import extend_rows, extended_length, phase_tables, spline_spectra
+from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch.motion.field import check_two_axes
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming, check_timing
 from rsvib_torch.options import DewarpOptions
-from rsvib_torch.restoration.frame_motion import FrameMotion
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
-__all__ = ["restore_dewarp"]
+__all__ = ["FixedDewarp", "restore_dewarp"]
 
 
+_DEGREE = 5  # of the B-spline across rows
 _CHUNK_ROWS = 128  # interpolated at a time
+
+
+@dataclass(frozen=True, eq=False)
+class _Moves:
+    """Where the rows of restored frames are found in the frames; all tensors are real.
+
+    Attributes:
+        taps: (B, T, H, 6) int64, rows of a frame.
+        weights: (B, T, H, 6) of these rows.
+        coarse: (B, T, H, n, 2) phase factors, from ``phase_tables``.
+        fine: (B, T, H, 64, 2) phase factors.
+    """
+
+    taps: Tensor
+    weights: Tensor
+    coarse: Tensor
+    fine: Tensor
+
+    @classmethod
+    def of(cls, motion: FrameMotion, length: int, dtype: torch.dtype) -> "_Moves":
+        """Moves by a motion, for rows that are extended to ``length``."""
+        rows = motion.frame_rows(torch.arange(motion.num_rows, dtype=torch.float64, device=motion.shift.device))
+        along = motion.mean_displacement(rows)[..., 0]
+        cell = rows.detach().floor()
+        weights = bspline_weights(rows - cell, _DEGREE).to(dtype)
+        taps = cell.to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=rows.device) - _DEGREE // 2
+        tables = phase_tables(along, length, slice(0, length // 2 + 1), dtype.to_complex())
+        return cls(mirrored(taps, motion.num_rows), weights, *(torch.view_as_real(table) for table in tables))
 
 
 def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
@@ -33,33 +71,128 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions =
     Returns:
         Restored frames of the same shape.
     """
-    degree = 5
-    B, T, C, H, W = frames.shape
-    rows = motion.frame_rows(torch.arange(H, dtype=torch.float64, device=frames.device))
-    along, rows = motion.mean_displacement(rows)[..., 0].flatten(0, 1), rows.flatten(0, 1)
+    length = extended_length(frames.shape[-1], motion.displacement_bound())
+    moves, spectra = (
+        _Moves.of(motion, length, frames.dtype),
+        torch.view_as_real(spline_spectra(frames, _DEGREE, length)),
+    )
 
-    length = extended_length(W, motion.displacement_bound())
-    spectra = spline_spectra(frames, degree, length)
-    count = spectra.shape[-1]
-    cell = rows.detach().floor()
-    weights = bspline_weights(rows - cell, degree).to(frames.dtype)
-    taps = cell.to(torch.int64)[..., None] + torch.arange(degree + 1, device=frames.device) - degree // 2
-    image = torch.arange(B * T, device=frames.device)[:, None, None]
-    taps = mirrored(taps, H) + image * H
-    # one entry per row, with all channels
-    flat = torch.view_as_real(spectra.movedim(2, 3)).reshape(B * T * H, -1)
+    def rows_of(moved: Tensor) -> Tensor:
+        rows: Tensor = torch.fft.irfft(torch.view_as_complex(moved), n=length)[..., : frames.shape[-1]]
+        return rows
 
-    coarse, fine = phase_tables(along, length, slice(0, count), frames.dtype.to_complex())
+    return _moved_back(spectra, moves, rows_of, options.chunk_rows or _CHUNK_ROWS)
+
+
+def _moved_back(spectra: Tensor, moves: _Moves, rows_of: Callable[[Tensor], Tensor], chunk_rows: int) -> Tensor:
+    """Restored frames (B, T, C, H, W) in row order.
+
+    Shapes are changed as real tensors: ONNX has no complex ones.
+
+    Args:
+        spectra: (B, T, C, H, U, 2) real and imaginary part of the transforms along rows of spline coefficients.
+        moves: Where the rows are found.
+        rows_of: Function from moved spectra (..., U, 2) to rows (..., W).
+        chunk_rows: Rows that are interpolated at a time.
+    """
+    B, T, C, H, count, _ = spectra.shape
+    flat = spectra.movedim(2, 3).reshape(B * T * H, -1)  # one entry per row, with all channels
+    image = torch.arange(B * T, device=spectra.device)[:, None, None]
+    taps = moves.taps.expand(B, -1, -1, -1).flatten(0, 1) + image * H
+    weights, coarse, fine = (
+        values.expand(B, *values.shape[1:]).flatten(0, 1) for values in (moves.weights, moves.coarse, moves.fine)
+    )
 
     def restored(part: slice) -> Tensor:
         fetched = embedding_bag(
             taps[:, part].flatten(0, 1), flat, per_sample_weights=weights[:, part].flatten(0, 1), mode="sum"
         )
-        moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2))
-        moved = moved * phase_products(coarse[:, part], fine[:, part], count)[:, :, None]
-        image: Tensor = torch.fft.irfft(moved, n=length)[..., :W]
-        return image
+        products = torch.view_as_complex(coarse[:, part, :, None]) * torch.view_as_complex(fine[:, part, None])
+        phases = torch.view_as_real(products).flatten(-3, -2)[:, :, None, :count]
+        moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2)) * torch.view_as_complex(phases)
+        return rows_of(torch.view_as_real(moved))
 
-    parts = ((part, restored(part)) for part in runs(H, options.chunk_rows or _CHUNK_ROWS))
+    parts = ((part, restored(part)) for part in runs(H, chunk_rows))
     stacked: Tensor = gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
     return stacked
+
+
+class FixedDewarp(nn.Module):
+    """Restoration by method ``"dewarp"`` with a vibration that does not change, as a fixed graph of tensor operations.
+
+    All that depends on the vibration is computed once. The result is that of ``restore(..., method="dewarp",
+    check=False)``. Frames are float32 tensors without missing pixels. ``torch.compile(fullgraph=True)``,
+    ``torch.export.export`` and ``torch.onnx.export`` accept the module. Rows are transformed by products with two
+    matrices of about W^2 numbers: runtimes of ONNX transform most lengths slowly, with errors of up to 6e-4.
+
+    Args:
+        timing: The sensor.
+        vibration: One motion along x and y, in image axes.
+        size: (height, width) of the frames in px.
+        num_frames: Frames of a stack.
+
+    Raises:
+        ValueError: If the vibration is a batch or has roll, zoom or a camera, or if frames of this size are refused by
+            ``restore``.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> dewarp = rsv.FixedDewarp(timing, vibration, frames.shape[-2:], num_frames=2)
+        >>> program = torch.export.export(dewarp, (frames,))
+        >>> expected = rsv.restore(frames, timing, vibration, method="dewarp", check=False)
+        >>> torch.allclose(program.module()(frames), expected, atol=1e-5)
+        True
+    """
+
+    taps: Tensor
+    weights: Tensor
+    coarse: Tensor
+    fine: Tensor
+    to_spectra: Tensor  # (W, 2 U)
+    to_rows: Tensor  # (2 U, W)
+
+    @checks_arguments
+    def __init__(self, timing: SensorTiming, vibration: Motion, size: tuple[int, int], num_frames: int) -> None:
+        super().__init__()
+        check_timing(timing)
+        check_two_axes(vibration, "FixedDewarp")
+        if vibration.batch_shape:
+            raise ValueError(
+                f"vibration must be one motion, got a batch {tuple(vibration.batch_shape)}; pass vibration[0]"
+            )
+        check_whole_number("num_frames", num_frames, at_least=1)
+        sides = [check_whole_number("size", side, at_least=1, at_most=MAX_ROWS) for side in size]
+        height, width = sides if timing.scan_axis == -2 else sides[::-1]
+        rowwise, in_rows = vibration.detached().to_row_order(timing).expanded(1), timing.in_row_order()
+        in_rows.check_rows(height)
+        motion = frame_motion(rowwise, in_rows, num_frames, height)
+        motion.check_fits(width)
+        self.timing, self.shape = timing, (num_frames, *sides)
+        length = extended_length(width, motion.displacement_bound())
+        for name, values in vars(_Moves.of(motion, length, torch.float32)).items():
+            self.register_buffer(name, values)
+        # Both transforms of unit vectors, in float64.
+        units = torch.eye(width, dtype=torch.float64, device=motion.shift.device)
+        of_rows = torch.view_as_real(torch.fft.rfft(extend_rows(units, length))).flatten(1)
+        of_spectra = torch.eye(of_rows.shape[1], dtype=torch.float64, device=units.device).unflatten(1, (-1, 2))
+        rows = torch.fft.irfft(torch.view_as_complex(of_spectra), n=length)[:, :width]
+        self.register_buffer("to_spectra", of_rows.float())
+        self.register_buffer("to_rows", rows.float())
+        bspline_coefficients(self.to_spectra[0], _DEGREE, 0)  # the filter is computed now: a graph cannot contain that
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Restore frames (T, H, W), (T, C, H, W) or (B, T, C, H, W)."""
+        batch = frames[None, :, None] if frames.ndim == 3 else frames[None] if frames.ndim == 4 else frames
+        if batch.ndim != 5 or (batch.shape[1], *batch.shape[-2:]) != self.shape:
+            raise ValueError(
+                f"frames must be stacks of (frames, height, width) = {self.shape}, got shape {tuple(frames.shape)}"
+            )
+        coefficients = bspline_coefficients(frames_to_row_order(batch, self.timing), _DEGREE, -2)
+        spectra = (coefficients @ self.to_spectra).unflatten(-1, (-1, 2))
+        moves = _Moves(self.taps, self.weights, self.coarse, self.fine)
+        restored = _moved_back(spectra, moves, lambda moved: moved.flatten(-2) @ self.to_rows, spectra.shape[3])
+        return frames_from_row_order(restored, self.timing).reshape(frames.shape)
