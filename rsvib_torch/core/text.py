@@ -46,19 +46,28 @@ def printable(text: str, *, lines: bool = False) -> str:
     return text if text.isascii() and text.isprintable() else "".join(map(shown, text))
 
 
-def measured_text(value: "Tensor | float", std: "Tensor | float | None" = None, digits: int = 4) -> str:
+def measured_text(
+    value: "Tensor | float",
+    std: "Tensor | float | None" = None,
+    digits: int = 4,
+    *,
+    hidden: "Tensor | float | None" = None,
+) -> str:
     """Format ``value ± std`` with two significant digits of the standard deviation.
 
     Args:
         value: The value; an infinite one is written as ∞, and NaN as "unknown".
         std: Its standard deviation; None to write the value alone.
         digits: Significant digits of the value if its standard deviation is not given, zero, infinite or unknown.
+        hidden: Standard deviation if a further tone is hidden; it is added in brackets if it is larger by a tenth.
 
     Example:
         >>> measured_text(60.0, 0.01234)
         '60.000 ± 0.012'
         >>> measured_text(12345.6, 789.0)
         '12350 ± 790'
+        >>> measured_text(2.19372, 0.00071, hidden=0.02)
+        '2.19372 ± 0.00071 (± 0.020)'
         >>> measured_text(0.123456)
         '0.1235'
     """
@@ -73,7 +82,10 @@ def measured_text(value: "Tensor | float", std: "Tensor | float | None" = None, 
             return "unknown" if math.isnan(number) else "∞" if number > 0 else "-∞"
         return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"
 
-    return shown(value) if std is None else f"{shown(value)} ± {shown(deviation)}"
+    if std is None:
+        return shown(value)
+    text = f"{shown(value)} ± {shown(deviation)}"
+    return text if hidden is None or not float(hidden) > 1.1 * deviation else f"{text} (± {float(hidden):#.2g})"
 
 
 def one_line(message: object, most: int = 400) -> str:

@@ -34,6 +34,7 @@ __all__ = ["assembled", "offset_curve"]
 def assembled(
     fit: ToneFit,
     std: VibrationStd,
+    std_if_hidden_tone: VibrationStd | None,
     curve: OffsetCurve,
     fitted: Array,
     findings: Sequence[Findings],
@@ -48,6 +49,7 @@ def assembled(
     Args:
         fit: Tones and image motion of each stack.
         std: Their standard deviations, in px.
+        std_if_hidden_tone: The same with the allowance for a further tone; None for none.
         curve: The measured offsets (B, P, N, A) in px.
         fitted: (B, P, N, A) px, the offsets that the fit predicts.
         findings: For each stack and each axis in row order, the reasons against it.
@@ -68,6 +70,7 @@ def assembled(
     return DetectionResult(
         vibration=vibration,
         std=scale.std(std).from_row_order(timing),
+        std_if_hidden_tone=None if std_if_hidden_tone is None else scale.std(std_if_hidden_tone).from_row_order(timing),
         offsets=replace(
             curve,
             offsets=offsets_from_row_order(curve.offsets * units, timing),

@@ -114,6 +114,7 @@ def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> 
     return assembled(
         found.fit,
         found.std,
+        found.std_if_hidden_tone,
         found.fitted.offsets,
         found.fitted.predicted,
         found.findings,
@@ -137,7 +138,7 @@ def _moving_axes(found: Attempt, least: int) -> int:
 
     A given number of tones is fitted to all components, also to those that do not move.
     """
-    significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std.amplitude
+    significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std_if_hidden_tone.amplitude
     moving = significant.any(0).any(-1).tolist()
     return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
 

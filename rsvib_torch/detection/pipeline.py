@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
 
 from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.assemble import offset_curve
@@ -30,7 +29,6 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
     shrunk,
     tone_displacements,
-    vibration_of_fit,
     with_unknown_errors,
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit
@@ -123,9 +121,10 @@ class Attempt:
         scale: Components of the motion.
         start: Offsets of the row bands.
         fitted: Measurements and the fit to them.
-        fit: The same with all uncertainties in its covariance.
+        fit: The same with all uncertainties in its covariance, also those of ``std_if_hidden_tone``.
         vibration: Its vibration, in px.
-        std: Standard deviations of the vibration, in px.
+        std: Standard deviations of the vibration, in px, given the tones that were found.
+        std_if_hidden_tone: The same with the allowance for a further tone.
         findings: For each stack and each axis the reasons against it.
         interval: Seconds between the first two frames.
     """
@@ -138,6 +137,7 @@ class Attempt:
     fit: ToneFit
     vibration: Vibration
     std: VibrationStd
+    std_if_hidden_tone: VibrationStd
     findings: tuple[Findings, ...]
     interval: float
 
@@ -184,9 +184,11 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     else:
         fit = without_aliasing(fitted.measurements, fitted.fit, fitted.refined.aliasing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
-    fit, total_std = with_further_tones(fitted.measurements, fit, row_starts, number_is_known=options.tones is not None)
-    vibration, std = vibration_of_fit(fit)
-    std = replace(std, displacement=torch.from_numpy(total_std))
+    stated, if_hidden = with_further_tones(
+        fitted.measurements, fit, row_starts, number_is_known=options.tones is not None
+    )
+    vibration, std = stated.vibration()
+    fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
 
     # 4. Verdict: for each axis, the reasons against it, from the rows or the bands that the vibration was fitted to.
     intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
@@ -194,7 +196,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     refined = fitted.refined
     findings = judged(
         vibration,
-        std,
+        std_if_hidden_tone,
         _band_offsets(start, fit, options, height) if refined is None else refined.other_motion,
         intervals=intervals,
         displacement=moved.std(1),
@@ -212,6 +214,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         fit=fit,
         vibration=vibration,
         std=std,
+        std_if_hidden_tone=std_if_hidden_tone,
         findings=findings,
         interval=float(intervals[0]),
     )

@@ -140,7 +140,8 @@ class DetectionResult(
 
     Attributes:
         vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
-        std: Standard deviations of its parameters.
+        std: Standard deviations of its parameters, given the tones that were found.
+        std_if_hidden_tone: The same if the record may contain a further tone, which few frames cannot exclude.
         gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames. A tone with a
             gain near 0 is nearly blind, unless other frames are at other intervals.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
@@ -200,11 +201,12 @@ class DetectionResult(
         def of_findings(findings: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
             return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
 
-        std = self.offsets.std
+        std, hidden = self.offsets.std, self.std_if_hidden_tone
         return replace(
             self,
             vibration=self.vibration.mapped(first),
             std=self.std.mapped(first),
+            std_if_hidden_tone=None if hidden is None else hidden.mapped(first),
             gain=first(self.gain),
             residual=first(self.residual),
             reliable=first(self.reliable),
@@ -225,10 +227,12 @@ class DetectionResult(
             missing = count - self.gain.shape[-1]
             return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values
 
+        hidden = self.std_if_hidden_tone
         return replace(
             self,
             vibration=self.vibration.mapped(padded),
             std=self.std.mapped(padded),
+            std_if_hidden_tone=None if hidden is None else hidden.mapped(padded),
             gain=padded(self.gain),
             sensitivity=self.sensitivity.mapped(padded),
         )

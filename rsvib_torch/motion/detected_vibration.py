@@ -1,6 +1,6 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 from torch import Tensor
@@ -25,7 +25,9 @@ class DetectedVibration(
 
     Attributes:
         vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
-        std: Standard deviations of its parameters, infinite where unknown.
+        std: Standard deviations of its parameters, given the tones that were found; infinite where unknown.
+        std_if_hidden_tone: The same if the record may contain a further tone, which few frames cannot exclude; None:
+            not larger.
         gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames.
         residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
         reliable: (..., 2) bool, verdict for each axis (x, y).
@@ -43,11 +45,12 @@ class DetectedVibration(
     reliable: Tensor
     findings: tuple[Any, ...]
     assumptions: tuple[Any, ...]
+    std_if_hidden_tone: VibrationStd | None = field(default=None, kw_only=True)
 
     @classmethod
     def of(cls, detection: "DetectedVibration") -> "DetectedVibration":
         """A detection without what derived classes add to it."""
-        return DetectedVibration(*(getattr(detection, field.name) for field in fields(DetectedVibration)))
+        return DetectedVibration(**{part.name: getattr(detection, part.name) for part in fields(DetectedVibration)})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,9 +65,11 @@ class DetectedVibration(
 
     def summary(self) -> str:
         """Tones of each axis with standard deviations, then the verdict; of a batch, a table with one row per axis."""
-        rows = [cells for _, cells in tone_rows(self.vibration, self.std)]
+        rows = [cells for _, cells in tone_rows(self.vibration, self.std, hidden=self.std_if_hidden_tone)]
         head = tone_head(axes=self.vibration.num_axes)
         table, *verdict = verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons)
+        if any("(± " in cell for cells in rows for cell in cells):
+            verdict = ["(±): if another tone is hidden in the record", *verdict]
         if not self.batch_shape:
             verdict += [wrapped(f"assumed: {text}") for text in self.assumptions]
         return "\n".join([table, *image_motion_line(self.vibration, self.std), *verdict])

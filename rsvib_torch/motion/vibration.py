@@ -455,7 +455,10 @@ def tone_head(quantities: Sequence[str] = _QUANTITIES, axes: int = 2) -> list[st
 
 
 def tone_rows(
-    vibration: Vibration, std: VibrationStd | None = None, quantities: Sequence[str] = _QUANTITIES
+    vibration: Vibration,
+    std: VibrationStd | None = None,
+    quantities: Sequence[str] = _QUANTITIES,
+    hidden: VibrationStd | None = None,
 ) -> list[tuple[tuple[int, ...], list[str]]]:
     """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells.
 
@@ -463,6 +466,7 @@ def tone_rows(
         vibration: The tones; of a batch, the strongest of each axis is shown.
         std: Their standard deviations.
         quantities: Columns: ``"amplitude"``, ``"frequency"``, ``"period"``, ``"phase"``.
+        hidden: Standard deviations if a further tone is hidden, which are added where they are larger.
     """
     rows = []
     for at, labels in _tones(vibration):
@@ -470,7 +474,9 @@ def tone_rows(
         if float(vibration.amplitude[at]) > 0:
             cells = [
                 measured_text(
-                    scale * getattr(vibration, name)[at], None if std is None else scale * getattr(std, name)[at]
+                    scale * getattr(vibration, name)[at],
+                    None if std is None else scale * getattr(std, name)[at],
+                    hidden=None if hidden is None else scale * getattr(hidden, name)[at],
                 )
                 for name, scale in ((name, _COLUMNS[name][1]) for name in quantities)
             ]

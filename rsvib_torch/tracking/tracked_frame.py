@@ -134,6 +134,7 @@ class TrackedFrame:
         results = assembled(
             fit,
             std,
+            None,
             curve,
             fitted,
             findings,

@@ -439,7 +439,7 @@ class VibrationTracker:
             middle: s, the time origin of the detection.
             record: s, from the first to the last frame of it.
         """
-        vibration, std, curve = found.vibration[0], found.std[0], found.fitted.offsets[0].to("cpu")
+        vibration, std, curve = found.vibration[0], found.std_if_hidden_tone[0], found.fitted.offsets[0].to("cpu")
         # 1. Image motion. A record does not distinguish a tone of less than one period from a drift, and its amplitude
         # is not known: it becomes a part of the drift. Without tones, the drift of the fit is wrong as well.
         tones = torch.polar(vibration.amplitude, vibration.phase - 0.5 * math.pi) * chosen
@@ -512,7 +512,7 @@ def _plausible(found: Attempt) -> Tensor:
 
     The verdict on a record may be that the motion changes, which the filter follows. It has its own verdict.
     """
-    vibration, amplitude, std = found.vibration[0], found.vibration[0].amplitude, found.std[0].amplitude
+    vibration, amplitude, std = found.vibration[0], found.vibration[0].amplitude, found.std_if_hidden_tone[0].amplitude
     strongest = amplitude == amplitude.amax(-1, keepdim=True)
     plausible = (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
     return plausible & (vibration.gain(found.interval).abs() > MIN_GAIN)  # blind tones may have any amplitude

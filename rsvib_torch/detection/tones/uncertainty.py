@@ -32,7 +32,7 @@ import numpy as np
 from scipy import special
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, unit_wave, valid_mean, without_nan
+from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
@@ -42,9 +42,11 @@ from rsvib_torch.detection.tones.fit import (
     model_displacements,
     residual_of,
     tone_response,
+    vibration_of_fit,
 )
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["with_further_tones", "without_aliasing"]
+__all__ = ["StatedFit", "with_further_tones", "without_aliasing"]
 
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
 # intervals of 150 simulated recordings with random tones contain the truth, with 0.2 fewer
@@ -193,10 +195,29 @@ def _unit_bias(measurements: Measurements, displacements: Array) -> Array:
 # --- Further tones and slow errors ---
 
 
+@dataclass(frozen=True, eq=False)
+class StatedFit:
+    """A fit with the uncertainty that is stated for it.
+
+    Attributes:
+        fit: The fit with its covariance.
+        displacement_std: (B, A) px, standard deviation of the displacement of rows without their mean, rms over the
+            rows; the effect of a further tone is that without linear trend, which the image motion contains.
+    """
+
+    fit: ToneFit
+    displacement_std: Array
+
+    def vibration(self) -> tuple[Vibration, VibrationStd]:
+        """The vibration, and its standard deviations with that of the displacement."""
+        vibration, std = vibration_of_fit(self.fit)
+        return vibration, replace(std, displacement=tensor(self.displacement_std))
+
+
 def with_further_tones(
     measurements: Measurements, fit: ToneFit, exposure_starts: Array, *, number_is_known: bool = False
-) -> tuple[ToneFit, Array]:
-    """The fit with a covariance that allows for a further tone, and the uncertainty of the displacement of the rows.
+) -> tuple[StatedFit, StatedFit]:
+    """The fit with slow errors in its covariance, and the same with an allowance for a further tone.
 
     Args:
         measurements: The measurements of the fit, with its weights.
@@ -205,18 +226,22 @@ def with_further_tones(
         number_is_known: Whether there are no further tones; slow errors remain.
 
     Returns:
-        The fit, and the standard deviation (B, A) in px of the displacement of rows without their mean, rms over the
-        rows; the effect of a further tone is that without linear trend, which the image motion contains.
+        The fit if there are no further tones, and if one may be hidden.
     """
-    covariance, rows = fit.covariance.copy(), np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
+    rows = np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
     variance = np.square(displacement_std(fit, exposure_starts, measurements.exposure_time))
+    stated = [(fit.covariance.copy(), variance.copy()) for _ in range(2)]
     jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
     slow_errors = _slow_errors(measurements, fit)
     for axis, problem in _problems(measurements, fit):
-        added, moved = _added(measurements, fit, axis, problem, rows, jacobian, slow_errors[:, axis], number_is_known)
-        problem.add_covariance(covariance, added)
-        variance[:, problem.axes] += moved
-    return replace(fit, covariance=covariance), np.sqrt(variance)
+        of_axis = _added(measurements, fit, axis, problem, rows, jacobian, slow_errors[:, axis], number_is_known)
+        for (covariance, variance), (added, moved) in zip(stated, of_axis, strict=True):
+            problem.add_covariance(covariance, added)
+            variance[:, problem.axes] += moved
+    known, hidden = (
+        StatedFit(replace(fit, covariance=covariance), np.sqrt(variance)) for covariance, variance in stated
+    )
+    return known, hidden
 
 
 def _grid(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, Array]:
@@ -242,8 +267,10 @@ def _added(
     jacobian: Array,
     slow_error: Array,
     number_is_known: bool,
-) -> tuple[Array, Array]:
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis.
+
+    By slow errors only, and with a further tone.
 
     Args:
         measurements: As in ``with_further_tones``.
@@ -294,8 +321,13 @@ def _added(
     # 5. Mean over all frequencies, and slow errors with equal variances at the low frequencies.
     slow = frequencies * measurements.span[:, None] <= _SLOW
     slow_variance = slow * (np.square(slow_error) / np.maximum(slow.sum(1), 1))[:, None]
-    second = probability[..., None, None] * second + slow_variance[..., None, None] * eye
-    return (back @ second @ back.mT).sum(1), (moved * second[:, :, None]).sum((1, 3, 4))
+    of_slow_errors = slow_variance[..., None, None] * eye
+    with_tone = probability[..., None, None] * second + of_slow_errors
+    known, hidden = (
+        ((back @ part @ back.mT).sum(1), (moved * part[:, :, None]).sum((1, 3, 4)))
+        for part in (of_slow_errors, with_tone)
+    )
+    return known, hidden
 
 
 def _slow_errors(measurements: Measurements, fit: ToneFit) -> Array:

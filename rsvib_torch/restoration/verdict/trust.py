@@ -86,7 +86,7 @@ def trusted_vibration(
     """
     check_whole_number("num_frames", num_frames, at_least=1)
     check_whole_number("num_rows", num_rows, at_least=1)
-    vibration, std = detected.vibration, detected.std
+    vibration, std = detected.vibration, detected.std_if_hidden_tone or detected.std
     reliable = torch.as_tensor(detected.reliable, dtype=torch.bool, device=vibration.device)
     error, size = (
         value.to(vibration.device) for value in displacement_uncertainty(vibration, std, timing, num_frames, num_rows)
