@@ -37,6 +37,7 @@ class Measurements:
         average_times: Duration over which each displacement (x, y) is an average: rows of a band times the row time.
             Roll and zoom have that of x.
         independent: Fraction of the measurements that are independent (bands may overlap), one for all stacks or (B,).
+        groups: Groups of frames whose rows follow each other: rows N / groups apart show the same part of the scene.
     """
 
     exposure_starts: Array
@@ -46,6 +47,7 @@ class Measurements:
     exposure_time: float
     average_times: tuple[float, float] = (0.0, 0.0)
     independent: float | Array = 1.0
+    groups: int = 1
 
     @classmethod
     def of_pairs(

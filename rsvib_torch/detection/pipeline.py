@@ -29,6 +29,7 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
     shrunk,
     tone_displacements,
+    with_errors_of_blocks,
     with_unknown_errors,
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit
@@ -176,13 +177,14 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     fitted = method.fit(start, stacks, timing, options, hypothesis)
 
     # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
-    # for any errors; aliasing biases the displacements; the record may contain a further tone. The displacement is that
-    # of every eighth row of all frames.
+    # for any errors; a part of the scene has the same errors in all frames; aliasing biases the displacements; the
+    # record may contain a further tone. The displacement is that of every eighth row of all frames.
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     if fitted.refined is None:
         fit = with_unknown_errors(fitted.measurements, fitted.fit)
     else:
-        fit = without_aliasing(fitted.measurements, fitted.fit, fitted.refined.aliasing)
+        fit = with_errors_of_blocks(fitted.measurements, fitted.fit)
+        fit = without_aliasing(fitted.measurements, fit, fitted.refined.aliasing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(
         fitted.measurements, fit, row_starts, number_is_known=options.tones is not None

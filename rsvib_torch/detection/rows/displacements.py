@@ -449,10 +449,12 @@ def measure_groups(
     for group, of_group in zip(groups, known, strict=True):
         measured.append(measure_group(group, timing, motion, of_group))
         advance(group.count)
-    return joined_groups([part for part, _ in measured], timing.exposure_time), [of_group for _, of_group in measured]
+    count = sum(group.count for group in groups)
+    measurements = joined_groups([part for part, _ in measured], timing.exposure_time, count)
+    return measurements, [of_group for _, of_group in measured]
 
 
-def joined_groups(parts: list[MeasuredGroup], exposure_time: float) -> Measurements:
+def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int = 1) -> Measurements:
     """Measurements of all groups as one record, by one transfer to the CPU.
 
     Smaller groups get frames in which no row is visible.
@@ -468,7 +470,12 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float) -> Measureme
         return np.concatenate(padded, 1)
 
     measurements = Measurements(
-        joined(starts, "edge"), joined(displacements), joined(visible), np.concatenate(information, 1), exposure_time
+        joined(starts, "edge"),
+        joined(displacements),
+        joined(visible),
+        np.concatenate(information, 1),
+        exposure_time,
+        groups=groups,
     )
     return replace(measurements, displacements=measurements.relative(measurements.displacements))
 

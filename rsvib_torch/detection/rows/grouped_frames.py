@@ -191,7 +191,7 @@ class GroupedStrips(GroupedFrames):
             measured.append(measure_strips(group, self.timing, motion, view, self.strips, factors, of_group))
             advance()
         gradients = [of_group for _, of_group in measured]
-        measurements = joined_groups([part for part, _ in measured], self.timing.exposure_time)
+        measurements = joined_groups([part for part, _ in measured], self.timing.exposure_time, len(self.groups))
         return MeasuredRows(measurements, gradients, self._apart(gradients))
 
     def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Array:

@@ -40,6 +40,7 @@ __all__ = [
     "tone_response",
     "vibration_of_fit",
     "with_axes",
+    "with_errors_of_blocks",
     "with_tone_parameters",
     "with_tones",
     "with_unknown_errors",
@@ -300,6 +301,31 @@ class _Problem:
         covariance = columns.mT @ columns
         return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
 
+    def covariance_of_blocks(self, state: _Estimate) -> Array:
+        """Covariance (B, A P, A P) from the scatter of the residuals between blocks of the scene.
+
+        A block of rows shows the same part of the scene in all frames, whose errors need not be independent: with the
+        sums ``u_n`` of its whitened derivatives times residuals over all frames, it is ``H^-1 sum u_n u_n^T H^-1``
+        (Liang and Zeger, Biometrika 73, 13, 1986).
+        """
+        matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
+        inverse = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
+        columns = self._whitened(self.root, state.jacobian)
+        if self.to_all is not None:
+            columns = columns @ self.to_all
+        whitened = (self.root @ state.residual[..., None]).reshape(*columns.shape[:2], 1)
+        groups = self.measurements.groups
+        count = state.residual.shape[1] // groups
+        sums = (columns * whitened).reshape(len(columns), groups, count, -1, columns.shape[-1]).sum((1, 3))
+        meat = sums.mT @ sums
+        for lag in (1, 2):  # neighbours, with the weights of Newey and West
+            product = sums[:, lag:].mT @ sums[:, :-lag]
+            meat = meat + (1 - lag / 3) * (product + product.mT)
+        used = (np.abs(sums).max(-1) > 0).sum(-1)
+        spent = self.free.sum(-1) / self.axes
+        covariance = inverse @ meat @ inverse * (used / np.maximum(used - spent, 1.0))[:, None, None]
+        return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
+
     @staticmethod
     def _whitened(root: Array, jacobian: Array) -> Array:
         """Derivatives (B, N G A, A P) of the displacements times ``root``, from those of each axis (B, N, G, A, P)."""
@@ -427,6 +453,33 @@ def fit_tones(
     problem = _Problem(measurements, active, model or MotionModel())
     state = problem.solve(start, iterations, tolerance=1e-7)
     return problem.fit(state.values, problem.covariance(state, np.sqrt(problem.variances(state))))
+
+
+def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
+    """The fit with standard deviations that are at least those by the scatter of blocks of the scene.
+
+    Aliasing and fixed patterns depend on the scene, so that more frames do not average them out: in eight frames with
+    little text, the amplitude was wrong by 6 standard deviations without this step, and by 3 with it.
+
+    Args:
+        measurements: The measurements of the fit, with its weights.
+        fit: With the covariance of its parameters.
+    """
+    problem = _Problem(measurements, fit.active, fit.model)
+    fit = fit.about(measurements.centre)
+    of_blocks = problem.covariance_of_blocks(problem.evaluate(fit.parameters))
+    # along the amplitude and the phase of each tone
+    turn = np.broadcast_to(np.eye(of_blocks.shape[-1]), of_blocks.shape).copy()
+    size = turn.shape[-1] // fit.active.shape[1]
+    phase = np.angle(fit.coefficients)
+    for axis, tone in np.ndindex(*fit.active.shape[1:]):
+        re = axis * size + 3 * tone
+        cos, sin = np.cos(phase[:, axis, tone]), np.sin(phase[:, axis, tone])
+        turn[:, re, re], turn[:, re, re + 1], turn[:, re + 1, re], turn[:, re + 1, re + 1] = cos, sin, -sin, cos
+    stated, scatter = (turn @ values @ turn.mT for values in (fit.covariance, of_blocks))
+    ratio = scatter.diagonal(axis1=-2, axis2=-1) / np.maximum(stated.diagonal(axis1=-2, axis2=-1), 1e-300)
+    factor = np.sqrt(np.clip(without_nan(ratio, 1.0), 1.0, 1e4))
+    return replace(fit, covariance=turn.mT @ (stated * factor[:, :, None] * factor[:, None]) @ turn)
 
 
 def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
