@@ -68,8 +68,8 @@ class DetectedVibration(
         rows = [cells for _, cells in tone_rows(self.vibration, self.std, hidden=self.std_if_hidden_tone)]
         head = tone_head(axes=self.vibration.num_axes)
         table, *verdict = verdict_table(head, rows, self.batch_shape, self.reliable, self.reasons)
-        if any("(± " in cell for cells in rows for cell in cells):
-            verdict = ["(±): if another tone is hidden in the record", *verdict]
         if not self.batch_shape:
             verdict += [wrapped(f"assumed: {text}") for text in self.assumptions]
+        if any("(± " in cell for cells in rows for cell in cells):
+            verdict.append("(±): if another tone is hidden in the record")
         return "\n".join([table, *image_motion_line(self.vibration, self.std), *verdict])
