@@ -1,10 +1,12 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
+import os
 import shlex
+import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -94,8 +96,19 @@ def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
 
 
 def print_line(message: str) -> None:
-    """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
-    Console(highlight=False).print(Text(printable(message, lines=True)), soft_wrap=True)
+    """Print a text to standard output; long lines are not wrapped, and control codes are escaped.
+
+    Raises:
+        OSError: If it cannot be written, as in a pipe whose reader has ended.
+    """
+    try:
+        print(printable(message, lines=True), flush=True)
+    except OSError as error:
+        # what is left in the buffer would fail again at the exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise OSError(
+            f"the answer cannot be written to standard output ({error.strerror}); the files are complete"
+        ) from error
 
 
 def show_answer(command: str, answer: Answer) -> None:
@@ -130,13 +143,15 @@ def note(message: str) -> None:
 def error_line(message: str, kind: str = "error") -> None:
     """Print a message to standard error, with the prefix ``rsvib: error:``; control codes are escaped.
 
-    Lines are wrapped between words in a terminal, and not at all in a file or pipe.
+    Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
+    end of a terminal, the command continues.
     """
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)
     line = Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), printable(message))
-    console.print(line, soft_wrap=not console.is_terminal)
+    with suppress(OSError, SystemExit):  # rich exits if a pipe has no reader
+        console.print(line, soft_wrap=not console.is_terminal)
 
 
 @contextmanager
