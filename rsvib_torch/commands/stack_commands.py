@@ -60,7 +60,6 @@ if TYPE_CHECKING:
     from rsvib_torch.motion.timing import SensorTiming
     from rsvib_torch.report import Box
     from rsvib_torch.stacks import RestoredFrames, StackReport, WindowResult
-    from rsvib_torch.stacks.job import RestoreOptions
 
 __all__ = ["Stack", "detect", "load", "report", "restore_and_save", "restore_frames", "run", "simulate"]
 
@@ -572,7 +571,7 @@ def run(
         )
         _remove_old(out, results if overwrite else (), [path.name for path in answer.files])
         return answer
-    common: RestoreOptions = {
+    common: dict[str, Any] = {
         "window": frames_at_once,
         "detection": settings.detection,
         "restoration": options,

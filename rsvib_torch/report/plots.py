@@ -190,10 +190,8 @@ def offset_figure(result: DetectionResult) -> Figure:
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
         >>> [panel.get_ylabel() for panel in rsv.offset_figure(detection).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
@@ -243,20 +241,12 @@ def windows_figure(
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
+        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
         >>> manifest = rsv.read_manifest(report.manifest)
         >>> starts = [window.start_time for window in manifest.windows]
         >>> figure = rsv.windows_figure(starts, manifest.detections())
@@ -448,10 +438,8 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
         >>> rsv.gain_figure(detection, timing).axes[-1].get_xlabel()
         'frequency (Hz)'

@@ -137,10 +137,8 @@ class FixedDewarp(nn.Module):
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> dewarp = rsv.FixedDewarp(timing, vibration, frames.shape[-2:], num_frames=2)
         >>> program = torch.export.export(dewarp, (frames,))
         >>> expected = rsv.restore(frames, timing, vibration, method="dewarp", check=False)

