@@ -36,7 +36,7 @@ else:  # arrays are checked where they are used
 
 FilePath = str | os.PathLike[str] | None
 OptionTable = Mapping[str, Any] | None
-Detections = Sequence[Any] | None  # of ``DetectedVibration`` or None
+Detections = Sequence[Any] | None  # entries are ``DetectedVibration`` or None
 Progress = Callable[[int, int], None] | None
 BorderName = Literal["mirror", "hold", "crop"]
 BadFrames = Literal["pass", "skip"]
@@ -52,6 +52,8 @@ RestorationName = Literal["exact", "banded", "dewarp", "richardson-lucy"]
 StmapConvention = Literal["nuke", "opencv"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
+Columns = Annotated[int, Field(ge=64, le=2**31)]  # px; narrower bands are often registered wrongly
+Frames = Annotated[int, Field(ge=2, le=2**31)]
 COMMAND_LINE: Any = {"command_line": True}  # mark of fields that are options of commands as well
 MAX_TONES = 4  # tones of one axis; a record of a few frames does not resolve more
 MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
@@ -151,7 +153,7 @@ class ToneOptions(ProjectionOptions, RegistrationOptions):
         description="Number of multiples of every tone, with one common base frequency; 1 for independent tones.",
     )
     image_acceleration: bool = Field(default=False, description="Whether the image motion has a constant acceleration.")
-    columns: Annotated[int, Field(ge=64, le=2**31)] | None = Field(  # px; narrower bands are often registered wrongly
+    columns: Columns | None = Field(
         default=None,
         description="Use only this number of neighbouring columns, those with the most detail: all columns contain the "
         "same vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.",
@@ -444,8 +446,8 @@ class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
 class NoiseGainOptions(RestorationOptions, InputOptions):
     """Options of ``predict_noise_gain``."""
 
-    columns: int = Field(
-        default=256, ge=64, le=2**31, description="Width of the strip across the scan, from the middle of the frames."
+    columns: Columns = Field(
+        default=256, description="Width of the strip across the scan, from the middle of the frames."
     )
 
 
@@ -453,13 +455,11 @@ class NoiseGainOptions(RestorationOptions, InputOptions):
 class FollowingOptions:
     """How a vibration is followed from frame to frame."""
 
-    window: int = Field(
+    window: Frames = Field(
         default=8,
-        ge=2,
-        le=2**31,
         description="Number of frames from which the vibration is detected at the start, and again if tracking fails.",
     )
-    columns: Annotated[int, Field(ge=64, le=2**31)] | None = Field(
+    columns: Columns | None = Field(
         default=384, description="Columns that are measured, those with the most detail; None for all."
     )
 
@@ -485,10 +485,8 @@ class TrackerOptions(FollowingOptions, RestorationOptions, InputOptions):
 class WindowSize:
     """Length of the windows that a stack is cut into."""
 
-    window: int = Field(
+    window: Frames = Field(
         default=8,
-        ge=2,
-        le=2**31,
         json_schema_extra=COMMAND_LINE,
         description="Largest number of frames in which one vibration is detected.",
     )

@@ -22,32 +22,6 @@ if TYPE_CHECKING:
 
     from rsvib_torch.io import StackInfo
 
-__all__ = [
-    "READOUT_HELP",
-    "CameraSettings",
-    "DeviceName",
-    "DeviceOption",
-    "ForceOption",
-    "FrameRateOption",
-    "FramesArgument",
-    "MemoryOption",
-    "OverwriteOption",
-    "RestorationArguments",
-    "RestoredArgument",
-    "ScaleOption",
-    "WorkersOption",
-    "check_new",
-    "file_of_source",
-    "full_scale_of",
-    "rate",
-    "restoration_options",
-    "restored_shape",
-    "seconds",
-    "sensor_forms",
-    "stated_rate",
-    "torch_device",
-]
-
 DeviceName = Literal["auto", "cpu", "cuda"]
 _TIMES = {"row_time": "--row-time", "exposure_time": "--exposure", "frame_rate": "--frame-rate"}  # required keys
 
@@ -56,9 +30,6 @@ _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10*
 
 def seconds(text: str) -> float:
     """A time in seconds: a number or a fraction, with or without a unit.
-
-    Raises:
-        BadParameter: If it is neither.
 
     Example:
         >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
@@ -73,9 +44,6 @@ def seconds(text: str) -> float:
 
 def rate(text: str) -> float:
     """Frames per second: a number or a fraction.
-
-    Raises:
-        BadParameter: If it is neither.
 
     Example:
         >>> round(rate("30000/1001"), 6)
@@ -305,7 +273,7 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
     return info.full_scale
 
 
-def restoration_options(
+def _restoration_options(
     info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line.
@@ -343,7 +311,16 @@ def restoration_options(
     return options
 
 
+def planned_restoration(
+    frames: Path, config: Config, full_scale: float | None, given: Mapping[str, Any] | None = None
+) -> "tuple[StackInfo, float | None, dict[str, Any]]":
+    """What the file of a stack states, its full scale, and the options of its restoration."""
+    info = io.read_stack_info(frames)
+    scale = full_scale_of(frames, info, config, full_scale)
+    return info, scale, _restoration_options(info, scale, config, given)
+
+
 def restored_shape(info: "StackInfo", options: Mapping[str, Any]) -> tuple[int, ...]:
-    """Shape of the restored frames of a stack, with options as from ``restoration_options``."""
+    """Shape of the restored frames of a stack, with options as from ``_restoration_options``."""
     shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
     return (1, *shape[1:]) if options.get("joint") is True else shape
