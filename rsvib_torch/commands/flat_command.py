@@ -12,8 +12,6 @@ from rsvib_torch.commands.terminal import Answer, output_of, show_answer
 from rsvib_torch.core.validation import fields_of, members_of
 from rsvib_torch.options import COMMAND_LINE
 
-__all__ = ["MadeBy", "flat_command", "group_arguments"]
-
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the answer as JSON on standard output, and nothing else there.")
 ]
@@ -55,7 +53,7 @@ def _options_of(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
 
 
 def _called(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
-    """Call a function with those of the options that are its arguments, made of several options where it says so."""
+    """Call a function with the options that are its arguments; those with the mark ``MadeBy`` are made of several."""
     values = {}
     for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
         build = _build_of(parameter)

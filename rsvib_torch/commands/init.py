@@ -21,8 +21,6 @@ from rsvib_torch.core.text import printable
 from rsvib_torch.core.validation import MistakesError, fields_of
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["init", "sensor_toml"]
-
 # How to find each value of [sensor]: comments of the file, and the text of questions and errors.
 _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
 
@@ -196,12 +194,7 @@ def _check_timing(timing: SensorTiming, rows: int) -> None:
 
 
 def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:
-    """Text of a configuration file with the table ``[sensor]``.
-
-    Args:
-        values: Values by key; the key of an unknown value (None) is a comment to be completed.
-        head: Lines of comments at the top.
-    """
+    """Text of a configuration file with the table ``[sensor]``; the key of an unknown value (None) is a comment."""
 
     def comment(text: str) -> list[str]:
         return textwrap.wrap(text, 76, initial_indent="# ", subsequent_indent="# ")

@@ -16,8 +16,6 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residual_of
 from rsvib_torch.detection.tones.selection import robust_fit
 
-__all__ = ["Acceleration", "Step", "is_converged"]
-
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 # A step was inexact if the next round corrects more than this part of it. Without long exposures, 0.1 is corrected
 _INEXACT = 0.3
@@ -26,15 +24,10 @@ _MAX_EXTRAPOLATION = 4.0  # steps
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A round of measuring and fitting, as relative displacements (B, N, G, A) of the rows in px.
+    """A round of measuring and fitting, as relative displacements (B, N, G, A) of the rows in px."""
 
-    Attributes:
-        fitted: Displacements by the fitted motion.
-        change: ``fitted`` less the displacements by the motion that the frames were warped by.
-    """
-
-    fitted: Array
-    change: Array
+    fitted: Array  # displacements by the fitted motion
+    change: Array  # ``fitted`` less the displacements by the motion that the frames were warped by
 
     @classmethod
     def between(cls, measurements: Measurements, warped_by: ToneFit, fitted: ToneFit) -> "Step":

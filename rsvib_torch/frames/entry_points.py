@@ -15,19 +15,6 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = [
-    "FileFunction",
-    "FramesFunction",
-    "SourceFunction",
-    "VibrationFunction",
-    "entry_point",
-    "file_options",
-    "frames_options",
-    "module_options",
-    "source_options",
-    "vibration_options",
-]
-
 P = ParamSpec("P")
 Module = TypeVar("Module")
 Options = TypeVar("Options")

@@ -19,15 +19,6 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks import RestoredFrames, StackManifest
 
-__all__ = [
-    "check_same_timing",
-    "read_vibration",
-    "write_offsets",
-    "write_restoration",
-    "write_vibration",
-    "write_windows",
-]
-
 
 @checks_arguments
 def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
@@ -103,16 +94,7 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
 
 
 def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -> None:
-    """Check that a stored detection was made with the timing of the frames that are to be restored.
-
-    Args:
-        source: File of the detection, for the message.
-        stored: Timing in that file.
-        timing: Timing of the frames.
-
-    Raises:
-        ValueError: If they differ by more than rounding.
-    """
+    """Raise an error if a detection was stored with another timing than that of the frames to be restored."""
     theirs, ours = stored.to_dict(), timing.to_dict()
     different = [name for name in ours if not _equal(theirs[name], ours[name])]
     if different:

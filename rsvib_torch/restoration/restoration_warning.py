@@ -3,8 +3,6 @@
 import sys
 import warnings
 
-__all__ = ["RestorationWarning", "warn_of_restoration"]
-
 
 class RestorationWarning(UserWarning):
     """A restored frame may be worse than the raw one, or a part of the vibration was not undone.

@@ -29,8 +29,6 @@ from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
 from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
 
-__all__ = ["StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
-
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
 
 
@@ -81,33 +79,21 @@ class StoredWindow:
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Everything on which the result of a window depends, except its frames.
+    """Everything on which the result of a window depends, except its frames."""
 
-    Attributes:
-        source: The stack.
-        info: What its file states.
-        timing: Timing of the whole stack.
-        full_scale: Count that corresponds to 1.0; None for floats.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; None for detection only.
-        given: Detections to use instead, by number of the window; None where a window has none.
-        bad_frames: Whether frames that cannot be used are written unchanged or omitted.
-        force: Whether to write restored frames even if they are judged worse than the raw ones.
-        device: Device for the computation.
-        window: Maximum number of frames of a window.
-    """
-
-    source: Path
-    info: StackInfo
-    timing: SensorTiming
-    full_scale: float | None
-    detection: Mapping[str, Any] = field(default_factory=dict)
+    source: Path  # the stack
+    info: StackInfo  # what its file states
+    timing: SensorTiming  # timing of the whole stack
+    full_scale: float | None  # count that corresponds to 1.0; None for floats
+    detection: Mapping[str, Any] = field(default_factory=dict)  # options of ``detect_vibration``
+    # options of ``restore``, for frames whose full scale is 1; None for detection only
     restoration: Mapping[str, Any] | None = field(default_factory=dict)
+    # detections to use instead, by number of the window; None where a window has none
     given: Mapping[int, DetectedVibration | None] | None = None
-    bad_frames: BadFrames = "pass"
-    force: bool = False
-    device: str = "cpu"
-    window: int = StackOptions.window
+    bad_frames: BadFrames = "pass"  # whether frames that cannot be used are written unchanged or omitted
+    force: bool = False  # whether to write restored frames even if they are judged worse than the raw ones
+    device: str = "cpu"  # device for the computation
+    window: int = StackOptions.window  # maximum number of frames of a window
 
     @property
     def joined(self) -> bool:
@@ -133,12 +119,7 @@ class StackJob:
         return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
-        """Detect the vibration in a window, restore its frames and judge the result.
-
-        Args:
-            window: The window.
-            pixels: Its frames, or why they cannot be read.
-        """
+        """Detect the vibration in a window, restore its frames and judge the result."""
         faults: dict[int, str] = {}
         nodata = self.info.nodata
         usable: dict[int, NDArray[Any]] = {}
@@ -284,15 +265,8 @@ def plan_job(
 ) -> tuple[StackJob, list[Window], int]:
     """The job of a run, its windows, and how many of them to compute at once.
 
-    Args:
-        source: The stack.
-        timing: The sensor.
-        options: Options of the run; frames are restored if they are ``StackOptions``.
-        here: Whether windows are computed on this machine, in the memory that is free.
-
-    Raises:
-        OSError: If the stack cannot be read.
-        ValueError: If an option contradicts the stack, or a window does not fit into the memory.
+    Frames are restored if the options are ``StackOptions``. The free memory limits the number of windows that are
+    computed ``here``, on this machine.
     """
     info = read_stack_info(source)
     full_scale = None

@@ -19,8 +19,6 @@ from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.stacks.job import StackJob
 
-__all__ = ["StackManifest", "WindowRecord", "fingerprint", "manifest_header", "read_manifest", "write_manifest"]
-
 
 @dataclass(frozen=True, eq=False)
 class WindowRecord:
@@ -177,19 +175,10 @@ def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> 
 
 
 def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: int = 32) -> dict[str, Any]:
-    """Name, size and hash of a file or folder.
+    """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
     The hash covers the names and sizes of all files, and evenly spaced blocks of them that include the first and the
     last; with the defaults, files of up to 2 MiB completely.
-
-    Args:
-        path: The file or folder; a file ``NAME.json`` beside a file is included.
-        block: Bytes per block.
-        blocks: Maximum number of blocks of a file.
-        files: Maximum number of files of a folder whose blocks are read.
-
-    Raises:
-        OSError: If it cannot be read.
     """
 
     def spread(count: int, most: int) -> list[int]:
@@ -242,15 +231,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
 def write_manifest(
     path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
 ) -> None:
-    """Write a manifest with one line per key and window; records are not kept in memory.
-
-    Args:
-        path: Temporary name of the file.
-        header: As made by ``manifest_header``.
-        records: Contents of ``WindowRecord``.
-        not_kept: Metadata of the input that the output does not contain.
-        **results: Further keys of ``StackManifest``.
-    """
+    """Write a manifest with one line per key and ``WindowRecord``; records are not kept in memory."""
     units = {
         "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
         "amplitude": "px",

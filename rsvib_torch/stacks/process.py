@@ -26,8 +26,6 @@ from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_
 from rsvib_torch.stacks.run_folder import RunFolder, check_space, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
 
-__all__ = ["detect_stack", "iterate_stack", "process_stack"]
-
 _UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
 _MAX_INITIAL_FAILURES = 8  # windows; a run stops if all windows up to this number fail
 

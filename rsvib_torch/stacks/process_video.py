@@ -40,8 +40,6 @@ from rsvib_torch.stacks.video_passes import PART_FRAMES, VideoPasses
 from rsvib_torch.stacks.video_tracks import FrameTrack
 from rsvib_torch.tracking import Margins
 
-__all__ = ["process_video"]
-
 _MAX_INITIAL_FAILURES = 8  # parts; a run stops if the motion is known in none of them
 
 Frame = NDArray[Any]

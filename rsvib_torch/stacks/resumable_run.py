@@ -15,8 +15,6 @@ from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import read_manifest, write_manifest
 from rsvib_torch.stacks.run_folder import RunFolder, describe_difference, disk_errors_named, work_folder
 
-__all__ = ["StackReport", "manifest_path", "run_to_file"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StackReport(Summarised):
@@ -89,23 +87,8 @@ def run_to_file(
 ) -> StackReport:
     """Compute the windows of a run that are not finished, and write the output and its manifest.
 
-    Args:
-        sink: The output.
-        manifest: Path of the manifest.
-        header: As from ``manifest_header``.
-        windows: Number of windows.
-        resume: Whether to continue an interrupted run; a complete output is not changed.
-        compute: Adds the missing windows to the folder, and returns results of the whole run for the manifest.
-        write: Writes the output from the folder.
-        not_kept: Metadata that the output does not contain, for its number of frames.
-
-    Returns:
-        Summary of the run.
-
-    Raises:
-        FileExistsError: If there is an interrupted run and ``resume`` is False.
-        OSError: If a file cannot be written; the run can then be resumed.
-        ValueError: If a run cannot be resumed.
+    ``compute`` adds the missing windows to the folder and returns further keys of the manifest; ``write`` writes the
+    output from the folder; ``not_kept`` names the metadata that an output of a number of frames does not contain.
     """
     start = time.perf_counter()
 

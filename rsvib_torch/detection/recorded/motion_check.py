@@ -29,8 +29,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OffsetOptions
 
-__all__ = ["MotionCheck", "check_motion"]
-
 _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 P = ParamSpec("P")

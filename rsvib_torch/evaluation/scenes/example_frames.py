@@ -7,8 +7,6 @@ from rsvib_torch.imaging import simulate_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["example_frames"]
-
 
 def example_frames(num_frames: int = 2) -> tuple[Tensor, SensorTiming, Vibration]:
     """Frames of a landscape from a vibrating camera, for examples and first steps.

@@ -12,8 +12,6 @@ from torch import Tensor
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 
-__all__ = ["FILLED_BLUR_REACH", "measured_values", "with_extension", "with_missing_values"]
-
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame
 FILLED_BLUR_REACH = 1.0
 # px beyond four times the reach. With 64, frames behind exposures of 200 and 400 rows gain up to 0.03 dB with 3 px and
