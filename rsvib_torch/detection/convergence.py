@@ -50,12 +50,8 @@ def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
     """(B, A) bool, whether the last round changed the tones of an axis so little that the next one need not be made.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
-    are therefore small enough, and up to three standard deviations if the measured ratio of two steps allows it.
-
-    Args:
-        previous: The fit of the previous round.
-        fit: The fit of this round.
-        ratio: (B,) length of the last step over that of the step before; None if unknown.
+    are therefore small enough, and up to three standard deviations if the measured ratio (B,) of the last two steps
+    allows it.
     """
     if previous.active.shape != fit.active.shape:
         return np.zeros_like(fit.active[..., 0])

@@ -265,12 +265,8 @@ def rotation_reasons(
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
 
-    Args:
-        axis: The axis, in row order.
-        axes: Number of components of the motion.
-        differential: (2,) px, rms difference of the displacements along a row that the motion does not explain.
-        size: px, rms offset along the axis.
-        remedy: Value of ``roll`` and ``zoom`` with which they are measured.
+    ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
+    ``size`` px the rms offset along the axis, and ``remedy`` the value of roll and zoom with which they are measured.
     """
     apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
     if apart <= allowed:

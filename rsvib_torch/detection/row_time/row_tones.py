@@ -193,13 +193,8 @@ def candidates(
 ) -> list[Candidate]:
     """All row times with ``low <= |T_row| <= high`` that are a local minimum of chi-square, the best first.
 
-    Args:
-        frequencies: (K, 2) cycles per row and per frame.
-        covariances: (K, 2, 2).
-        period: Frame period P in s.
-        low: Shortest row time in s.
-        high: Longest row time in s.
-        floor: Cycles; error of phi that is assumed in addition.
+    Frequencies (K, 2) are in cycles per row and per frame, with covariances (K, 2, 2); times are in s. ``floor`` is an
+    error of phi in cycles that is assumed in addition.
     """
     nu, phi = frequencies.unbind(-1)
 

@@ -319,14 +319,10 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
 
 
 def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[list[Reason]]:
-    """Reasons against a motion of each axis in row order that the offsets of row bands contradict.
+    """Reasons against a motion of each axis in row order that the offsets of row bands of one stack contradict.
 
-    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
-
-    Args:
-        banded: Offsets of the bands of one stack, from ``measurements_of_curve``.
-        motion: The motion (not a batch).
-        counted: Fraction of the bands that count, the best ones: clouds may cover the others.
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it. The best
+    bands count, a fraction ``counted``: clouds may cover the others.
     """
     used = banded.weights[0].min(-1) > 0
     values, rest = (x[0, used, 1] - x[0, used, 0] for x in (banded.displacements, residual_of_motion(banded, motion)))
@@ -474,11 +470,8 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     between a for given s, and s_j = mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the
     penalty.
 
-    Args:
-        gram: (N, N) normal matrix of the coefficients.
-        right: (N,) right-hand side.
-        noise: Variance of measurements of unit weight.
-        smoothness: Weight of the squares of second differences in the sum of squares, to start with.
+    ``gram`` (N, N) and ``right`` (N,) are the normal equations, ``noise`` is the variance of measurements of unit
+    weight, and ``smoothness`` the weight of squared second differences to start with.
     """
     count = len(right)
     margin = max(10, count // 16)  # knots beyond the record, as cosines have zero slope at their ends

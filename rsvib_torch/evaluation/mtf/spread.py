@@ -172,12 +172,9 @@ def posterior(
 ) -> Posterior:
     """Average over priors, each weighted by its restricted likelihood, for noise of variance 1.
 
-    Args:
-        matrix: Of the normal equations of all parameters.
-        right: Their right side.
-        roots: (P, K, K) square roots of the prior covariances of the departure's coefficients at strength 1.
-        contrast: () of the edge.
-        shadings: Standard deviations of the slopes of the sides across the edge over the contrast, per half ROI.
+    ``matrix`` and ``right`` are the normal equations of all parameters, ``roots`` (P, K, K) square roots of the prior
+    covariances of the departure at strength 1. ``shadings`` are standard deviations of the slopes of the sides across
+    the edge over the contrast, per half ROI.
     """
     size = matrix.diagonal()[:_FREE].sqrt()
     size = size.clamp(min=1e-12 * float(size.max()))
