@@ -19,36 +19,15 @@ from rich.text import Text
 from rsvib_torch.core.progress import listening
 from rsvib_torch.core.text import json_text, printable, wrapped
 
-__all__ = [
-    "Answer",
-    "counting",
-    "error_line",
-    "note",
-    "output_of",
-    "print_line",
-    "running",
-    "running_command",
-    "show_answer",
-    "warnings_in_one_line",
-    "working",
-]
-
 
 @dataclass
 class Answer:
-    """What a command found and did: the last thing that it prints.
+    """What a command found and did: the last thing that it prints."""
 
-    Attributes:
-        results: Titles of the results, and their lines.
-        data: The same for ``--json``, values that JSON can store.
-        files: Files that were written, the one to open first in front.
-        next_steps: What to do next: sentences and commands.
-    """
-
-    results: dict[str, list[str]]
-    data: dict[str, Any]
-    files: list[Path] = field(default_factory=list)
-    next_steps: list[str] = field(default_factory=list)
+    results: dict[str, list[str]]  # titles of the results, and their lines
+    data: dict[str, Any]  # the same for ``--json``, values that JSON can store
+    files: list[Path] = field(default_factory=list)  # files that were written, the one to open first in front
+    next_steps: list[str] = field(default_factory=list)  # what to do next: sentences and commands
 
 
 @dataclass
@@ -82,12 +61,7 @@ def running_command() -> str | None:
 
 @contextmanager
 def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
-    """Form of the output of a command.
-
-    Args:
-        as_json: Whether its answer is printed as JSON.
-        quiet: Whether no text and no progress is printed.
-    """
+    """Form of the output of a command: its answer as JSON, or neither text nor progress."""
     _outputs.append(_Output(as_json, quiet))
     try:
         yield
