@@ -21,8 +21,6 @@ from rsvib_torch.core.validation import Count, Section, checked, validate
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 
-__all__ = ["Config", "ConfigFile", "SensorSection", "presets", "read_config", "simulation_section"]
-
 _MAX_BYTES = 10**7  # start times of 500,000 frames
 _MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
 _AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them

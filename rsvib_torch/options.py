@@ -8,6 +8,8 @@ Configuration files and command lines are checked before torch is imported, whic
 imports no other part of the package. The tables of the packages hold the functions that belong to the names.
 """
 
+import os
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, SkipValidation
@@ -24,8 +26,6 @@ from rsvib_torch.core.validation import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from rsvib_torch.core.arrays import ArrayLike
 
     Mask = ArrayLike | None
@@ -34,6 +34,10 @@ else:  # arrays are checked where they are used
     Mask = Any
     Curve = list[list[float]]
 
+FilePath = str | os.PathLike[str] | None
+OptionTable = Mapping[str, Any] | None
+Detections = Sequence[Any] | None  # entries are ``DetectedVibration`` or None
+Progress = Callable[[int, int], None] | None
 BorderName = Literal["mirror", "hold", "crop"]
 BadFrames = Literal["pass", "skip"]
 Channels = Literal["first", "last"] | None
@@ -48,6 +52,8 @@ RestorationName = Literal["exact", "banded", "dewarp", "richardson-lucy"]
 StmapConvention = Literal["nuke", "opencv"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
+Columns = Annotated[int, Field(ge=64, le=2**31)]  # px; narrower bands are often registered wrongly
+Frames = Annotated[int, Field(ge=2, le=2**31)]
 COMMAND_LINE: Any = {"command_line": True}  # mark of fields that are options of commands as well
 MAX_TONES = 4  # tones of one axis; a record of a few frames does not resolve more
 MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
@@ -147,7 +153,7 @@ class ToneOptions(ProjectionOptions, RegistrationOptions):
         description="Number of multiples of every tone, with one common base frequency; 1 for independent tones.",
     )
     image_acceleration: bool = Field(default=False, description="Whether the image motion has a constant acceleration.")
-    columns: Annotated[int, Field(ge=64, le=2**31)] | None = Field(  # px; narrower bands are often registered wrongly
+    columns: Columns | None = Field(
         default=None,
         description="Use only this number of neighbouring columns, those with the most detail: all columns contain the "
         "same vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.",
@@ -440,25 +446,29 @@ class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
 class NoiseGainOptions(RestorationOptions, InputOptions):
     """Options of ``predict_noise_gain``."""
 
-    columns: int = Field(
-        default=256, ge=64, le=2**31, description="Width of the strip across the scan, from the middle of the frames."
+    columns: Columns = Field(
+        default=256, description="Width of the strip across the scan, from the middle of the frames."
     )
 
 
 @options
-class TrackerOptions(RestorationOptions, InputOptions):
+class FollowingOptions:
+    """How a vibration is followed from frame to frame."""
+
+    window: Frames = Field(
+        default=8,
+        description="Number of frames from which the vibration is detected at the start, and again if tracking fails.",
+    )
+    columns: Columns | None = Field(
+        default=384, description="Columns that are measured, those with the most detail; None for all."
+    )
+
+
+@options
+class TrackerOptions(FollowingOptions, RestorationOptions, InputOptions):
     """Options of ``VibrationTracker``."""
 
     method: RestorationName = Field(default="dewarp", description='Method of ``restore``; ``"dewarp"`` is the fastest.')
-    window: int = Field(
-        default=8,
-        ge=2,
-        le=2**31,
-        description="Number of frames from which the vibration is detected at the start, and again if tracking fails.",
-    )
-    columns: Annotated[int, Field(ge=64, le=2**31)] | None = Field(
-        default=384, description="Columns that are measured, those with the most detail; None for all."
-    )
     steady: NotNegative = Field(
         default=0.0,
         description="s; the image is moved to the straight line that fits its path during this time, so that slow "
@@ -472,19 +482,126 @@ class TrackerOptions(RestorationOptions, InputOptions):
 
 
 @options
-class WindowOptions:
-    """Processing of stacks in windows."""
+class WindowSize:
+    """Length of the windows that a stack is cut into."""
 
-    window: int = Field(
+    window: Frames = Field(
         default=8,
-        ge=2,
-        le=2**31,
         json_schema_extra=COMMAND_LINE,
         description="Largest number of frames in which one vibration is detected.",
     )
+
+
+@options
+class WindowOptions(WindowSize):
+    """Processing of stacks in windows."""
+
     bad_frames: BadFrames = Field(
         default="pass",
         json_schema_extra=COMMAND_LINE,
         description='Frames that cannot be read or used: ``"pass"`` writes them unchanged (a frame that cannot be read '
         'as NaN, or 0 for integers), ``"skip"`` leaves them out.',
+    )
+
+
+@options
+class ResourceOptions:
+    """Memory, threads and device of a run, and the full scale of its stack."""
+
+    full_scale: Positive | None = Field(default=None, description="As in ``read_stack``.")
+    memory: str | float | None = Field(
+        default=None,
+        description='Limit for the memory of the process, in bytes or like ``"2GB"``; by default three quarters of the '
+        "memory that is free or used by the process. It does not limit Dask workers.",
+    )
+    workers: Annotated[int, Field(ge=1)] | None = Field(
+        default=None,
+        description="Largest number of windows, or of frames of a video, to compute at once; by default the number of "
+        "processors. Of local Dask workers, the number of processes.",
+    )
+    device: str = Field(default="auto", description='``"auto"``, ``"cpu"`` or ``"cuda"``.')
+
+
+@options
+class StackDetectionOptions(WindowSize, ResourceOptions):
+    """Detection in windows."""
+
+    detection: OptionTable = Field(default=None, description="Options of ``detect_vibration``.")
+
+
+@options
+class StackOptions(StackDetectionOptions):
+    """Options of ``iterate_stack``."""
+
+    restoration: OptionTable = Field(
+        default=None,
+        description="Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window "
+        "becomes one image.",
+    )
+    force: bool = Field(
+        default=False, description="Whether to keep restored frames even if they are judged worse than the raw ones."
+    )
+
+
+@options
+class ProgressOptions:
+    """What is called while a stack is processed."""
+
+    progress: Progress = Field(default=None, description="Called with the number of complete frames and of all frames.")
+
+
+@options
+class DetectStackOptions(StackDetectionOptions, ProgressOptions):
+    """Options of ``detect_stack``."""
+
+
+@options
+class RunOptions(ProgressOptions):
+    """A run from file to file."""
+
+    resume: bool = Field(
+        default=False, description="Whether to continue an interrupted run; a complete output is not changed."
+    )
+    manifest: FilePath = Field(
+        default=None, description="Path of the manifest; by default ``sink`` with ``.manifest.json`` appended."
+    )
+
+
+@options
+class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
+    """Options of ``process_stack``."""
+
+    given: Detections = Field(
+        default=None, description="Detections to use instead, one for each window (see ``read_manifest``)."
+    )
+    scheduler: str | None = Field(
+        default=None,
+        description='Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` '
+        "starts workers on this machine; None computes in this process.",
+    )
+    compression: str | None = Field(default=None, description="As in ``write_stack``.")
+
+
+@options
+class ProcessVideoOptions(RunOptions, FollowingOptions, ResourceOptions):
+    """Options of ``process_video``; both passes of ``border="crop"`` count as half of the progress."""
+
+    border: BorderName = Field(
+        default="mirror",
+        description='Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself; '
+        '``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins, for which the video is read '
+        "twice.",
+    )
+    steady: NotNegative = Field(
+        default=0.0,
+        description="s; every frame is moved to the mean of its path in the interval of this length around it: "
+        "vibration, rolling-shutter wobble and shaking are removed, slow motion is kept. 0: frames stay where they "
+        "are.",
+    )
+    restoration: OptionTable = Field(
+        default=None,
+        description='``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames '
+        "whose full scale is 1. Without ``saturation``, saturated pixels count as measured: their values are restored "
+        "0.2 dB worse if 1 % of the pixels are saturated, in a quarter of the time. Not ``joint``, ``scale``, "
+        "``mosaic`` or ``optics``.",
     )

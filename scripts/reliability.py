@@ -53,6 +53,7 @@ ATTACKS: dict[str, Attack] = {
     "inputs": Attack("outputs that are or contain inputs", 250),
     "concurrent": Attack("several runs with one output", 45),
     "disks": Attack("full and read-only disks", 69),
+    "live_sessions": Attack("recordings of a camera", 32),
     "memory": Attack("`--memory` in different layouts", 17),
     "crafted": Attack("crafted files", 200),
     "workers": Attack("killed and missing Dask workers", 9),

@@ -28,8 +28,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["RollingShutterVibration"]
-
 Range = float | Sequence[float] | Sequence[Sequence[float]]
 Parameters = dict[str, Tensor]
 _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
@@ -37,21 +35,13 @@ _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
 
 @dataclass(frozen=True, eq=False)
 class ImageMotion:
-    """Motion of B images in row order, each with its own vibration, start and exposure.
+    """Motion of B images in row order, each with its own vibration, start and exposure."""
 
-    Attributes:
-        vibration: Motion of batch shape (B,).
-        starts: (B,) exposure start of the first row of each image, seconds.
-        exposure_time: (B,) seconds.
-        timing: The sensor; its exposure is not used.
-        size: (rows, columns) of the images.
-    """
-
-    vibration: Motion
-    starts: Tensor
-    exposure_time: Tensor
-    timing: RowTiming
-    size: tuple[int, int]
+    vibration: Motion  # motion of batch shape (B,)
+    starts: Tensor  # (B,) exposure start of the first row of each image, seconds
+    exposure_time: Tensor  # (B,) seconds
+    timing: RowTiming  # the sensor; its exposure is not used
+    size: tuple[int, int]  # (rows, columns) of the images
 
     @property
     def turns(self) -> bool:
@@ -184,10 +174,6 @@ def _axis_ranges(
     name: str, value: Range, *, at_least: float = -math.inf
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lowest and highest value of the axes x and y, from a number or a range for both or for each.
-
-    Raises:
-        TypeError: If the value is none of these.
-        ValueError: If low exceeds high, or a value is less than ``at_least``.
 
     Example:
         >>> _axis_ranges("amplitude", (1.0, 2.0))

@@ -18,8 +18,6 @@ from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.io.stack_reading import FramesOrFiles
 
-__all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]
-
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 

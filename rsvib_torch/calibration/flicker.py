@@ -16,41 +16,22 @@ from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.frames.prepare import as_float_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 
-__all__ = ["BandFit", "Profiles", "SceneModel", "find_bands", "row_profiles"]
-
 SceneModel = Literal["smooth", "fixed"]
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """Brightness of rows.
+    """Brightness of rows."""
 
-    Attributes:
-        rows: (T, H) float64, mean over the columns of each row, first row of the image first.
-        parts: (T, P, H) float64, the same for parts of the columns side by side.
-        clipped: Fraction of all pixels that are saturated.
-    """
-
-    rows: Tensor
-    parts: Tensor
-    clipped: float
+    rows: Tensor  # (T, H) float64, mean over the columns of each row, first row of the image first
+    parts: Tensor  # (T, P, H) float64, the same for parts of the columns side by side
+    clipped: float  # fraction of all pixels that are saturated
 
 
 def row_profiles(
     frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels = None
 ) -> Profiles:
-    """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W).
-
-    Args:
-        frames: The stack; floats of full scale 1, integers, or files.
-        scan_axis: The axis along which rows follow each other, as in ``SensorTiming``.
-        full_scale: Count that means 1.0, for integers.
-        gamma: Pixels are raised to this power to make them proportional to light.
-        channels: As in ``prepare_frames``.
-
-    Raises:
-        ValueError: If the frames are black, saturated or too small.
-    """
+    """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W)."""
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
     check_number("gamma", gamma, above=0.0, at_most=4.0)
     loaded = load_frames(frames, full_scale)
@@ -76,27 +57,16 @@ def row_profiles(
 
 @dataclass(frozen=True, eq=False)
 class BandFit:
-    """Bands of period P rows: ``y_p(i) = s_p(i) (1 + sum_k Re[c_pk exp(-2 pi j k i / P)])``.
+    """Bands of period P rows: ``y_p(i) = s_p(i) (1 + sum_k Re[c_pk exp(-2 pi j k i / P)])``."""
 
-    Attributes:
-        period: P in rows.
-        period_std: Its standard deviation in rows, from the residuals with their correlation.
-        coefficients: (T, K) complex128, waveform of each frame over its mean.
-        scene: (T, H) float64, brightness of the rows without flicker.
-        fitted: (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``.
-        residual: (T, H) float64, residual brightness over that of the scene.
-        certainty: Power of the fundamental over that of residuals at frequencies beside it, all frames together.
-        evidence: Gaussian log-likelihood less half the number of parameters times log N (BIC).
-    """
-
-    period: float
-    period_std: float
-    coefficients: Tensor
-    scene: Tensor
-    fitted: Tensor
-    residual: Tensor
-    certainty: float
-    evidence: float
+    period: float  # P in rows
+    period_std: float  # its standard deviation in rows, from the residuals with their correlation
+    coefficients: Tensor  # (T, K) complex128, waveform of each frame over its mean
+    scene: Tensor  # (T, H) float64, brightness of the rows without flicker
+    fitted: Tensor  # (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``
+    residual: Tensor  # (T, H) float64, residual brightness over that of the scene
+    certainty: float  # power of the fundamental over that of residuals at frequencies beside it, all frames together
+    evidence: float  # Gaussian log-likelihood less half the number of parameters times log N (BIC)
 
 
 def _harmonics(rows: Tensor, period: float, count: int) -> tuple[Tensor, Tensor]:
@@ -129,16 +99,10 @@ def _polynomials(height: int, period: float) -> Tensor:
 
 
 def fit_period(brightness: Tensor, start: float, scene: SceneModel) -> BandFit | None:
-    """Fit bands to the brightness of rows, with the number of harmonics that maximises the evidence.
+    """Fit bands to the brightness (T, H) of rows, with the number of harmonics that maximises the evidence.
 
-    Args:
-        brightness: (T, H) float64.
-        start: Period to start with, in rows.
-        scene: ``"smooth"``: the brightness of the scene is a polynomial along the rows, one for each frame;
-            ``"fixed"``: that, times a texture of the rows that is the same in all frames while the bands move.
-
-    Returns:
-        The fit; None if it diverges.
+    The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; of a ``"fixed"`` scene
+    that times a texture of the rows, which is the same in all frames while the bands move. None if the fit diverges.
     """
     best: BandFit | None = None
     for count in (1, 2, 3, 5, 8, 12, 16):
@@ -300,20 +264,10 @@ def _starts(brightness: Tensor, min_periods: float, padding: int = 4) -> list[fl
 
 
 def find_bands(profiles: Profiles, *, min_periods: float = 1.5, min_period: float = 4.0) -> tuple[BandFit, SceneModel]:
-    """The bands whose period has the smallest relative standard deviation.
+    """The bands whose period has the smallest relative standard deviation, and the model of the scene.
 
     Several frames of a still scene are fitted together if their bands move, which eliminates the texture of the scene.
-
-    Args:
-        profiles: Brightness of the rows.
-        min_periods: Fewest periods in a frame.
-        min_period: Smallest period in rows: finer bands may be aliases of coarser ones.
-
-    Returns:
-        The fit and its model of the scene.
-
-    Raises:
-        ValueError: If there are no bands, or they are too fine or too coarse.
+    A frame must contain ``min_periods``; bands of less than ``min_period`` rows may be aliases of coarser ones.
     """
     brightness = profiles.rows
     fitted: list[tuple[BandFit, SceneModel]] = []

@@ -9,19 +9,11 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 from torch import Tensor
 
-__all__ = ["StrobeFit", "exposure_from_contrast", "fit_strobe", "lit_fraction"]
-
 Array = NDArray[np.float64]
 
 
 def lit_fraction(begin: Array, exposure: float, on_time: float, period: float) -> Array:
-    """Fraction of exposures in which a light is on that goes on at 0, P, 2 P ... for ``on_time``.
-
-    Args:
-        begin: Begin of the exposures, any unit of time.
-        exposure: Their length.
-        on_time: How long the light stays on, at most the period.
-        period: P.
+    """Fraction of exposures from ``begin`` on in which a light is on that goes on at 0, P, 2 P ... for ``on_time``.
 
     Example:
         >>> lit_fraction(np.array([-1.0, 0.0, 1.5, 2.0]), 1.0, 2.0, 10.0).tolist()
@@ -37,19 +29,12 @@ def lit_fraction(begin: Array, exposure: float, on_time: float, period: float) -
 
 @dataclass(frozen=True)
 class StrobeFit:
-    """Bands of an on-off light, in rows.
+    """Bands of an on-off light, in rows."""
 
-    Attributes:
-        period: P.
-        on_rows: Rows read while the light is on.
-        exposure_rows: (T,) rows read during the exposure of one row.
-        std: Standard deviations of the free parameters, by name.
-    """
-
-    period: float
-    on_rows: float
-    exposure_rows: Array
-    std: dict[str, float]
+    period: float  # P
+    on_rows: float  # rows read while the light is on
+    exposure_rows: Array  # (T,) rows read during the exposure of one row
+    std: dict[str, float]  # standard deviations of the free parameters, by name
 
 
 def _residuals(brightness: Array, smooth: Array, shape: Array) -> Array:
@@ -83,12 +68,6 @@ def fit_strobe(
         on_fraction: Fraction of the period that the light is on.
         exposures: Exposures in seconds, one a frame; ``std["row_time"]`` then holds that of the row time.
         max_misfit: Largest root mean square of the residuals over the brightness.
-
-    Returns:
-        The best fit from several starts.
-
-    Raises:
-        ValueError: If the bands do not have the shape of an on-off light.
     """
     values = (brightness / brightness.mean(1, keepdim=True)).numpy()
     height = values.shape[1]
@@ -164,13 +143,7 @@ def _deviations(jacobian: Array, residual: Array, period: float) -> list[float]:
 def exposure_from_contrast(contrast: float, light_contrast: float, period: float) -> float:
     """Exposure that attenuates a sine of known contrast to the contrast of the bands: ``sinc(f T_e)``, first lobe.
 
-    Args:
-        contrast: Of the bands: amplitude of the fundamental over the mean.
-        light_contrast: Of the light itself.
-        period: 1/f, in the unit of time of the result.
-
-    Raises:
-        ValueError: If the bands have more contrast than the light.
+    The result has the unit of the period 1/f; the contrast is the amplitude of the fundamental over the mean.
 
     Example:
         >>> round(exposure_from_contrast(0.5 * 2 / math.pi, 0.5, 10.0), 6)

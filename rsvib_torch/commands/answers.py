@@ -14,17 +14,6 @@ if TYPE_CHECKING:
     from rsvib_torch.restoration import RestorationVerdict
     from rsvib_torch.stacks import RestoredFrames
 
-__all__ = [
-    "command_text",
-    "detection_data",
-    "restoration_data",
-    "restoration_lines",
-    "step_parts",
-    "step_with_force",
-    "steps_after_detection",
-    "verdict_data",
-]
-
 
 def command_text(*parts: str | Path) -> str:
     """A command line of the program that can be copied into a shell."""
@@ -49,12 +38,7 @@ def detection_data(result: DetectionResult) -> dict[str, Any]:
 
 
 def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
-    """What was restored and its gain, and which axes were left unchanged and why.
-
-    Args:
-        result: Restored frames with their verdict.
-        count: Number of frames of the stack.
-    """
+    """What was restored of ``count`` frames and its gain, and which axes were left unchanged and why."""
     frames = number_of(count, "frame") if len(result.frames) == count else f"1 image of {number_of(count, 'frame')}"
     if not result.restored:
         lines = [f"{number_of(count, 'frame')} unchanged"]
@@ -101,14 +85,7 @@ def verdict_data(verdict: RestorationVerdict | None) -> dict[str, Any]:
 def steps_after_detection(
     result: DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
-    """What to do after a detection: restore, or try another model.
-
-    Args:
-        result: The detection; None for windows.
-        frames: The stack.
-        settings: The camera.
-        vibration: The file of the detection, if the frames were not restored by the same command.
-    """
+    """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
     lines = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
         target = frames.with_name("restored.tif")
@@ -121,6 +98,12 @@ def steps_after_detection(
     if reasons:
         lines.append("follow the remedies that the reasons above name")
     return lines
+
+
+def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
+    """The step to write a page about a restored stack."""
+    page = command_text("report", frames, out, *settings.arguments, *more)
+    return f"write a page with all figures and the sharpness before and after:\n  {page}"
 
 
 def step_with_force(command: str, result: RestoredFrames, frames: Path, out: Path, settings: Config) -> list[str]:

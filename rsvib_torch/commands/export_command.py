@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from rsvib_torch.motion.timing import SensorTiming
     from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["export"]
-
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
 
 

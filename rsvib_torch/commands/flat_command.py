@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -11,8 +11,6 @@ import typer
 from rsvib_torch.commands.terminal import Answer, output_of, show_answer
 from rsvib_torch.core.validation import fields_of, members_of
 from rsvib_torch.options import COMMAND_LINE
-
-__all__ = ["MadeBy", "flat_command", "group_arguments"]
 
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print the answer as JSON on standard output, and nothing else there.")
@@ -39,31 +37,38 @@ def _common(*, as_json: JsonOption = False, quiet: QuietOption = False, debug: D
     """Options of all commands; ``--debug`` is read where errors are printed."""
 
 
-def _options_of(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    parameters = inspect.signature(function, eval_str=True).parameters
-    return {name: one for name, one in parameters.items() if get_origin(one.annotation) is Annotated}
+def _build_of(parameter: inspect.Parameter) -> Callable[..., Any] | None:
+    """The function that makes the value of a parameter; None for an option."""
+    marks = (mark for mark in getattr(parameter.annotation, "__metadata__", ()) if isinstance(mark, MadeBy))
+    return next((mark.build for mark in marks), None)
+
+
+def _options_of(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
+    """Options of a command or of a function of ``MadeBy``, and of those that make its arguments."""
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        if build := _build_of(parameter):
+            yield from _options_of(build)
+        elif get_origin(parameter.annotation) is Annotated:
+            yield parameter
+
+
+def _called(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
+    """Call a function with the options that are its arguments; those with the mark ``MadeBy`` are made of several."""
+    values = {}
+    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+        build = _build_of(parameter)
+        values[name] = given.get(name) if build is None else _called(build, given)
+    return function(**values)
 
 
 def flat_command(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
     """A command as typer calls it: its options are flat, and its answer is printed."""
-    stated = inspect.signature(command, eval_str=True).parameters
-    made: dict[str, Callable[..., Any]] = {}
-    parameters: list[inspect.Parameter] = []
-    for parameter in stated.values():
-        marks = [mark for mark in getattr(parameter.annotation, "__metadata__", ()) if isinstance(mark, MadeBy)]
-        if marks:
-            made[parameter.name] = marks[0].build
-        parameters += _options_of(marks[0].build).values() if marks else [parameter]
-    parameters += _options_of(_common).values()
 
     def flat(**given: Any) -> None:
-        with output_of(as_json=given.pop("as_json"), quiet=given.pop("quiet")):
-            values = {
-                key: build(**{argument: given.get(argument) for argument in inspect.signature(build).parameters})
-                for key, build in made.items()
-            }
-            show_answer(name, command(**values, **{key: given[key] for key in stated if key not in made}))
+        with output_of(as_json=given["as_json"], quiet=given["quiet"]):
+            show_answer(name, _called(command, given))
 
+    parameters = [*_options_of(command), *_options_of(_common)]
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     flat.__doc__ = command.__doc__
@@ -75,23 +80,20 @@ def group_arguments(group: Any, forms: Mapping[str, Any] | None = None) -> Calla
 
     Args:
         group: The group; options whose field is marked by ``COMMAND_LINE`` are options of the command.
-        forms: Annotations for typer of options that are stated in another form than the field.
+        forms: Annotations for typer of further options, and of those that are stated in another form than the field.
     """
 
     def given_options(**given: Any) -> dict[str, Any]:
         return {name: value for name, value in given.items() if value is not None}
 
-    known = dict(forms or {})
+    known = forms or {}
     given_options.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=None,
-                annotation=known.get(name) or _form(field),
+                name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=known.get(name) or _form(field)
             )
             for name, field in fields_of(group).items()
-            if field.json_schema_extra == COMMAND_LINE
+            if name in known or field.json_schema_extra == COMMAND_LINE
         ]
     )
     return given_options

@@ -5,22 +5,14 @@ import sys
 import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 from rsvib_torch import io
 from rsvib_torch.commands.answers import command_text
-from rsvib_torch.commands.shared_options import (
-    READOUT_HELP,
-    SCAN_AXIS_HELP,
-    ExposureOption,
-    FrameRateOption,
-    RowTimeOption,
-    rate,
-    seconds,
-    stated_rate,
-)
+from rsvib_torch.commands.flat_command import MadeBy, group_arguments
+from rsvib_torch.commands.shared_options import rate, seconds, sensor_forms, stated_rate
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import SensorSection, presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
@@ -28,8 +20,6 @@ from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.text import printable
 from rsvib_torch.core.validation import MistakesError, fields_of
 from rsvib_torch.motion.timing import SensorTiming
-
-__all__ = ["init", "sensor_toml"]
 
 # How to find each value of [sensor]: comments of the file, and the text of questions and errors.
 _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
@@ -42,18 +32,24 @@ def init(
     ] = None,
     *,
     out: Annotated[Path, typer.Option(help="Configuration file to write.")] = Path("camera.toml"),
-    row_time: RowTimeOption = None,
-    exposure: ExposureOption = None,
-    frame_rate: FrameRateOption = None,
-    scan_axis: Annotated[Literal["y", "x"] | None, typer.Option(help=SCAN_AXIS_HELP, show_default="y")] = None,
-    readout_direction: Annotated[
-        Literal["forward", "reverse"] | None,
-        typer.Option(help=READOUT_HELP, show_default="forward"),
-    ] = None,
-    full_scale: Annotated[
-        float | None,
-        typer.Option(help="Count that corresponds to full scale, e.g. 4095 for 12 bits.", show_default="from the file"),
-    ] = None,
+    sensor: Annotated[
+        dict[str, Any],
+        MadeBy(
+            group_arguments(
+                SensorSection,
+                sensor_forms("")
+                | {
+                    "full_scale": Annotated[
+                        float | None,
+                        typer.Option(
+                            help="Count that corresponds to full scale, e.g. 4095 for 12 bits.",
+                            show_default="from the file",
+                        ),
+                    ]
+                },
+            )
+        ),
+    ],
     preset: Annotated[str | None, typer.Option(help=f"Copy a preset instead: {', '.join(presets())}.")] = None,
     list_presets: Annotated[bool, typer.Option("--list-presets", help="List the presets and exit.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing configuration file.")] = False,
@@ -65,16 +61,7 @@ def init(
     if list_presets:
         listed = {name: _first_comment(text) for name, text in presets().items()}
         return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
-    sensor = {
-        "row_time": row_time,
-        "exposure_time": exposure,
-        "frame_rate": frame_rate,
-        "scan_axis": scan_axis,
-        "readout_direction": readout_direction,
-        "full_scale": full_scale,
-    }
-    given = {name: value for name, value in sensor.items() if value is not None}
-    if preset is not None and (frames is not None or given):
+    if preset is not None and (frames is not None or sensor):
         raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
     if preset is None and frames is None:
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
@@ -88,7 +75,7 @@ def init(
         text = presets()[preset]
     else:
         assert frames is not None
-        text = _describe_camera(frames, given)
+        text = _describe_camera(frames, sensor)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
     step = command_text("run", frames or "FRAMES", "results", "--config", out)
@@ -207,12 +194,7 @@ def _check_timing(timing: SensorTiming, rows: int) -> None:
 
 
 def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:
-    """Text of a configuration file with the table ``[sensor]``.
-
-    Args:
-        values: Values by key; the key of an unknown value (None) is a comment to be completed.
-        head: Lines of comments at the top.
-    """
+    """Text of a configuration file with the table ``[sensor]``; the key of an unknown value (None) is a comment."""
 
     def comment(text: str) -> list[str]:
         return textwrap.wrap(text, 76, initial_indent="# ", subsequent_indent="# ")

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
@@ -100,7 +100,7 @@ def live_session(
     """Follow the vibration of a running camera, and restore its frames.
 
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
-    counted. Ctrl-C ends the session, and the video is complete.
+    counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
     is_camera, is_file = source.isdecimal() or "://" in source, file_of_source(source) is not None
     check_number("steady", steady, at_least=0.0)
@@ -120,7 +120,9 @@ def live_session(
         if is_camera:
             return live.CameraSource(int(source) if source.isdecimal() else source, settings.timing)
         if source == "-":
-            return live.PipeSource(sys.stdin.buffer, _size(size or ""), pixel_format, settings.timing)
+            # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
+            stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
+            return live.PipeSource(stream, _size(size or ""), pixel_format, settings.timing)
         scale = full_scale if full_scale is not None else settings.full_scale
         return live.FileSource(Path(source), settings.timing, scale, realtime=realtime)
 
@@ -141,11 +143,7 @@ def live_session(
 
     frames_of = opened()
     with _frames_on_standard_output(enabled=pipe_out) as stream:
-        try:
-            outputs = _outputs(settings, preview, page, stream, None if pipe_out else out)
-        except BaseException:
-            frames_of.close()
-            raise
+        outputs = _outputs(settings, preview, page, stream, None if pipe_out else out, overwrite)
         shown = [output for output in outputs if isinstance(output, live.PageOutput)]
         collected = None if spectrogram is None else live.Spectrogram(settings.timing, max_frequency=max_frequency)
         report = live.run_live(
@@ -188,25 +186,20 @@ def _check_options(
 
 
 def _outputs(
-    settings: Config, preview: bool, page: int | None, stream: BinaryIO | None, out: Path | None
+    settings: Config, preview: bool, page: int | None, stream: BinaryIO | None, out: Path | None, overwrite: bool
 ) -> list[FrameOutput]:
-    """The outputs that the options name; none stays open if one of them cannot be opened."""
+    """The outputs that the options name."""
     outputs: list[FrameOutput] = []
-    try:
-        if preview:
-            outputs.append(live.PreviewOutput())
-        if page is not None:
-            served = live.PageOutput(page)
-            outputs.append(served)
-            error_line(f"the page is {served.url}", "note")
-        if stream is not None:
-            outputs.append(live.PipeOutput(stream))
-        if out is not None:
-            outputs.append(live.VideoOutput(out, settings.timing.frame_rate))
-    except BaseException:
-        for output in outputs:
-            output.close(complete=False)
-        raise
+    if out is not None:
+        outputs.append(live.VideoOutput(out, settings.timing.frame_rate, overwrite=overwrite))
+    if stream is not None:
+        outputs.append(live.PipeOutput(stream))
+    if preview:
+        outputs.append(live.PreviewOutput())
+    if page is not None:  # the last one, because it is the only one that is opened before the first frame
+        served = live.PageOutput(page)
+        outputs.append(served)
+        error_line(f"the page is {served.url}", "note")
     return outputs
 
 
@@ -226,10 +219,9 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
         return
     if sys.stdout.isatty():
         raise ValueError("--out - writes raw frames to standard output, which is a terminal; redirect it")
-    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as frames:
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb", buffering=0) as frames:
         sys.stdout = sys.stderr
-        with suppress(BrokenPipeError):  # the program behind the pipe has ended
-            yield frames
+        yield frames
 
 
 class _StateText:

@@ -25,8 +25,6 @@ from rsvib_torch.commands.terminal import (
 from rsvib_torch.commands.unexpected_errors import in_one_line, system_error
 from rsvib_torch.core.validation import MistakesError
 
-__all__ = ["main", "run_command"]
-
 # Commands in the order of the help: name, function, line in the list of commands, and two examples.
 _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
     (

@@ -23,8 +23,7 @@ from rsvib_torch.commands.shared_options import (
     RestoredArgument,
     ScaleOption,
     check_new,
-    full_scale_of,
-    restoration_options,
+    planned_restoration,
     restored_shape,
     seconds,
 )
@@ -47,8 +46,6 @@ if TYPE_CHECKING:
     from rsvib_torch.motion.timing import SensorTiming
 
     Array = NDArray[np.float64]
-
-__all__ = ["calibrate", "known", "motion"]
 
 
 def motion(
@@ -221,9 +218,7 @@ def known(
             time_unit=time_unit,
             signs=(-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0),
         )
-    info = io.read_stack_info(frames)
-    scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings)
+    info, scale, options = planned_restoration(frames, settings, full_scale)
     io.check_stack_target(restored, restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}

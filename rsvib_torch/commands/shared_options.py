@@ -13,7 +13,7 @@ import typer
 from rsvib_torch import io
 from rsvib_torch.commands.flat_command import MadeBy, group_arguments
 from rsvib_torch.commands.terminal import note
-from rsvib_torch.config import Config, read_config
+from rsvib_torch.config import Config, SensorSection, read_config
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.options import RestorationOptions, method_options
 
@@ -22,44 +22,14 @@ if TYPE_CHECKING:
 
     from rsvib_torch.io import StackInfo
 
-__all__ = [
-    "READOUT_HELP",
-    "SCAN_AXIS_HELP",
-    "CameraSettings",
-    "DeviceName",
-    "DeviceOption",
-    "ExposureOption",
-    "ForceOption",
-    "FrameRateOption",
-    "FramesArgument",
-    "MemoryOption",
-    "OverwriteOption",
-    "RestorationArguments",
-    "RestoredArgument",
-    "RowTimeOption",
-    "ScaleOption",
-    "WorkersOption",
-    "check_new",
-    "file_of_source",
-    "full_scale_of",
-    "rate",
-    "restoration_options",
-    "restored_shape",
-    "seconds",
-    "stated_rate",
-    "torch_device",
-]
-
 DeviceName = Literal["auto", "cpu", "cuda"]
+_TIMES = {"row_time": "--row-time", "exposure_time": "--exposure", "frame_rate": "--frame-rate"}  # required keys
 
 _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10**6, "ns": 10**9}  # per second
 
 
 def seconds(text: str) -> float:
     """A time in seconds: a number or a fraction, with or without a unit.
-
-    Raises:
-        BadParameter: If it is neither.
 
     Example:
         >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
@@ -74,9 +44,6 @@ def seconds(text: str) -> float:
 
 def rate(text: str) -> float:
     """Frames per second: a number or a fraction.
-
-    Raises:
-        BadParameter: If it is neither.
 
     Example:
         >>> round(rate("30000/1001"), 6)
@@ -107,17 +74,6 @@ _ConfigOption = Annotated[
         "--frame-rate.",
     ),
 ]
-RowTimeOption = Annotated[
-    float | None,
-    typer.Option(
-        parser=seconds,
-        metavar="TIME",
-        help="Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.",
-    ),
-]
-ExposureOption = Annotated[
-    float | None, typer.Option(parser=seconds, metavar="TIME", help="Exposure time, e.g. 1/500 or 2ms.")
-]
 FrameRateOption = Annotated[
     float | None,
     typer.Option(
@@ -127,15 +83,37 @@ FrameRateOption = Annotated[
         show_default="from the file, or the configuration",
     ),
 ]
-SCAN_AXIS_HELP = "y: image rows are exposed one after another; x: image columns."
 READOUT_HELP = "forward: the top row (or left column) is read first; reverse: the last one is."
-_ScanAxisOption = Annotated[
-    Literal["y", "x"] | None, typer.Option(help=SCAN_AXIS_HELP, show_default="from the configuration, or y")
-]
-_ReadoutOption = Annotated[
-    Literal["forward", "reverse"] | None,
-    typer.Option(help=READOUT_HELP, show_default="from the configuration, or forward"),
-]
+
+
+def sensor_forms(default: str) -> dict[str, Any]:
+    """Annotations for typer of the keys of ``[sensor]`` that are options; ``default`` precedes that of choices."""
+    return {
+        "row_time": Annotated[
+            float | None,
+            typer.Option(
+                parser=seconds,
+                metavar="TIME",
+                help="Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.",
+            ),
+        ],
+        "exposure_time": Annotated[
+            float | None,
+            typer.Option("--exposure", parser=seconds, metavar="TIME", help="Exposure time, e.g. 1/500 or 2ms."),
+        ],
+        "frame_rate": FrameRateOption,
+        "scan_axis": Annotated[
+            Literal["y", "x"] | None,
+            typer.Option(
+                help="y: image rows are exposed one after another; x: image columns.", show_default=f"{default}y"
+            ),
+        ],
+        "readout_direction": Annotated[
+            Literal["forward", "reverse"] | None, typer.Option(help=READOUT_HELP, show_default=f"{default}forward")
+        ],
+    }
+
+
 DeviceOption = Annotated[DeviceName, typer.Option(help="Device for the computation; auto uses a GPU if there is one.")]
 ScaleOption = Annotated[
     float | None,
@@ -179,11 +157,9 @@ WorkersOption = Annotated[
 def _read_camera(
     *,
     config: _ConfigOption = None,
-    row_time: RowTimeOption = None,
-    exposure: ExposureOption = None,
-    frame_rate: FrameRateOption = None,
-    scan_axis: _ScanAxisOption = None,
-    readout_direction: _ReadoutOption = None,
+    sensor: Annotated[
+        dict[str, Any], MadeBy(group_arguments(SensorSection, sensor_forms("from the configuration, or ")))
+    ],
     frames: Path | None = None,
     source: str | None = None,
     full_scale: float | None = None,
@@ -194,29 +170,21 @@ def _read_camera(
     commands that follow.
     """
     frames = frames if source is None else file_of_source(source)
-    if config is None and frame_rate is None and None not in (row_time, exposure) and frames is not None:
+    missing = [option for name, option in _TIMES.items() if name not in sensor]
+    if config is None and missing == ["--frame-rate"] and frames is not None:
         frame_rate = stated_rate(io.read_stack_info(frames))
         if frame_rate is not None:
             note(f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it")
-    times = {"--row-time": row_time, "--exposure": exposure, "--frame-rate": frame_rate}
-    missing = [name for name, value in times.items() if value is None]
+            sensor, missing = sensor | {"frame_rate": frame_rate}, []
     if config is None and missing:
         raise ValueError(
             f"the camera is not described: give {', '.join(missing)}, or --config FILE (rsvib init FRAMES writes such "
             "a file and explains its values)"
         )
-    sensor = {
-        "row_time": row_time,
-        "exposure_time": exposure,
-        "frame_rate": frame_rate,
-        "scan_axis": scan_axis,
-        "readout_direction": readout_direction,
-    }
-    given = {name: value for name, value in sensor.items() if value is not None}
-    settings = read_config(config, sensor=given)
+    settings = read_config(config, sensor=sensor)
     arguments = [] if config is None else ["--config", str(config)]
-    for name, value in given.items():
-        option = "--exposure" if name == "exposure_time" else f"--{name.replace('_', '-')}"
+    for name, value in sensor.items():
+        option = _TIMES.get(name, f"--{name.replace('_', '-')}")
         arguments += [option, f"{value:.10g}" if isinstance(value, float) else value]
     if full_scale is not None:
         arguments += ["--full-scale", f"{full_scale:.10g}"]
@@ -305,7 +273,7 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
     return info.full_scale
 
 
-def restoration_options(
+def _restoration_options(
     info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line.
@@ -343,7 +311,16 @@ def restoration_options(
     return options
 
 
+def planned_restoration(
+    frames: Path, config: Config, full_scale: float | None, given: Mapping[str, Any] | None = None
+) -> "tuple[StackInfo, float | None, dict[str, Any]]":
+    """What the file of a stack states, its full scale, and the options of its restoration."""
+    info = io.read_stack_info(frames)
+    scale = full_scale_of(frames, info, config, full_scale)
+    return info, scale, _restoration_options(info, scale, config, given)
+
+
 def restored_shape(info: "StackInfo", options: Mapping[str, Any]) -> tuple[int, ...]:
-    """Shape of the restored frames of a stack, with options as from ``restoration_options``."""
+    """Shape of the restored frames of a stack, with options as from ``_restoration_options``."""
     shape = info.restored_as(options.get("scale", 1), options.get("mosaic")).shape
     return (1, *shape[1:]) if options.get("joint") is True else shape

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +15,7 @@ from rsvib_torch import report as reports
 from rsvib_torch.commands.answers import (
     command_text,
     detection_data,
+    page_step,
     restoration_data,
     restoration_lines,
     step_parts,
@@ -36,14 +37,24 @@ from rsvib_torch.commands.shared_options import (
     WorkersOption,
     check_new,
     full_scale_of,
-    restoration_options,
+    planned_restoration,
     restored_shape,
     torch_device,
 )
 from rsvib_torch.commands.terminal import Answer, counting, error_line, note, running_command, working
-from rsvib_torch.commands.video_command import check_followed, followed_figure, is_followed, run_followed
+from rsvib_torch.commands.video_command import check_followed, is_followed, run_followed
+from rsvib_torch.commands.written_results import (
+    OF_DETECTION,
+    OF_WINDOWS,
+    check_folder,
+    draw_safely,
+    note_lost,
+    remove_old,
+    write_detection,
+    write_windows,
+)
 from rsvib_torch.config import Config
-from rsvib_torch.core.atomic import check_writable, whole_folder, write_json
+from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import number_of, printable
@@ -60,26 +71,16 @@ if TYPE_CHECKING:
     from rsvib_torch.motion.timing import SensorTiming
     from rsvib_torch.report import Box
     from rsvib_torch.stacks import RestoredFrames, StackReport, WindowResult
-    from rsvib_torch.stacks.job import RestoreOptions
-
-__all__ = ["Stack", "detect", "load", "report", "restore_and_save", "restore_frames", "run", "simulate"]
 
 
 @dataclass(frozen=True)
 class Stack:
-    """Frames in memory.
+    """Frames in memory."""
 
-    Attributes:
-        frames: (T, H, W) or (T, C, H, W), full scale 1.
-        info: Data type and metadata of the file, with exposure times for frame times.
-        full_scale: Count that corresponds to full scale; None for floating point.
-        timing: The sensor, with the frame times of the file.
-    """
-
-    frames: Tensor
-    info: StackInfo
-    full_scale: float | None
-    timing: SensorTiming
+    frames: Tensor  # (T, H, W) or (T, C, H, W), full scale 1
+    info: StackInfo  # data type and metadata of the file, with exposure times for frame times
+    full_scale: float | None  # count that corresponds to full scale; None for floating point
+    timing: SensorTiming  # the sensor, with the frame times of the file
 
 
 def load(
@@ -89,18 +90,7 @@ def load(
     device: DeviceName,
     restoration: dict[str, Any] | None = None,
 ) -> Stack:
-    """Read a stack that is processed as a whole.
-
-    Args:
-        path: The stack.
-        config: The camera.
-        full_scale: Option of the command line.
-        device: Option of the command line.
-        restoration: Options of the restoration that follows; None for detection only.
-
-    Raises:
-        ValueError: If the memory does not suffice.
-    """
+    """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows."""
     from rsvib_torch.stacks.memory import check_stack_fits  # noqa: PLC0415
 
     target = torch_device(device)
@@ -122,18 +112,12 @@ def print_notes(info: StackInfo, config: Config) -> None:
         note(sentence)
 
 
-def _note_lost(path: Path, names: Sequence[str]) -> None:
-    """Print which metadata of the input a file does not contain."""
-    if names:
-        note(f"{path}: not kept from the input: {', '.join(names)}")
-
-
 def _save(path: Path, frames: Tensor, stack: Stack) -> tuple[str, ...]:
     """Write frames with the data type, full scale and metadata of a stack; print and return what is not kept."""
     with working(f"writing {path.name}"):
         io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     names = io.metadata_not_kept(stack.info, path, tuple(frames.shape))
-    _note_lost(path, names)
+    note_lost(path, names)
     return names
 
 
@@ -179,63 +163,6 @@ def _warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
         error_line(result.verdict.sentence + unchanged, "warning")
-
-
-def _draw(path: Path, draw: Callable[[], Figure]) -> list[str]:
-    """Draw a figure and return its name; a warning if that fails, because the results do not depend on figures."""
-    try:
-        reports.save_figure(draw(), path)
-    except Exception as error:
-        error_line(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}", "warning")
-        return []
-    return [path.name]
-
-
-def _write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
-    """Write a detection as JSON, CSV and figure, and return the names of the files."""
-    with working("drawing the offset curve"):
-        reports.write_vibration(folder / "vibration.json", result, timing)
-        reports.write_offsets(folder / "offsets.csv", result)
-        drawn = _draw(folder / "offsets.png", lambda: reports.offset_figure(result))
-    return [*drawn, "vibration.json", "offsets.csv"]
-
-
-def _write_windows(folder: Path, path: Path) -> list[str]:
-    """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
-    manifest = stacks.read_manifest(path)
-    with working("drawing the windows"):
-        write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
-        reports.write_windows(folder / "windows.csv", manifest)
-        starts = [record.start_time for record in manifest.windows]
-        drawn = _draw(folder / "windows.png", lambda: reports.windows_figure(starts, manifest.detections()))
-    return [*drawn, "windows.json", "windows.csv"]
-
-
-def _check_folder(
-    folder: Path, names: Iterable[str], overwrite: bool, inputs: Iterable[Path | None], output: Path | None = None
-) -> None:
-    """Raise an error if results cannot be written into a folder, exist there, or would replace an input.
-
-    Args:
-        folder: The folder.
-        names: Names of files in it.
-        overwrite: Whether existing results are replaced.
-        inputs: Files and folders that are read.
-        output: A stack that is written there as well.
-    """
-    stack = [] if output is None else io.stack_files(output)
-    check_new([*(folder / name for name in names), *stack], overwrite, inputs, folder=folder)
-    check_writable(folder, folder=True)
-
-
-def _remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> None:
-    """Remove results of an earlier run from a folder that this run did not replace."""
-    for name in set(results) - set(names):
-        (folder / name).unlink(missing_ok=True)
-
-
-_OF_DETECTION = ("vibration.json", "offsets.csv", "offsets.png")
-_OF_WINDOWS = ("manifest.json", "windows.json", "windows.csv", "windows.png")
 
 
 def simulate(
@@ -316,14 +243,14 @@ def detect(
 
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
-    _check_folder(out, (*_OF_DETECTION, *_OF_WINDOWS), overwrite, [*io.stack_files(frames), settings.path])
+    check_folder(out, (*OF_DETECTION, *OF_WINDOWS), overwrite, [*io.stack_files(frames), settings.path])
     window = settings.stack.get("window") if window is None else window
     if window is None:
         stack = load(frames, settings, full_scale, device)
         result = _detect(stack, settings)
         with whole_folder(out) as folder:
-            names = _write_detection(folder, result, stack.timing)
-        _remove_old(out, _OF_WINDOWS, names)
+            names = write_detection(folder, result, stack.timing)
+        remove_old(out, OF_WINDOWS, names)
         return Answer(
             {f"Vibration in {frames.name}": [result.summary()]},
             {"detection": detection_data(result)},
@@ -347,8 +274,8 @@ def detect(
                 device=str(torch_device(device)),
                 progress=progress,
             )
-        names = [*_write_windows(folder, folder / "manifest.json"), "manifest.json"]
-    _remove_old(out, _OF_DETECTION, names)
+        names = [*write_windows(folder, folder / "manifest.json"), "manifest.json"]
+    remove_old(out, OF_DETECTION, names)
     manifest = stacks.read_manifest(out / "manifest.json")
     _warn_of_failures(sum(record.error is not None for record in manifest.windows))
     return Answer(
@@ -395,10 +322,8 @@ def restore_frames(
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
         check_new([*outputs, restored.with_name(f"{restored.name}.manifest.json")], overwrite, inputs)
         return _restore_windows(frames, restored, settings, vibration, restoration, force, device, full_scale)
-    info = io.read_stack_info(frames)
+    info, scale, options = planned_restoration(frames, settings, full_scale, restoration)
     detected = reports.read_vibration(vibration, io.timing_from_first_frame(settings.timing, info))
-    scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, restoration)
     io.check_stack_target(restored, restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
@@ -408,13 +333,8 @@ def restore_frames(
         {"Vibration": [detected.summary()], "Restoration": restoration_lines(result, len(stack.frames))},
         {"detection": detected.to_dict(), "restoration": restoration_data(result)},
         [restored, *([] if report is None else [report])],
-        _steps_after_restoration(result, frames, settings),
+        [page_step(frames, frames.with_name("report"), settings)] * result.restored,
     )
-
-
-def _steps_after_restoration(result: RestoredFrames, frames: Path, settings: Config) -> list[str]:
-    page = command_text("report", frames, frames.with_name("report"), *settings.arguments)
-    return [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
 
 
 def _restore_windows(
@@ -446,9 +366,8 @@ def _restore_windows(
         )
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
-    info = io.read_stack_info(frames)
+    info, scale, options = planned_restoration(frames, config, full_scale, given)
     print_notes(info, config)
-    scale = full_scale_of(frames, info, config, full_scale)
     with counting(f"restoring {frames.name}") as progress:
         result = stacks.process_stack(
             frames,
@@ -456,13 +375,13 @@ def _restore_windows(
             config.timing,
             window=window,
             given=manifest.detections(),
-            restoration=restoration_options(info, scale, config, given),
+            restoration=options,
             full_scale=scale,
             force=force,
             device=str(torch_device(device)),
             progress=progress,
         )
-    _note_lost(restored, result.not_kept)
+    note_lost(restored, result.not_kept)
     manifest = stacks.read_manifest(result.manifest)
     vibration_lines, lines = manifest.lines()
     return Answer(
@@ -540,12 +459,10 @@ def run(
     output = _video_name(frames, output) if video else output
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    results = (*_OF_DETECTION, *_OF_WINDOWS, "restoration.json", "before_after.png")
-    _check_folder(out, results, overwrite or resume, [*io.stack_files(frames), settings.path], out / output)
-    info = io.read_stack_info(frames)
+    results = (*OF_DETECTION, *OF_WINDOWS, "restoration.json", "before_after.png")
+    check_folder(out, results, overwrite or resume, [*io.stack_files(frames), settings.path], out / output)
+    info, scale, options = planned_restoration(frames, settings, full_scale, restoration)
     print_notes(info, settings)
-    scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, restoration)
     chosen = WindowOptions(**{**settings.stack, **windows})
     frames_at_once = chosen.window
     requested = border is not None or steady is not None
@@ -560,8 +477,6 @@ def run(
             output,
             settings,
             options,
-            lambda: _draw_windows(out),
-            lambda stored: _draw(out / "before_after.png", lambda: followed_figure(frames, out / output, stored)),
             border=border or "mirror",
             steady=steady or 0.0,
             full_scale=scale,
@@ -570,9 +485,9 @@ def run(
             workers=workers,
             device=str(torch_device(device)),
         )
-        _remove_old(out, results if overwrite else (), [path.name for path in answer.files])
+        remove_old(out, results if overwrite else (), [path.name for path in answer.files])
         return answer
-    common: RestoreOptions = {
+    common: dict[str, Any] = {
         "window": frames_at_once,
         "detection": settings.detection,
         "restoration": options,
@@ -604,7 +519,7 @@ def run(
     with whole_folder(out) as folder:
         if len(first.frames):
             with working("drawing the frames"):
-                names += _draw(
+                names += draw_safely(
                     folder / "before_after.png", lambda: _comparison(frames, scale, first, options.get("mosaic"))
                 )
         names += [output, "manifest.json"]
@@ -613,11 +528,11 @@ def run(
             assert first.restoration is not None
             reports.write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
             timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*_write_detection(folder, first.detection, timing), "restoration.json"]
+            names += [*write_detection(folder, first.detection, timing), "restoration.json"]
         else:
-            names += _write_windows(folder, out / "manifest.json")
+            names += write_windows(folder, out / "manifest.json")
     if overwrite:
-        _remove_old(out, results, names)
+        remove_old(out, results, names)
     return _answer_of_windows(frames, info.shape[0], out, output, settings, result, first, names)
 
 
@@ -634,10 +549,9 @@ def _answer_of_windows(
     """What a run on a stack of ``count`` frames found and did, with its warnings."""
     if result.bad_frames:
         error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
-    _note_lost(out / output, result.not_kept)
+    note_lost(out / output, result.not_kept)
     windows = ["--manifest", str(out / "manifest.json")] if result.windows > 1 else []
-    page = command_text("report", frames, out / "report", *settings.arguments, *windows)
-    steps = [f"write a page with all figures and the sharpness before and after:\n  {page}"] if result.restored else []
+    steps = [page_step(frames, out / "report", settings, *windows)] if result.restored else []
     files = [out / name for name in names]
     if result.windows == 1:
         assert isinstance(first.detection, detection.DetectionResult)
@@ -661,12 +575,6 @@ def _answer_of_windows(
         files,
         steps,
     )
-
-
-def _draw_windows(out: Path) -> list[str]:
-    """Write summary, table and figure of the windows of a manifest in the same folder."""
-    with whole_folder(out) as folder:
-        return _write_windows(folder, out / "manifest.json")
 
 
 def _video_name(frames: Path, output: str) -> str:
@@ -729,10 +637,8 @@ def report(
     boxes = [_edge_box(text) for text in edge or []]
     windows = None if manifest is None else stacks.read_manifest(manifest)
     inputs = [*io.stack_files(frames), settings.path, *([] if manifest is None else [manifest])]
-    _check_folder(out, ["report.html"], overwrite, inputs)
-    info = io.read_stack_info(frames)
-    scale = full_scale_of(frames, info, settings, full_scale)
-    options = restoration_options(info, scale, settings, restoration)
+    check_folder(out, ["report.html"], overwrite, inputs)
+    _, _, options = planned_restoration(frames, settings, full_scale, restoration)
     stack = load(frames, settings, full_scale, device, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, force, "page")

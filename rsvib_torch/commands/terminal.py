@@ -1,10 +1,12 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
+import os
 import shlex
+import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -17,36 +19,15 @@ from rich.text import Text
 from rsvib_torch.core.progress import listening
 from rsvib_torch.core.text import json_text, printable, wrapped
 
-__all__ = [
-    "Answer",
-    "counting",
-    "error_line",
-    "note",
-    "output_of",
-    "print_line",
-    "running",
-    "running_command",
-    "show_answer",
-    "warnings_in_one_line",
-    "working",
-]
-
 
 @dataclass
 class Answer:
-    """What a command found and did: the last thing that it prints.
+    """What a command found and did: the last thing that it prints."""
 
-    Attributes:
-        results: Titles of the results, and their lines.
-        data: The same for ``--json``, values that JSON can store.
-        files: Files that were written, the one to open first in front.
-        next_steps: What to do next: sentences and commands.
-    """
-
-    results: dict[str, list[str]]
-    data: dict[str, Any]
-    files: list[Path] = field(default_factory=list)
-    next_steps: list[str] = field(default_factory=list)
+    results: dict[str, list[str]]  # titles of the results, and their lines
+    data: dict[str, Any]  # the same for ``--json``, values that JSON can store
+    files: list[Path] = field(default_factory=list)  # files that were written, the one to open first in front
+    next_steps: list[str] = field(default_factory=list)  # what to do next: sentences and commands
 
 
 @dataclass
@@ -80,12 +61,7 @@ def running_command() -> str | None:
 
 @contextmanager
 def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
-    """Form of the output of a command.
-
-    Args:
-        as_json: Whether its answer is printed as JSON.
-        quiet: Whether no text and no progress is printed.
-    """
+    """Form of the output of a command: its answer as JSON, or neither text nor progress."""
     _outputs.append(_Output(as_json, quiet))
     try:
         yield
@@ -94,8 +70,19 @@ def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
 
 
 def print_line(message: str) -> None:
-    """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
-    Console(highlight=False).print(Text(printable(message, lines=True)), soft_wrap=True)
+    """Print a text to standard output; long lines are not wrapped, and control codes are escaped.
+
+    Raises:
+        OSError: If it cannot be written, as in a pipe whose reader has ended.
+    """
+    try:
+        print(printable(message, lines=True), flush=True)
+    except OSError as error:
+        # what is left in the buffer would fail again at the exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise OSError(
+            f"the answer cannot be written to standard output ({error.strerror}); the files are complete"
+        ) from error
 
 
 def show_answer(command: str, answer: Answer) -> None:
@@ -130,13 +117,15 @@ def note(message: str) -> None:
 def error_line(message: str, kind: str = "error") -> None:
     """Print a message to standard error, with the prefix ``rsvib: error:``; control codes are escaped.
 
-    Lines are wrapped between words in a terminal, and not at all in a file or pipe.
+    Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
+    end of a terminal, the command continues.
     """
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)
     line = Text.assemble(("rsvib: ", "bold"), (f"{kind}: ", "bold red"), printable(message))
-    console.print(line, soft_wrap=not console.is_terminal)
+    with suppress(OSError, SystemExit):  # rich exits if a pipe has no reader
+        console.print(line, soft_wrap=not console.is_terminal)
 
 
 @contextmanager

@@ -2,8 +2,6 @@
 
 import errno
 
-__all__ = ["in_one_line", "system_error"]
-
 
 def system_error(error: BaseException) -> OSError | None:
     """The error of the system that exhausted memory or threads stand for, with the remedy; None for others."""

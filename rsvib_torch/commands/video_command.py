@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsvib_torch import io, stacks
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import command_text
+from rsvib_torch.commands.answers import page_step
 from rsvib_torch.commands.terminal import Answer, counting, error_line
+from rsvib_torch.commands.written_results import draw_safely, write_windows
+from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.core.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from rsvib_torch.config import Config
-
-__all__ = ["check_followed", "followed_figure", "is_followed", "run_followed"]
 
 
 def is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
@@ -28,12 +28,7 @@ def is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bo
 
 
 def check_followed(given: Mapping[str, Any], options: Mapping[str, Any]) -> None:
-    """Refuse options that only windows have.
-
-    Args:
-        given: Options of the command line that only windows have; None or False if they are not given.
-        options: Options of ``restore``.
-    """
+    """Refuse options that only windows have: those ``given`` on the command line, and those of ``restore``."""
     others = {"--joint": options.get("joint"), "--scale": options.get("scale", 1) != 1}
     others |= {"--mosaic": options.get("mosaic"), "--optics-sigma": options.get("optics")}
     names = [name for name, value in {**given, **others}.items() if value]
@@ -50,22 +45,9 @@ def run_followed(
     output: str,
     settings: Config,
     options: dict[str, Any],
-    draw_windows: Callable[[], list[str]],
-    draw_frames: Callable[[stacks.StackManifest], list[str]],
     **others: Any,
 ) -> Answer:
-    """Process a video.
-
-    Args:
-        frames: The video.
-        out: Folder of the results.
-        output: Name of the restored video in it.
-        settings: The camera.
-        options: Options of ``restore``.
-        draw_windows: Writes table and figure of the parts of the video, and returns the names of the files.
-        draw_frames: Draws frames before and after, and returns the name of the file.
-        **others: Options of ``process_video``.
-    """
+    """Process a video; ``others`` are options of ``process_video``."""
     with counting(f"restoring {frames.name}") as progress:
         result = stacks.process_video(
             frames,
@@ -77,7 +59,9 @@ def run_followed(
             **others,
         )
     stored = stacks.read_manifest(out / "manifest.json")
-    names = [output, *draw_frames(stored), "manifest.json", *draw_windows()]
+    drawn = draw_safely(out / "before_after.png", lambda: _followed_figure(frames, out / output, stored))
+    with whole_folder(out) as folder:
+        names = [output, *drawn, "manifest.json", *write_windows(folder, out / "manifest.json")]
     unknown = [record for record in stored.windows if record.error is not None]
     if unknown:
         first = unknown[0]
@@ -93,16 +77,15 @@ def run_followed(
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
         error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
     vibration, lines = stored.lines()
-    page = command_text("report", frames, out / "report", *settings.arguments, "--manifest", out / "manifest.json")
     return Answer(
         {f"Vibration in {frames.name}": vibration, "Restoration": [result.summary(), *lines[1:]]},
         {"windows": stored.totals()},
         [out / name for name in names],
-        [f"write a page with all figures and the sharpness before and after:\n  {page}"],
+        [page_step(frames, out / "report", settings, "--manifest", out / "manifest.json")],
     )
 
 
-def followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
+def _followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
     """Draw one of the first frames of a video beside the restored one."""
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
     from rsvib_torch.tracking import Margins  # noqa: PLC0415

@@ -36,19 +36,6 @@ from torch import Tensor
 from rsvib_torch.core.checks import MAX_NUMBER, described
 from rsvib_torch.core.validation import Number, members_of, validated, without_alias
 
-__all__ = [
-    "as_numbers",
-    "check_broadcast",
-    "check_device",
-    "check_fields",
-    "check_images",
-    "check_pixels",
-    "check_shapes",
-    "check_tensor",
-    "checked_methods",
-    "checks_arguments",
-]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 _ARRAYS = (Tensor, np.ndarray)
@@ -57,9 +44,6 @@ _PLAIN = (bool, float, str, type(None), object)  # types that pydantic checks it
 
 def check_tensor(name: str, value: object) -> Tensor:
     """Return ``value`` if it is a dense tensor of real numbers that has data.
-
-    Raises:
-        TypeError: If it is not a tensor, or a sparse, nested, quantised, complex or meta tensor.
 
     Example:
         >>> check_tensor("frames", torch.zeros(2, 3, device="meta"))
@@ -85,15 +69,7 @@ def check_tensor(name: str, value: object) -> Tensor:
 
 
 def as_numbers(name: str, value: object, device: torch.device | None = None) -> Tensor:
-    """Return a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
-
-    Args:
-        name: Name of the argument in error messages.
-        value: The value.
-        device: Device of the result; by default that of a tensor, and the CPU for other values.
-
-    Raises:
-        TypeError: If it does not consist of real numbers, or lists differ in length.
+    """A tensor, a number or a nested list of numbers as a float64 tensor, by default on its device; gradients are kept.
 
     Example:
         >>> as_numbers("amplitude", [3, 5]).dtype
@@ -168,10 +144,6 @@ def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
 def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> None:
     """Check that tensors are floating-point images of the shapes of ``check_shapes``.
 
-    Raises:
-        TypeError: If one is not a floating-point tensor.
-        ValueError: If one has another shape.
-
     Example:
         >>> check_images({"scene": torch.zeros(4, 5, dtype=torch.uint8)}, {"scene": "... H W"})
         Traceback (most recent call last):
@@ -229,10 +201,6 @@ def check_broadcast(**tensors: Any) -> None:
 
 def check_device(name: str, value: object) -> torch.device:
     """Return ``value`` as a device on which tensors can be computed.
-
-    Raises:
-        TypeError: If it is neither a device nor text.
-        ValueError: If there is no such device.
 
     Example:
         >>> check_device("device", "cpu")

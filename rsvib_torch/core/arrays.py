@@ -12,8 +12,6 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_tensor
 from rsvib_torch.core.checks import check_choice
 
-__all__ = ["ArrayLike", "Channels", "FramesLike", "as_tensor", "channel_axis", "channels_appear_last"]
-
 ArrayLike = Tensor | NDArray[Any]
 FramesLike = ArrayLike | Sequence[ArrayLike]
 Channels = Literal["first", "last"] | None
@@ -24,15 +22,6 @@ def as_tensor(name: str, value: object) -> Tensor:
 
     The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays and arrays with negative
     strides or foreign byte order (FITS and TIFF files) are copied.
-
-    Args:
-        name: Name of the argument in error messages.
-        value: The value.
-
-    Raises:
-        TypeError: If the value is a masked array, a sparse, nested, quantised, complex or meta tensor, or does not
-            consist of numbers.
-        ValueError: If the tensors or arrays of a list differ in shape, dtype or device.
 
     Example:
         >>> as_tensor("frames", np.arange(3, dtype=">u2")[::-1]).tolist()
@@ -112,16 +101,9 @@ def _check_frame_axis(name: str, shape: tuple[int, ...]) -> None:
 def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     """The axis of the channels: -1 if they are last, -3 if they come before the image axes or do not exist.
 
-    Args:
-        name: Name of the argument in error messages.
-        shape: (T, H, W), (T, C, H, W) or (B, T, C, H, W); with ``channels="last"`` (T, H, W), (T, H, W, C) or
-            (B, T, H, W, C).
-        channels: Position of the channels; None for ``"first"``, with a check of the shape.
-
-    Raises:
-        ValueError: If the shape appears to have another position of the channels: up to four of them, in an image of
-            more than four pixels along each axis; or, without ``channels``, to have the frames on the last axis
-            (H, W, T), (H, W, C, T), or after three channels (B, C, T, H, W).
+    Shapes are (T, H, W), (T, C, H, W) and (B, T, C, H, W); with ``channels="last"`` (T, H, W, C) and (B, T, H, W, C).
+    Without ``channels``, a shape is refused that appears to have up to four channels last in an image of more than four
+    pixels along each axis, or the frames on the last axis or behind three channels.
 
     Example:
         >>> channel_axis("frames", (2, 48, 64, 3), "last")

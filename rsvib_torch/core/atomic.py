@@ -13,24 +13,6 @@ from typing import Any, Literal
 
 from rsvib_torch.core.text import json_text
 
-__all__ = [
-    "PART",
-    "check_kind",
-    "check_name",
-    "check_not_special",
-    "check_writable",
-    "make_folder",
-    "move_into_place",
-    "nearest_folder",
-    "remove_abandoned",
-    "sync",
-    "sync_tree",
-    "temporary_folder",
-    "whole_file",
-    "whole_folder",
-    "write_json",
-]
-
 PART = ".part"  # ending of temporary folders: .NAME.########.part
 _ADDED = len("..12345678.part")  # bytes that names of temporary files have in addition
 
@@ -166,12 +148,7 @@ def _check_folder_target(path: Path) -> None:
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
-    """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing.
-
-    Args:
-        path: File or folder to be written later.
-        folder: Whether it will be a folder.
-    """
+    """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing."""
     (_check_folder_target if folder else _check_file_target)(path)
     with temporary_folder(path):
         pass
@@ -179,17 +156,7 @@ def check_writable(path: Path, *, folder: bool = False) -> None:
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a file under a temporary name; it gets its own name when the block ends without an exception.
-
-    Args:
-        path: The file to write; its folder must exist. An existing file is replaced.
-
-    Yields:
-        A temporary path with the same file ending.
-
-    Raises:
-        OSError: If the folder does not exist or is not writable.
-    """
+    """Write a file under a temporary name with its ending; it gets its name when the block ends without exception."""
     target = Path(path)
     _check_file_target(target)
     with temporary_folder(target) as folder:
@@ -214,16 +181,8 @@ def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None
 def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write files into a temporary folder; they are moved when the block ends without an exception.
 
-    An existing folder keeps its other files; files of the same names are replaced.
-
-    Args:
-        path: The folder to write; it is created, with the folders above it, if it does not exist.
-
-    Yields:
-        A temporary folder on the same file system.
-
-    Raises:
-        OSError: If the folder cannot be created or written to.
+    The folder and those above it are created. An existing folder keeps its other files; files of the same names are
+    replaced.
     """
     target = Path(path)
     _check_folder_target(target)

@@ -23,30 +23,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-__all__ = [
-    "BandedFactor",
-    "InterpolatedFactors",
-    "factor_banded",
-    "from_both_ends",
-    "node_frequencies",
-    "skew_band",
-    "solve_banded",
-    "solve_halves",
-]
-
 
 class _Solution(NamedTuple):
-    """Memory of a solution.
+    """Memory of a solution."""
 
-    Attributes:
-        x: (K + b, M, S).
-        rows: The K first rows.
-        runs: Rows j ... j + b - 1, for j = 0 ... K.
-    """
-
-    x: Tensor
-    rows: tuple[Tensor, ...]
-    runs: tuple[Tensor, ...]
+    x: Tensor  # (K + b, M, S)
+    rows: tuple[Tensor, ...]  # the K first rows
+    runs: tuple[Tensor, ...]  # rows j ... j + b - 1, for j = 0 ... K
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,14 +133,10 @@ class BandedFactor:
     """``A = U^H D U`` of a batch of banded matrices, eliminated from both ends.
 
     A factor must not be used by two threads at the same time.
-
-    Attributes:
-        ends: Of the halves, (2 S) systems.
-        middle: Of the middle rows.
     """
 
-    ends: _Triangle
-    middle: _Triangle
+    ends: _Triangle  # of the halves, (2 S) systems
+    middle: _Triangle  # of the middle rows
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -198,12 +177,7 @@ class BandedFactor:
 
 
 def factor_banded(halves: Tensor, count: int) -> BandedFactor:
-    """Factor Hermitian positive definite matrices of ``count`` rows in their own memory.
-
-    Args:
-        halves: (H + b, 2 b + 1, 2 S) as from ``from_both_ends``.
-        count: K.
-    """
+    """Factor Hermitian positive definite matrices of ``count`` rows from ``from_both_ends`` in their own memory."""
     width, size = halves.shape[1] // 2, halves.shape[2] // 2
     half = len(halves) - width
     steps = count - half
@@ -323,14 +297,10 @@ class InterpolatedFactors:
 
     U and D are as smooth in the frequency as A is. Linear interpolation of both replaces the elimination, whose number
     of operations is b / 2 times that of solving with the factors.
-
-    Attributes:
-        nodes: (N,) frequencies of the nodes, ascending from the first to the last of all frequencies.
-        tensors: Those of ``BandedFactor``, (..., n, N) instead of (..., S).
     """
 
-    nodes: Tensor
-    tensors: tuple[Tensor, ...]
+    nodes: Tensor  # (N,) frequencies of the nodes, ascending from the first to the last of all frequencies
+    tensors: tuple[Tensor, ...]  # those of ``BandedFactor``, (..., n, N) instead of (..., S)
 
     @classmethod
     def of(cls, halves: Tensor, nodes: Tensor, count: int) -> "InterpolatedFactors":

@@ -3,8 +3,6 @@
 import math
 from numbers import Real
 
-__all__ = ["MAX_NUMBER", "check_choice", "check_number", "check_whole_number", "described"]
-
 # Largest magnitude of numbers and pixels of public functions: squares of float32 are finite up to 1.8e19, and sums of
 # squares over an image of 1e8 px up to 1.8e15. No quantity in px, s or Hz reaches it.
 MAX_NUMBER = 1e15
@@ -40,21 +38,7 @@ def check_number(
     at_least: float = -math.inf,
     at_most: float = math.inf,
 ) -> float:
-    """Return ``value`` as a finite float within its bounds.
-
-    Args:
-        name: Name of the argument in error messages.
-        value: The value; booleans are refused.
-        above: The value must be larger than this.
-        at_least: The value must not be smaller than this.
-        at_most: The value must not be larger than this.
-
-    Returns:
-        The value as a float.
-
-    Raises:
-        TypeError: If the value is not a real number.
-        ValueError: If it is not finite or out of bounds.
+    """Return ``value`` as a finite float within its bounds; booleans are refused.
 
     Example:
         >>> check_number("row_time", 2e-5, above=0.0)
@@ -90,10 +74,6 @@ def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
 
 def check_whole_number(name: str, value: object, *, at_least: int, at_most: int = 2**63 - 1) -> int:
     """Return ``value`` as an int from ``at_least`` to ``at_most``, by default the largest index of an array.
-
-    Raises:
-        TypeError: If the value is not a whole number.
-        ValueError: If it is out of bounds.
 
     Example:
         >>> check_whole_number("band_rows", 32, at_least=4)

@@ -5,8 +5,6 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-__all__ = ["at_once", "chunks", "gathered", "runs"]
-
 
 def runs(count: int, size: int) -> list[slice]:
     """Consecutive slices of ``size`` indices that cover ``count``; the last one may be shorter.

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FIGURES", "figure_of", "register_figures"]
-
 # The function that draws a result of this type with this number of leading dimensions (0: not a batch).
 FIGURES: dict[tuple[type, int], Callable[[Any], "Figure"]] = {}
 _importers: list[Callable[[], object]] = []

@@ -8,20 +8,14 @@ from typing import Annotated, Any, get_args, get_origin
 
 from rsvib_torch.core.validation import fields_of
 
-__all__ = ["flat_options"]
-
 
 def flat_options(
     group: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None
 ) -> Callable[..., Any]:
     """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
 
-    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced.
-
-    Args:
-        group: The group.
-        function: Function or method with the keyword argument ``options``.
-        build: What makes the options of keyword arguments, if it is not the group.
+    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced. ``build`` makes the
+    options of the arguments, if it is not the group.
     """
     parameters = inspect.signature(function).parameters
     names = parameters.keys() - {"options"}

@@ -10,18 +10,6 @@ from torch import Tensor
 from rsvib_torch.core.chunking import gathered
 from rsvib_torch.core.splines import bspline_coefficient_rows
 
-__all__ = [
-    "extend_rows",
-    "extended_length",
-    "fast_length",
-    "phase_products",
-    "phase_tables",
-    "shift_phases",
-    "spline_spectra",
-    "squared_modulus",
-    "waves",
-]
-
 _PHASE_STEP = 64  # frequencies per entry of the coarse table of phases
 
 
@@ -89,14 +77,7 @@ def spline_spectra(images: Tensor, degree: int, length: int) -> Tensor:
 def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> Tensor:
     """Phase factors ``exp(2 pi i k shift / length)``, which move rows back by a shift, as products of two tables.
 
-    Args:
-        shift: (...) px, float64.
-        length: L of the period.
-        frequencies: Which k of ``rfft``, from start to stop.
-        dtype: Complex, of the result.
-
-    Returns:
-        (..., stop - start).
+    The shift (...) is in px; ``frequencies`` selects k of ``rfft``. The result is (..., stop - start).
 
     Example:
         >>> rows = torch.sin(2 * torch.pi * (torch.arange(8.0) - 0.25) / 8)

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import psutil
 
-__all__ = ["check_fits", "free_memory", "size_text"]
-
 
 def size_text(count: int) -> str:
     """A number of bytes with its unit.
@@ -28,9 +26,6 @@ def free_memory(root: Path = Path("/")) -> int:
 
     Files in the page cache count as free, as the system drops them when memory is needed.
 
-    Args:
-        root: Folder that contains ``proc`` and ``sys``.
-
     Example:
         >>> free_memory() > 1_000_000
         True
@@ -39,12 +34,7 @@ def free_memory(root: Path = Path("/")) -> int:
 
 
 def check_fits(what: str, needed: int, remedy: str) -> None:
-    """Raise a ``ValueError`` if ``needed`` bytes exceed the free memory, before they are allocated.
-
-    Args:
-        what: What needs them, the first words of the message.
-        needed: Bytes in addition to the memory of the process.
-        remedy: What to do, the last words of the message.
+    """Raise a ``ValueError``, from ``what`` to ``remedy``, if ``needed`` bytes more exceed the free memory.
 
     Example:
         >>> check_fits("frames", 1000, "read fewer")

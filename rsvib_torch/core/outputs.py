@@ -7,8 +7,6 @@ from pathlib import Path
 
 from rsvib_torch.core.atomic import check_not_special
 
-__all__ = ["check_outputs"]
-
 _Path = str | os.PathLike[str]
 
 
@@ -63,16 +61,7 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
     """Raise an error if an output would replace or change an input, another output, or a device.
 
     An output must not be an input under any name (another path, a link, a hard link), lie inside an input folder, or
-    contain an input.
-
-    Args:
-        outputs: Files, or folders that are written as a whole.
-        inputs: Files and folders that are read.
-        folder: Folder of the outputs, which may contain an input file, but not an input folder.
-
-    Raises:
-        ValueError: If an output is, contains or lies in an input, or two outputs are the same.
-        OSError: If an output exists and is neither a regular file nor a folder.
+    contain an input. The ``folder`` of the outputs may contain an input file, but not an input folder.
 
     Example:
         >>> check_outputs(["restored.tif"], ["frames.tif"])

@@ -9,8 +9,6 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["allowed_threads", "in_parallel", "threads_for"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -50,14 +48,6 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
 
     The threads share the number of threads that PyTorch may use within each operation. On other devices, or with one
     thread, it is a plain loop.
-
-    Args:
-        work: Called with every item; must not write to memory that another call reads.
-        items: The items.
-        device: Device of the tensors.
-
-    Returns:
-        The results, in the order of the items.
 
     Example:
         >>> in_parallel(lambda value: float(value.sum()), torch.ones(3, 2), torch.device("cpu"))

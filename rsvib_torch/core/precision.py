@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["full_precision", "outside_graphs", "outside_inference", "without_gradients"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

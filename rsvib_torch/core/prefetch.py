@@ -7,23 +7,15 @@ from typing import Any, TypeVar
 
 import torch
 
-__all__ = ["prefetched"]
-
 Item = TypeVar("Item")
 _END = object()
 
 
 def prefetched(items: Iterator[Item], count: int) -> Generator[Item, None, None]:
-    """Yield the items of an iterator, which a thread makes while earlier ones are used.
+    """Yield the items of an iterator, which a thread makes while earlier ones are used; ``count`` of them wait.
 
-    The thread uses one thread of PyTorch. It ends with the iterator, or when the generator is closed.
-
-    Args:
-        items: The iterator; it is used in the thread only, and closed there.
-        count: Number of items that wait.
-
-    Raises:
-        Exception: Errors of the iterator, behind the items before them.
+    The thread uses one thread of PyTorch. It ends with the iterator, or when the generator is closed. Errors of the
+    iterator are raised behind the items before them.
 
     Example:
         >>> list(prefetched(iter("abc"), 2))

@@ -27,19 +27,6 @@ from rsvib_torch.core.text import text_table, wrapped
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "AXIS_NAMES",
-    "AXIS_UNITS",
-    "JudgedResult",
-    "Result",
-    "Summarised",
-    "axis_head",
-    "axis_rows",
-    "plain_values",
-    "verdict_lines",
-    "verdict_table",
-]
-
 # Text
 
 
@@ -68,15 +55,7 @@ def axis_head(batch_shape: Sequence[int]) -> list[str]:
 def verdict_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], batch_shape: Sequence[int], reliable: Any, reasons: Any
 ) -> list[str]:
-    """A table with one or more rows per axis, and the verdict: lines with reasons, or a column in a batch.
-
-    Args:
-        head: Columns after those of ``axis_head``.
-        rows: Rows that begin with the cells of ``axis_rows``.
-        batch_shape: Leading dimensions.
-        reliable: (..., A) bool, one for each axis.
-        reasons: Reasons against each axis.
-    """
+    """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
     if not batch_shape:
         return [text_table(head, rows), *verdict_lines(reliable, reasons)]

@@ -7,8 +7,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["listening", "steps"]
-
 Listener = Callable[[int, int, str], None]  # steps done, number of steps, unit of a step
 
 _lock = threading.Lock()  # loops may run in several threads
@@ -26,14 +24,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 def steps(total: int, unit: str) -> Callable[..., None]:
-    """Begin a loop.
-
-    Args:
-        total: Number of steps.
-        unit: What a step is, in the plural, e.g. ``"frames"``.
-
-    Returns:
-        A function to be called after each step, or with the number of steps after several, from any thread.
+    """Begin a loop; the result is called after each step, or with the number of steps after several, from any thread.
 
     Example:
         >>> with listening(lambda done, total, unit: print(f"{done} of {total} {unit}")):

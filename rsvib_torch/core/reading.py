@@ -5,17 +5,11 @@ from pathlib import Path
 
 from rsvib_torch.core.free_memory import size_text
 
-__all__ = ["check_regular", "read_text"]
-
 _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device"}
 
 
 def check_regular(path: Path) -> None:
     """Raise an error if a path is neither a regular file nor a folder: reading others can wait or go on forever.
-
-    Raises:
-        OSError: If it does not exist.
-        ValueError: If it is a pipe, a socket or a device.
 
     Example:
         >>> check_regular(Path("/dev/null"))
@@ -30,16 +24,7 @@ def check_regular(path: Path) -> None:
 
 
 def read_text(path: Path, *, at_most: int) -> str:
-    """Text of a file in UTF-8.
-
-    Args:
-        path: The file.
-        at_most: Largest size in bytes.
-
-    Raises:
-        OSError: If it cannot be opened.
-        ValueError: If it is not a regular file, larger, or not UTF-8.
-    """
+    """Text of a regular file in UTF-8 of at most a number of bytes."""
     check_regular(path)
     with path.open("rb") as file:
         size = path.stat().st_size  # 0 for files of /proc, some of which have no end

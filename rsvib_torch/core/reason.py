@@ -12,8 +12,6 @@ from functools import partial
 from string import Formatter
 from typing import Any
 
-__all__ = ["GROUPS", "REASONS", "Reason", "ReasonKind", "read_findings", "texts"]
-
 
 @dataclass(frozen=True)
 class ReasonKind:

@@ -16,8 +16,6 @@ from rsvib_torch.core.validation import read_json
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["decode", "load_result", "save_figure", "save_result"]
-
 
 def save_result(result: Any, path: Path) -> None:
     """Write a ``Result`` as JSON, see ``Result.save``."""
@@ -47,14 +45,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
 def decode(kind: Any, value: Any, path: str, missing: float = math.nan) -> Any:
     """A value of an annotated type from what ``plain_values`` made of it.
 
-    Args:
-        kind: The type: a dataclass, a tensor, numbers and texts, or tuples and tables of these.
-        value: What a JSON file contains.
-        path: Its place in the file, for messages.
-        missing: What None stands for in a tensor.
-
-    Raises:
-        ValueError: If the value does not have the type, with its place.
+    ``path`` is its place in the file, for messages; ``missing`` is what None stands for in a tensor.
     """
     if get_origin(kind) in (Union, types.UnionType):
         if value is None:

@@ -10,17 +10,6 @@ from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
 
-__all__ = [
-    "bspline_coefficient_rows",
-    "bspline_coefficients",
-    "bspline_coefficients_adjoint",
-    "bspline_weights",
-    "correlated",
-    "gauss_legendre",
-    "mirrored",
-    "spread_taps",
-]
-
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
     """Weights of the ``degree + 1`` B-splines that are not zero at a position.
@@ -121,15 +110,7 @@ def mirrored(index: Tensor, length: int) -> Tensor:
 
 
 def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[slice, Tensor]]:
-    """``bspline_coefficients`` across the rows of images, in chunks of rows that stay in the cache.
-
-    Args:
-        samples: (..., H, W).
-        degree: Odd degree of the spline, at least 3.
-
-    Yields:
-        A slice of rows, and their coefficients (..., r, W).
-    """
+    """``bspline_coefficients`` across the rows of images, in slices of rows that stay in the cache."""
     on_cpu = samples.device.type == "cpu"
     if samples.numel() <= (1 << 20 if on_cpu else 1 << 24):  # fits the cache, or the memory
         yield slice(0, samples.shape[-2]), bspline_coefficients(samples, degree, -2)
@@ -186,17 +167,7 @@ def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tenso
 
 
 def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
-    """Matrix whose product with samples is their correlation with kernels.
-
-    Args:
-        kernels: (..., N) taps.
-        rows: Number of values of the product.
-        step: Samples between neighbouring values.
-
-    Returns:
-        (..., rows, (rows - 1) step + N).
-
-    """
+    """Matrix (..., rows, (rows - 1) step + N) whose product with samples is their correlation with kernels (..., N)."""
     taps = kernels.shape[-1]
     matrix = kernels.new_zeros(*kernels.shape[:-1], rows, (rows - 1) * step + taps)
     row = torch.arange(rows, device=kernels.device)[:, None]

@@ -15,21 +15,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = [
-    "Array",
-    "median",
-    "pseudo_inverse",
-    "quantile",
-    "select_stacks",
-    "split_axis",
-    "table",
-    "tables",
-    "take_stacks",
-    "tensor",
-    "valid_mean",
-    "without_nan",
-]
-
 Array = npt.NDArray[Any]
 Stacks = TypeVar("Stacks", bound="DataclassInstance")
 

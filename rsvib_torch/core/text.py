@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["json_text", "measured_text", "one_line", "printable", "text_table", "wrapped"]
-
 
 # Marks that change the direction of the text after them, and separators of lines.
 _INVISIBLE = frozenset("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
@@ -21,10 +19,6 @@ def printable(text: str, *, lines: bool = False) -> str:
     r"""Text with escapes instead of control characters, direction marks and bytes that are not UTF-8.
 
     Names of files may contain them; a terminal would execute control characters.
-
-    Args:
-        text: The text.
-        lines: Whether line breaks are kept.
 
     Example:
         >>> printable("a\x1b[31m\n\u202eb\udcff")

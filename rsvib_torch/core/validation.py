@@ -20,26 +20,6 @@ from pydantic_core import PydanticCustomError, core_schema
 from rsvib_torch.core.checks import MAX_NUMBER, described
 from rsvib_torch.core.reading import read_text
 
-__all__ = [
-    "Count",
-    "Extensible",
-    "MistakesError",
-    "NotNegative",
-    "Number",
-    "Positive",
-    "Section",
-    "checked",
-    "expected_text",
-    "fields_of",
-    "members_of",
-    "not_an_option",
-    "options",
-    "read_json",
-    "validate",
-    "validated",
-    "without_alias",
-]
-
 _Group = TypeVar("_Group")
 _Result = TypeVar("_Result")
 _MAX_LINES = 20  # of an error message
@@ -113,10 +93,6 @@ class Extensible:
 def options(group: type[_Group]) -> type[_Group]:
     """Make a class a group of options: a frozen dataclass whose values are checked.
 
-    Raises:
-        TypeError: When an instance is made: for an unknown option, or a value of another type.
-        ValueError: For a value that is out of bounds or not among the choices.
-
     Example:
         >>> @options
         ... class Bands:
@@ -176,17 +152,7 @@ def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result
 
 
 def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Result:
-    """Return ``data`` as a ``model``.
-
-    Args:
-        model: A ``Section``, or a group of options.
-        data: Parsed TOML or JSON.
-        source: Name of the file, for the messages.
-
-    Raises:
-        ValueError: If a key is missing or unknown, or a value has a wrong type or value: one line for each key, with
-            its path, its value and what was expected.
-    """
+    """Parsed TOML or JSON as a ``Section`` or group of options; an error has a line for each mistake in ``source``."""
     try:
         return TypeAdapter(model).validate_python(data, context={"file": source})
     except ValidationError as error:
@@ -196,12 +162,7 @@ def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Res
 
 
 def validated(name: str, value: Any, adapter: TypeAdapter[Any], kind: Any) -> Any:
-    """Return the value of an argument if it is of a kind, as ``adapter`` converts it.
-
-    Raises:
-        TypeError: If it has another type.
-        ValueError: If it is out of bounds or not among the choices.
-    """
+    """Return the value of an argument if it is of a kind, as ``adapter`` converts it."""
     try:
         return adapter.validate_python(_plain(value))
     except ValidationError as error:
@@ -212,29 +173,17 @@ def validated(name: str, value: Any, adapter: TypeAdapter[Any], kind: Any) -> An
 
 @dataclass
 class _Mistake:
-    """A mistake at one key.
+    """A mistake at one key."""
 
-    Attributes:
-        path: The key, with the tables around it.
-        value: The value.
-        expected: What was expected instead.
-        text: A sentence that replaces the others.
-        known: The keys that exist, for one that does not.
-        choices: The choices, if there is nothing else.
-        accepts_none: Whether None is possible in Python.
-        kind: The exception in Python.
-        is_bound: Whether the value has the right type and is out of bounds.
-    """
-
-    path: str
-    value: Any = None
-    expected: str = ""
-    text: str = ""
-    known: tuple[str, ...] = ()
-    choices: tuple[Any, ...] = ()
-    accepts_none: bool = False
-    kind: type[Exception] = ValueError
-    is_bound: bool = False
+    path: str  # the key, with the tables around it
+    value: Any = None  # the value
+    expected: str = ""  # what was expected instead
+    text: str = ""  # a sentence that replaces the others
+    known: tuple[str, ...] = ()  # the keys that exist, for one that does not
+    choices: tuple[Any, ...] = ()  # the choices, if there is nothing else
+    accepts_none: bool = False  # whether None is possible in Python
+    kind: type[Exception] = ValueError  # the exception in Python
+    is_bound: bool = False  # whether the value has the right type and is out of bounds
 
     def in_python(self) -> Exception:
         """The exception."""
@@ -361,16 +310,7 @@ def expected_text(annotation: Any) -> str:
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """Read a table from a JSON file.
-
-    Args:
-        path: The file.
-        what: Name of the kind of file, for the messages.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ValueError: If it is not JSON or not a table, or larger than 1 GB.
-    """
+    """Read a table from a JSON file of a kind, at most 1 GB."""
     try:
         text = read_text(path, at_most=_MAX_JSON_BYTES)
         data = json.loads(text, parse_constant=_no_constant)

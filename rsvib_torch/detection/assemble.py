@@ -28,8 +28,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["assembled", "offset_curve"]
-
 
 def assembled(
     fit: ToneFit,
@@ -100,12 +98,8 @@ def offset_curve(
 ) -> tuple[OffsetCurve, Array]:
     """Measured offsets between consecutive frames, and those (B, P, N, A) in px that a fit predicts.
 
-    Args:
-        measurements: Displacements of the rows of all groups behind each other.
-        fit: The fit to them.
-        robust_weights: As in ``FittedRows``.
-        group_frames: Number of frames of each group; neighbouring groups share a frame.
-        device: Device of the curve.
+    The measurements have the rows of all groups behind each other; neighbouring groups of ``group_frames`` share a
+    frame.
     """
     count = measurements.displacements.shape[1] // len(group_frames)
     parts = [

@@ -29,22 +29,14 @@ from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["FieldOptions", "detect_tones", "detect_windows", "windows_of"]
-
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """Whether roll and zoom are measured (True, False or ``"auto"``), and the camera in row order.
+    """Whether roll and zoom are measured (True, False or ``"auto"``), and the camera in row order."""
 
-    Attributes:
-        roll: Rotation about the optical axis.
-        zoom: Change of scale; includes roll.
-        camera: Focal length and lens; None for an infinite focal length.
-    """
-
-    roll: bool | Literal["auto"]
-    zoom: bool | Literal["auto"]
-    camera: Camera | None
+    roll: bool | Literal["auto"]  # rotation about the optical axis
+    zoom: bool | Literal["auto"]  # change of scale; includes roll
+    camera: Camera | None  # focal length and lens; None for an infinite focal length
 
     @property
     def most_axes(self) -> int:
@@ -67,12 +59,7 @@ def detect_tones(
 ) -> DetectionResult:
     """Detect the tones of B stacks, with as many components as were requested or as the frames require.
 
-    Args:
-        stacks: The frames.
-        timing: The sensor, in image order.
-        options: Options of all attempts.
-        field: Roll, zoom and camera.
-        diagnose: Whether another timing is tried for stacks whose rows the tones do not explain.
+    ``diagnose`` tries another timing for stacks whose rows the tones do not explain.
     """
     height, width = stacks.images.shape[-2:]
     row_timing, num_frames = timing.in_row_order(), stacks.images.shape[1]

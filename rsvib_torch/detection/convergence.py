@@ -16,8 +16,6 @@ from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residual_of
 from rsvib_torch.detection.tones.selection import robust_fit
 
-__all__ = ["Acceleration", "Step", "is_converged"]
-
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 # A step was inexact if the next round corrects more than this part of it. Without long exposures, 0.1 is corrected
 _INEXACT = 0.3
@@ -26,15 +24,10 @@ _MAX_EXTRAPOLATION = 4.0  # steps
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A round of measuring and fitting, as relative displacements (B, N, G, A) of the rows in px.
+    """A round of measuring and fitting, as relative displacements (B, N, G, A) of the rows in px."""
 
-    Attributes:
-        fitted: Displacements by the fitted motion.
-        change: ``fitted`` less the displacements by the motion that the frames were warped by.
-    """
-
-    fitted: Array
-    change: Array
+    fitted: Array  # displacements by the fitted motion
+    change: Array  # ``fitted`` less the displacements by the motion that the frames were warped by
 
     @classmethod
     def between(cls, measurements: Measurements, warped_by: ToneFit, fitted: ToneFit) -> "Step":
@@ -57,12 +50,8 @@ def is_converged(previous: ToneFit, fit: ToneFit, ratio: Array | None) -> Array:
     """(B, A) bool, whether the last round changed the tones of an axis so little that the next one need not be made.
 
     Without long exposures a step is a tenth of the previous one or shorter. Changes of up to half a standard deviation
-    are therefore small enough, and up to three standard deviations if the measured ratio of two steps allows it.
-
-    Args:
-        previous: The fit of the previous round.
-        fit: The fit of this round.
-        ratio: (B,) length of the last step over that of the step before; None if unknown.
+    are therefore small enough, and up to three standard deviations if the measured ratio (B,) of the last two steps
+    allows it.
     """
     if previous.active.shape != fit.active.shape:
         return np.zeros_like(fit.active[..., 0])

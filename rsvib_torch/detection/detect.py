@@ -193,10 +193,8 @@ class VibrationDetector(nn.Module):
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> detector = rsv.VibrationDetector(timing, method="bands", tones=1)
         >>> found = detector(frames.expand(2, 1, *frames.shape).transpose(1, 2))  # two stacks (B, T, C, H, W)
         >>> found.vibration.frequency[..., 0].round(decimals=0).tolist()  # Hz, (B, 2)

@@ -29,8 +29,6 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.options import OffsetOptions
 from rsvib_torch.registration.register import fits_frame
 
-__all__ = ["TimingDiagnosis", "diagnose_timing", "other_timings", "period_factor"]
-
 
 @dataclass(frozen=True)
 class TimingDiagnosis:
@@ -110,10 +108,7 @@ def diagnose_timing(frames: FramesOrFiles, timing: SensorTiming, options: Offset
 def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, TimingDiagnosis]:
     """The settings that stacks contradict, by the index of the stack; without stacks that contradict none.
 
-    Args:
-        stacks: The frames.
-        timing: The sensor as stated, in image order.
-        found: The attempt with this timing.
+    ``found`` is the attempt with the stated timing, in image order.
     """
     if found.fitted.refined is None:
         return {}
@@ -132,13 +127,8 @@ def _diagnosis(
 ) -> TimingDiagnosis | None:
     """The setting with the value that one stack agrees with; None if it agrees with no other timing.
 
-    Args:
-        stack: The frames, (1, T, H, W) in row order.
-        timing: The sensor as stated, in image order.
-        found: The attempt with this timing, of all stacks.
-        index: The stack.
-        axes: Axes (x, y) in row order that contradict the stated timing.
-        rotates: Whether the halves of the rows move apart, as they do with the wrong scan axis.
+    ``axes`` (x, y) in row order contradict the stated timing; ``rotates`` states that the halves of the rows move
+    apart, as they do with the wrong scan axis.
     """
     num_frames, height, width = stack.images.shape[1:]
     only = slice(index, index + 1)

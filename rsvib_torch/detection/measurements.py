@@ -12,8 +12,6 @@ import numpy as np
 
 from rsvib_torch.core.tables import Array, median, take_stacks, valid_mean, without_nan
 
-__all__ = ["Measurements", "OtherMotion", "cholesky_root", "trimmed_mean"]
-
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -25,28 +23,22 @@ class Measurements:
     Every scene row n is measured in a group of G frames (two of them give an offset). The position of the scene itself
     is unknown, so only differences within a group are measured: the mean over the group is subtracted from the
     displacements, and from every model that is compared with them.
-
-    Attributes:
-        exposure_starts: (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n.
-        displacements: (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that contain the row; 0 in
-            the others.
-        visible: (B, N, G) float64, 1 where a frame contains the row, else 0.
-        information: (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common
-            factor; 0 where nothing was measured.
-        exposure_time: T_e in seconds.
-        average_times: Duration over which each displacement (x, y) is an average: rows of a band times the row time.
-            Roll and zoom have that of x.
-        independent: Fraction of the measurements that are independent (bands may overlap), one for all stacks or (B,).
-        groups: Groups of frames whose rows follow each other: rows N / groups apart show the same part of the scene.
     """
 
-    exposure_starts: Array
+    exposure_starts: Array  # (B, N, G) float64 s, exposure start of the row of each frame that contains scene row n
+    # (B, N, G, 2) float64 px, axes (x, y), with zero mean over the frames that contain the row; 0 in the others
     displacements: Array
-    visible: Array
+    visible: Array  # (B, N, G) float64, 1 where a frame contains the row, else 0
+    # (B, N, 2, 2) float64 px^-2, inverse covariance of the displacement in one frame up to a common factor; 0 where
+    # nothing was measured
     information: Array
-    exposure_time: float
+    exposure_time: float  # T_e in seconds
+    # duration over which each displacement (x, y) is an average: rows of a band times the row time. Roll and zoom
+    # have that of x
     average_times: tuple[float, float] = (0.0, 0.0)
+    # fraction of the measurements that are independent (bands may overlap), one for all stacks or (B,)
     independent: float | Array = 1.0
+    # groups of frames whose rows follow each other: rows N / groups apart show the same part of the scene
     groups: int = 1
 
     @classmethod
@@ -282,23 +274,16 @@ class Measurements:
 
 @dataclass(frozen=True, eq=False)
 class OtherMotion:
-    """Motion of the rows that no vibration explains, for each axis in px, without the part that noise explains.
+    """Motion of the rows that no vibration explains, for each axis in px, without the part that noise explains."""
 
-    Attributes:
-        size: (..., 2) rms offset of the rows by the tones, for comparison.
-        unexplained: (..., 2) rms residual displacement of the fit.
-        correlated: (..., 2) the part of it that neighbouring rows have in common.
-        differential: (..., 2) rms difference of the residual displacements of the left and right halves of the rows.
-        measured: (...) fraction of the visible rows whose displacement was measured.
-        blur: (..., 3) measured difference of the blur of the frames relative to the expected one, its standard
-            deviation, and the size of the expected difference relative to the detail of the scene.
-    """
-
-    size: Array
-    unexplained: Array
-    correlated: Array
+    size: Array  # (..., 2) rms offset of the rows by the tones, for comparison
+    unexplained: Array  # (..., 2) rms residual displacement of the fit
+    correlated: Array  # (..., 2) the part of it that neighbouring rows have in common
+    # (..., 2) rms difference of the residual displacements of the left and right halves of the rows
     differential: Array
-    measured: Array
+    measured: Array  # (...) fraction of the visible rows whose displacement was measured
+    # (..., 3) measured difference of the blur of the frames relative to the expected one, its standard deviation, and
+    # the size of the expected difference relative to the detail of the scene
     blur: Array
 
     @classmethod

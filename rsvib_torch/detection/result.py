@@ -15,9 +15,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["AttitudeTones", "DetectionResult", "TimingSensitivity"]
-
-
 _TONE_VALUES = ("amplitude", "frequency")
 _SENSITIVITY_SHAPES = {
     f"{value}_by_{time}": "... A K" for time in ("row_time", "frame_rows", "exposure_rows") for value in _TONE_VALUES
@@ -32,22 +29,14 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
     and the frames are the same. All values have the shape (..., 2, K), axes (x, y), 0 where there is no tone. A change
     of ``row_time`` changes exposure time and frame period alike; with ``frame_start_times``, ``frame_rows`` has no
     effect.
-
-    Attributes:
-        amplitude_by_row_time: d ln A / d ln row_time.
-        amplitude_by_frame_rows: d ln A / d ln frame_rows.
-        amplitude_by_exposure_rows: d ln A / d ln exposure_rows.
-        frequency_by_row_time: d ln f / d ln row_time.
-        frequency_by_frame_rows: d ln f / d ln frame_rows.
-        frequency_by_exposure_rows: d ln f / d ln exposure_rows.
     """
 
-    amplitude_by_row_time: Tensor
-    amplitude_by_frame_rows: Tensor
-    amplitude_by_exposure_rows: Tensor
-    frequency_by_row_time: Tensor
-    frequency_by_frame_rows: Tensor
-    frequency_by_exposure_rows: Tensor
+    amplitude_by_row_time: Tensor  # d ln A / d ln row_time
+    amplitude_by_frame_rows: Tensor  # d ln A / d ln frame_rows
+    amplitude_by_exposure_rows: Tensor  # d ln A / d ln exposure_rows
+    frequency_by_row_time: Tensor  # d ln f / d ln row_time
+    frequency_by_frame_rows: Tensor  # d ln f / d ln frame_rows
+    frequency_by_exposure_rows: Tensor  # d ln f / d ln exposure_rows
 
     def summary(self) -> str:
         """Changes of the strongest tone of each axis if a time is stated 1 % larger."""
@@ -69,22 +58,14 @@ class AttitudeTones(
 
     The rotation is right-handed about the axes x (right), y (down) and z (forward) of the camera, see ``Camera``. Roll
     that was not measured has amplitude 0 and a standard deviation of infinity.
-
-    Attributes:
-        amplitude: rad.
-        amplitude_std: rad.
-        frequency: Hz.
-        frequency_std: Hz.
-        phase: rad at the time origin.
-        phase_std: rad.
     """
 
-    amplitude: Tensor
-    amplitude_std: Tensor
-    frequency: Tensor
-    frequency_std: Tensor
-    phase: Tensor
-    phase_std: Tensor
+    amplitude: Tensor  # rad
+    amplitude_std: Tensor  # rad
+    frequency: Tensor  # hz
+    frequency_std: Tensor  # hz
+    phase: Tensor  # rad at the time origin
+    phase_std: Tensor  # rad
 
     @classmethod
     def of(cls, vibration: Vibration, std: VibrationStd) -> "AttitudeTones":
@@ -158,10 +139,8 @@ class DetectionResult(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> detection = rsv.detect_vibration(frames, timing)
         >>> detection.std.amplitude.shape, detection.offsets.offsets.shape[-1]  # (axis, tone); x and y
         (torch.Size([2, 1]), 2)

@@ -16,25 +16,15 @@ from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displa
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["assumptions", "timing_sensitivity"]
-
 _STEP = 1e-4  # relative change of the timing, for differences
 
 
 def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_rows: int) -> TimingSensitivity:
-    """Sensitivity of the tones of a fit to the timing, in row order.
+    """Sensitivities (B, 2, K) of the tones of a fit to the timing, in row order, as of ``vibration_of_fit``.
 
     A timing that is wrong by dT changes the displacements at the measured times by ``dD``. The least-squares fit then
-    changes its parameters by ``-X^+ dD`` to first order, X the Jacobian of the displacements of all rows.
-
-    Args:
-        fit: The fit of B stacks.
-        timing: The sensor.
-        num_frames: Frames of a stack.
-        num_rows: Rows of a frame; about 128 of them are used.
-
-    Returns:
-        Sensitivities (B, 2, K), the tones in the order of ``vibration_of_fit``.
+    changes its parameters by ``-X^+ dD`` to first order, X the Jacobian of the displacements of about 128 rows of all
+    frames.
     """
     batch, axes, tones = fit.coefficients.shape
 
@@ -80,15 +70,7 @@ def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:
 def assumptions(
     vibration: Vibration, sensitivity: TimingSensitivity, timing: RowTiming, num_frames: int, num_rows: int
 ) -> tuple[str, ...]:
-    """What the frames cannot contradict, with its effect, one sentence for each.
-
-    Args:
-        vibration: The vibration (not a batch), in image axes.
-        sensitivity: Its sensitivity, in image axes.
-        timing: The sensor.
-        num_frames: Frames of the stack.
-        num_rows: Rows of a frame.
-    """
+    """What the frames cannot contradict, with its effect on one vibration in image axes, one sentence for each."""
     if not bool((vibration.amplitude > 0).any()):
         return ()
     sentences = []

@@ -21,15 +21,6 @@ from rsvib_torch.options import RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.register import check_frame_size, fits_frame, register_rows
 
-__all__ = [
-    "BandStart",
-    "band_curve",
-    "band_start",
-    "field_start",
-    "measurements_of_curve",
-]
-
-
 _START_COLUMNS = 320  # px, columns that give a start of sufficient accuracy
 
 
@@ -72,17 +63,11 @@ def band_curve(
 
 @dataclass(frozen=True, eq=False)
 class BandStart:
-    """Offsets of row bands, with which every detection starts.
+    """Offsets of row bands, with which every detection starts."""
 
-    Attributes:
-        curve: (B, P, N) offsets; with roll and zoom in px (``FieldScale``).
-        measurements: The same as input of a fit.
-        fit: Tones that are known; None if there are none.
-    """
-
-    curve: OffsetCurve
-    measurements: Measurements
-    fit: ToneFit | None = None
+    curve: OffsetCurve  # (B, P, N) offsets; with roll and zoom in px (``FieldScale``)
+    measurements: Measurements  # the same as input of a fit
+    fit: ToneFit | None = None  # tones that are known; None if there are none
 
     def predicted(self, fit: ToneFit) -> Array:
         """Offsets (B, P, N, A) in px of the row bands that a fit predicts."""

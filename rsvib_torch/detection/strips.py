@@ -27,24 +27,15 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.options import ProjectionOptions
 
-__all__ = ["FieldScale", "camera_in_row_order", "combined_strips", "cut_into_strips"]
-
 
 @dataclass(frozen=True)
 class FieldScale:
-    """Lengths of a frame that roll and zoom refer to.
+    """Lengths of a frame that roll and zoom refer to."""
 
-    Attributes:
-        axes: Number of components of the motion, 2 to 4.
-        width: Columns of a frame.
-        height: Rows of a frame.
-        camera: Focal length and lens, in row order.
-    """
-
-    axes: int
-    width: int
-    height: int
-    camera: Camera | None = None
+    axes: int  # number of components of the motion, 2 to 4
+    width: int  # columns of a frame
+    height: int  # rows of a frame
+    camera: Camera | None = None  # focal length and lens, in row order
 
     @property
     def same_for_all_columns(self) -> bool:
@@ -109,14 +100,9 @@ def camera_in_row_order(
 
 
 def combined_strips(measured: Measurements, factors: Array) -> Measurements:
-    """Components of the motion of every row from the displacements of strips.
+    """Components (B, N, G, A) of the motion of every row from the displacements (B S, N, G, 2) of strips.
 
-    Args:
-        measured: Displacements (B S, N, G, 2) of the strips.
-        factors: (B, S, N, 2, A) displacements by unit components.
-
-    Returns:
-        Measurements (B, N, G, A).
+    ``factors`` (B, S, N, 2, A) are displacements by unit components.
     """
     strips = factors.shape[1]
 

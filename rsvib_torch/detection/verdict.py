@@ -19,19 +19,6 @@ from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = [
-    "MAX_DISPLACEMENT_STD",
-    "BandOffsets",
-    "Findings",
-    "contradicted_axes",
-    "halves_move_apart",
-    "judged",
-    "recording_reasons",
-    "residual_reasons",
-    "rotation_possible",
-    "rotation_reasons",
-]
-
 Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
 
 _MIN_MEASURED = 0.5  # of the visible rows or bands
@@ -43,17 +30,11 @@ _OF_STACK = ("measured", "bands", "differential", "blur")  # quantities without 
 
 @dataclass(frozen=True, eq=False)
 class BandOffsets:
-    """Offsets of M row bands of B stacks.
+    """Offsets of M row bands of B stacks."""
 
-    Attributes:
-        offsets: (B, M, A) px, NaN where a band could not be registered.
-        fitted: (B, M, A) px, offsets predicted by the vibration.
-        visible: (B, M) bool, bands that both frames contain.
-    """
-
-    offsets: Array
-    fitted: Array
-    visible: Array
+    offsets: Array  # (B, M, A) px, NaN where a band could not be registered
+    fitted: Array  # (B, M, A) px, offsets predicted by the vibration
+    visible: Array  # (B, M) bool, bands that both frames contain
 
 
 def judged(
@@ -267,10 +248,8 @@ _MAX_UNEVEN, _MAX_MOVED = 3.0, 8.0  # of the permitted difference of the halves,
 def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array:
     """(B,) whether roll or zoom may be all that the fit of a stack does not explain.
 
-    Args:
-        other: Motion of the rows that the fit does not explain.
-        uneven: (B, 2) px, differences of the displacements along a row that are not linear in the column.
-        aspect: Rows of a frame over its columns.
+    ``uneven`` (B, 2) px are differences of the displacements along a row that are not linear in the column; ``aspect``
+    is the rows of a frame over its columns.
     """
     apart = other.differential[..., ::-1]
     is_uneven = (uneven[..., ::-1] > _MAX_UNEVEN * _max_apart(other.size)).any(-1)
@@ -286,12 +265,8 @@ def rotation_reasons(
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
 
-    Args:
-        axis: The axis, in row order.
-        axes: Number of components of the motion.
-        differential: (2,) px, rms difference of the displacements along a row that the motion does not explain.
-        size: px, rms offset along the axis.
-        remedy: Value of ``roll`` and ``zoom`` with which they are measured.
+    ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
+    ``size`` px the rms offset along the axis, and ``remedy`` the value of roll and zoom with which they are measured.
     """
     apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
     if apart <= allowed:
@@ -327,12 +302,9 @@ def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) 
 
 
 def recording_reasons(moved: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
-    """Reasons against a recorded motion.
+    """Reasons against a recorded motion, from the rms motion of the rows by it and beside it along each axis, in px.
 
-    Args:
-        moved: px, rms motion of the rows by the recording, for each axis.
-        unexplained: px, rms motion that it does not explain.
-        other: Another offset of its clock in s that explains the frames as well.
+    ``other`` is another offset of its clock in s that explains the frames as well.
     """
     reasons, largest = [], max(moved)
     if largest < _MIN_MOTION:

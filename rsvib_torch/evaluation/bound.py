@@ -24,8 +24,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["cramer_rao_bound"]
-
 _DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
 _RIDGE = 1e-10  # of the largest element, for scene rows outside all frames; 1e-9, 1e-11: bounds change by 0.8 %
@@ -48,25 +46,15 @@ _Parameter = tuple[int, str, int]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A still scene, the frames taken of it, and the parameters of the bound, in row order.
+    """A still scene, the frames taken of it, and the parameters of the bound, in row order."""
 
-    Attributes:
-        scene: (Hs, Ws) float64; frames are centred on it.
-        timing: The sensor.
-        motion: The motion, with two components: with roll and zoom that of the middle column.
-        num_frames: Frames taken.
-        size: (H, W) of the frames.
-        axes: For each of the P parameters the component of the motion (x, y, roll, zoom) that it changes.
-        sensitivity: From times (...) to the derivatives (P, ...) of that component.
-    """
-
-    scene: Tensor
-    timing: RowTiming
-    motion: Motion
-    num_frames: int
-    size: tuple[int, int]
-    axes: tuple[int, ...]
-    sensitivity: Callable[[Tensor], Tensor]
+    scene: Tensor  # (Hs, Ws) float64; frames are centred on it
+    timing: RowTiming  # the sensor
+    motion: Motion  # the motion, with two components: with roll and zoom that of the middle column
+    num_frames: int  # frames taken
+    size: tuple[int, int]  # (H, W) of the frames
+    axes: tuple[int, ...]  # for each of the P parameters the component of the motion (x, y, roll, zoom) that it changes
+    sensitivity: Callable[[Tensor], Tensor]  # from times (...) to the derivatives (P, ...) of that component
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -146,25 +134,15 @@ def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Observation operator: coefficients of the scene for each row at the N nodes of its exposure.
+    """Observation operator: coefficients of the scene for each row at the N nodes of its exposure."""
 
-    Attributes:
-        first: (T, R) first scene row.
-        taps: (T, R, N, J) weights of the scene rows from the first on.
-        slopes: (T, R, N, J) their derivatives by the place.
-        along: (T, R, N) displacement along the row in px.
-        weights: (N,) of the nodes.
-        sensitivity: (P, T, R, N) derivatives of the displacement.
-        axes: As in ``Recording``.
-    """
-
-    first: Tensor
-    taps: Tensor
-    slopes: Tensor
-    along: Tensor
-    weights: Tensor
-    sensitivity: Tensor
-    axes: tuple[int, ...]
+    first: Tensor  # (T, R) first scene row
+    taps: Tensor  # (T, R, N, J) weights of the scene rows from the first on
+    slopes: Tensor  # (T, R, N, J) their derivatives by the place
+    along: Tensor  # (T, R, N) displacement along the row in px
+    weights: Tensor  # (N,) of the nodes
+    sensitivity: Tensor  # (P, T, R, N) derivatives of the displacement
+    axes: tuple[int, ...]  # as in ``Recording``
 
     @classmethod
     def of(cls, recording: Recording) -> "_Places":
@@ -287,14 +265,10 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
 
 
 def _gradient_products(scene: Tensor, factors: Tensor, window: Tensor, noise: float | None, num_frames: int) -> Tensor:
-    """Sums (S, A, A) of the products of the derivatives by the A components over the columns in the window.
+    """Sums (S, A, A) of the products of the derivatives by the A components over the columns, weighted by a window.
 
-    Args:
-        scene: (S, W).
-        factors: (S, W, 2, A) displacements by unit components.
-        window: (S, W) weights of the columns.
-        noise: As in ``gradient_information``.
-        num_frames: Frames of the scene.
+    The scene is (S, W), the displacements by unit components are (S, W, 2, A); ``noise`` as in
+    ``gradient_information``.
     """
     lengths = [fast_length(size + 2 * _MARGIN) for size in scene.shape]
     closed = extend_rows(extend_rows(scene, lengths[1], hold=0.0).T, lengths[0], hold=0.0).T
@@ -351,9 +325,7 @@ def _sensitivity(motion: Vibration, parameter: _Parameter, times: Tensor) -> Ten
 def _deviations(information: Tensor, typical: Tensor) -> Tensor:
     """Square roots of the diagonal of the inverse; infinite where there is no information.
 
-    Args:
-        information: (P, P).
-        typical: (P,), information for a known scene; eigenvalues below 1e-8 of it count as zero.
+    Eigenvalues below 1e-8 of the information (P,) for a known scene count as zero.
     """
     scale = typical.clamp(min=1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, None] * scale)

@@ -10,8 +10,6 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import FramesLike, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 
-__all__ = ["offset_endpoint_error", "psnr", "ssim"]
-
 
 def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tensor, Tensor]:
     """Both images without their rim in float32 or float64, as (N, C, H, W), one entry of N an image."""

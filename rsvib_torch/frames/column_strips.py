@@ -10,24 +10,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["ColumnStrips"]
-
 
 @dataclass(frozen=True)
 class ColumnStrips:
-    """Strips of equal width that cover a frame.
+    """Strips of equal width that cover a frame."""
 
-    Attributes:
-        frame_width: Columns of the frame.
-        width: Columns of a strip.
-        firsts: First column of each strip.
-        middles: Columns, not necessarily whole, where the weight of each strip is 1.
-    """
-
-    frame_width: int
-    width: int
-    firsts: tuple[int, ...]
-    middles: tuple[float, ...]
+    frame_width: int  # columns of the frame
+    width: int  # columns of a strip
+    firsts: tuple[int, ...]  # first column of each strip
+    middles: tuple[float, ...]  # columns, not necessarily whole, where the weight of each strip is 1
 
     @classmethod
     def of(cls, frame_width: int, max_pitch: float, margin: int) -> "ColumnStrips":

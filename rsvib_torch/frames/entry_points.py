@@ -7,21 +7,13 @@ receives ``options``. A decorator has the type of the arguments that precede the
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.flat_options import flat_options
 from rsvib_torch.core.precision import outside_graphs
-from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.io.stack_reading import FramesOrFiles, PathLike
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-
-__all__ = [
-    "FramesFunction",
-    "VibrationFunction",
-    "entry_point",
-    "frames_options",
-    "module_options",
-    "vibration_options",
-]
 
 P = ParamSpec("P")
 Module = TypeVar("Module")
@@ -34,6 +26,22 @@ class FramesFunction(Protocol[P, Result_co]):
     """A function of frames and their timing."""
 
     def __call__(self, frames: FramesOrFiles, timing: SensorTiming, *args: P.args, **kwargs: P.kwargs) -> Result_co:
+        """Call the function."""
+
+
+class FileFunction(Protocol[P, Result_co]):
+    """A function of the file of a stack, of the file to write, and of the timing."""
+
+    def __call__(
+        self, source: PathLike, sink: PathLike, timing: SensorTiming, *args: P.args, **kwargs: P.kwargs
+    ) -> Result_co:
+        """Call the function."""
+
+
+class SourceFunction(Protocol[P, Result_co]):
+    """A function of the file of a stack and of the timing."""
+
+    def __call__(self, source: PathLike, timing: SensorTiming, *args: P.args, **kwargs: P.kwargs) -> Result_co:
         """Call the function."""
 
 
@@ -65,6 +73,20 @@ def vibration_options(
 ]:
     """Decorator of a function ``(frames, timing, vibration, options)``."""
     return lambda function: entry_point(options, function)
+
+
+def source_options(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[PathLike, SensorTiming, Options], Result]], SourceFunction[P, Result]]:
+    """Decorator of a function ``(source, timing, options)``."""
+    return lambda function: flat_options(options, checks_arguments(function))
+
+
+def file_options(
+    options: Callable[P, Options],
+) -> Callable[[Callable[[PathLike, PathLike, SensorTiming, Options], Result]], FileFunction[P, Result]]:
+    """Decorator of a function ``(source, sink, timing, options)``."""
+    return lambda function: flat_options(options, checks_arguments(function))
 
 
 def module_options(

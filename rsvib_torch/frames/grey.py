@@ -13,23 +13,15 @@ from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import MaskedInputOptions
 
-__all__ = ["GreyFrames", "constant_frame", "grey_frames", "without_mosaic"]
-
 
 @dataclass(frozen=True, eq=False)
 class GreyFrames:
-    """Stacks of frames as detection uses them.
+    """Stacks of frames as detection uses them."""
 
-    Attributes:
-        images: (B, T, H, W) grey, in row order; missing pixels hold local means.
-        valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
-        batched: Whether the user gave a batch.
-        timing: The sensor in image orientation, with the frame times of the file if frames were given by a path.
-    """
-
-    images: Tensor
-    valid: Tensor | None
-    batched: bool
+    images: Tensor  # (B, T, H, W) grey, in row order; missing pixels hold local means
+    valid: Tensor | None  # (B, T, H, W) bool, False at missing pixels; None if there are none
+    batched: bool  # whether the user gave a batch
+    # the sensor in image orientation, with the frame times of the file if frames were given by a path
     timing: SensorTiming
 
     def narrowed(self, columns: int) -> "GreyFrames":
@@ -68,22 +60,10 @@ def grey_frames(
     *,
     min_valid_fraction: float = 0.1,
 ) -> GreyFrames:
-    """Read and check stacks of frames, and convert them to grey frames in row order.
+    """Read and check stacks of frames as ``prepare_frames`` does, and convert them to grey frames in row order.
 
-    Args:
-        frames: (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array, list of these, or files; NaN marks missing
-            pixels.
-        timing: The sensor.
-        given: Full scale, missing pixels and position of the channels.
-        min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
-
-    Warns:
-        TimingWarning: As ``prepare_frames``.
-
-    Raises:
-        TypeError: If frames are not numbers or ``ignore`` is not bool.
-        ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
-            ``ignore`` does not fit; or a frame is a copy of the one before.
+    There must be at least two frames. Frames that are constant, have too few pixels that are not missing, or are copies
+    of the one before are refused.
     """
     prepared = prepare_frames(
         frames, timing, full_scale=given.full_scale, channels=given.channels, ignore=given.ignore, minimum_frames=2

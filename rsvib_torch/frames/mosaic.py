@@ -10,18 +10,6 @@ from rsvib_torch.core.checks import check_choice
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.options import Mosaic
 
-__all__ = [
-    "check_mosaic",
-    "colour_frames",
-    "colours_of",
-    "fill_by_colour",
-    "interpolated_colours",
-    "is_mosaic",
-    "luminance",
-    "measures",
-    "mosaic_free",
-]
-
 _LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic
 
 
@@ -41,12 +29,7 @@ def check_mosaic(pattern: object, shape: tuple[int, ...], name: str = "frames") 
 
 
 def colours_of(pattern: str, height: int, width: int) -> Tensor:
-    """Colour of every pixel, (height, width) int64: 0 red, 1 green, 2 blue.
-
-    Args:
-        pattern: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1).
-        height: Even number of rows.
-        width: Even number of columns.
+    """Colour of every pixel, (height, width) int64: 0 red, 1 green, 2 blue; of a pattern such as ``"RGGB"``.
 
     Example:
         >>> colours_of("RGGB", 2, 4).tolist()

@@ -14,16 +14,6 @@ from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.motion.timing import SensorTiming, row_axes
 
-__all__ = [
-    "findings_from_row_order",
-    "frames_from_row_order",
-    "frames_to_row_order",
-    "magnitudes_from_row_order",
-    "offsets_from_row_order",
-    "reasons_from_row_order",
-    "sequence_from_row_order",
-]
-
 Entry = TypeVar("Entry")
 
 
@@ -50,10 +40,7 @@ def offsets_from_row_order(offsets: Tensor, timing: SensorTiming) -> Tensor:
 def magnitudes_from_row_order(values: Tensor, timing: SensorTiming, axis: int = -1) -> Tensor:
     """Turn values without a sign back to image axes: standard deviations, gains, residuals, verdicts.
 
-    Args:
-        values: (..., A) for ``axis=-1``, (..., A, K) for ``axis=-2``, with components in row order; of any dtype.
-        timing: The sensor.
-        axis: Axis of the components.
+    Values are (..., A) for ``axis=-1`` and (..., A, K) for ``axis=-2``, with components in row order, of any dtype.
 
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")

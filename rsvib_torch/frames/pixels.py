@@ -6,17 +6,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["cut_columns", "cut_parts", "detailed_columns", "detailed_parts", "enlarged", "fill_with_means"]
-
 
 def fill_with_means(frames: Tensor, missing: Tensor) -> Tensor:
     """Replace missing pixels (..., H, W) by the mean of the measured pixels of a square around them.
 
-    The square grows from 3 px until it contains a measured pixel.
-
-    Args:
-        frames: (..., H, W); values of missing pixels are not used.
-        missing: Bool of that shape.
+    The square grows from 3 px until it contains a measured pixel. Values of missing pixels are not used.
 
     Example:
         >>> frames = torch.tensor([[[1.0, 9.0, 3.0]]])
@@ -72,11 +66,7 @@ def _box_sum(images: Tensor, size: int) -> Tensor:
 
 
 def detailed_columns(images: Tensor, count: int) -> slice:
-    """The ``count`` neighbouring columns with the largest squared differences of neighbouring rows.
-
-    Args:
-        images: (..., H, W); the leading dimensions are taken together.
-        count: Number of columns.
+    """The ``count`` neighbouring columns of images (..., H, W) with the largest squared row differences.
 
     Example:
         >>> image = torch.zeros(16, 12)

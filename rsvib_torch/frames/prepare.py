@@ -23,38 +23,27 @@ from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 
-__all__ = ["PreparedFrames", "Saturation", "as_float_frames", "prepare_frames"]
-
 Saturation = float | Literal["auto"] | None
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrames:
-    """Frames in the form that core code expects, with what is needed to return to the user's form.
+    """Frames in the form that core code expects, with what is needed to return to the user's form."""
 
-    Attributes:
-        images: (B, T, C, H, W) float32 or float64 in row order, full scale 1; 0 at missing pixels.
-        missing: Bool of that shape, True at pixels without data; None if there are none.
-        saturated: Bool of that shape, True at pixels at or above the saturation level; None if there are none.
-        timing: The sensor in row order.
-        image_timing: The sensor in image orientation, with the frame times of the file if frames were given by a path.
-        shape: Shape of the user's frames.
-        channel_axis: Their axis of the channels, -3 or -1, if they have one.
-        dtype: Floating-point dtype of results for the user.
-        full_scale: Count that means 1.0 in the user's frames, as given or stated by their file; None if not stated.
-        colours: (B, T, 1, H, W), colour that each pixel of a mosaic measures: 0 red, 1 green, 2 blue; None for frames
-            whose pixels measure all channels.
-    """
-
-    images: Tensor
-    missing: Tensor | None
+    images: Tensor  # (B, T, C, H, W) float32 or float64 in row order, full scale 1; 0 at missing pixels
+    missing: Tensor | None  # bool of that shape, True at pixels without data; None if there are none
+    # bool of that shape, True at pixels at or above the saturation level; None if there are none
     saturated: Tensor | None
-    timing: RowTiming
+    timing: RowTiming  # the sensor in row order
+    # the sensor in image orientation, with the frame times of the file if frames were given by a path
     image_timing: SensorTiming
-    shape: tuple[int, ...]
-    channel_axis: int
-    dtype: torch.dtype
+    shape: tuple[int, ...]  # shape of the user's frames
+    channel_axis: int  # their axis of the channels, -3 or -1, if they have one
+    dtype: torch.dtype  # Floating-point dtype of results for the user
+    # count that means 1.0 in the user's frames, as given or stated by their file; None if not stated
     full_scale: float | None
+    # (B, T, 1, H, W), colour that each pixel of a mosaic measures: 0 red, 1 green, 2 blue; None for frames whose
+    # pixels measure all channels
     colours: Tensor | None = None
 
     @property
@@ -203,25 +192,11 @@ def as_float_frames(
     minimum_frames: int = 1,
     name: str = "frames",
 ) -> Tensor:
-    """Check a stack of frames and convert it to float32 with full scale 1; float64 is kept.
+    """Check a stack of frames, and convert it to float32 with full scale 1; float64 is kept.
 
-    Floating-point frames keep their values. 8-bit integers have full scale 255; the full scale of other integers must
-    be given, because a 16-bit file may hold 12-bit counts.
-
-    Args:
-        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W); tensor, array or list of these.
-        full_scale: Count that means 1.0, for integer frames.
-        channels: As in ``prepare_frames``.
-        minimum_frames: Number of frames that the stack must have.
-        name: Name of the argument in error messages.
-
-    Returns:
-        Tensor of the same shape.
-
-    Raises:
-        TypeError: If the frames are not a tensor or array of real numbers.
-        ValueError: If the shape is not that of a stack, there are too few frames, a pixel is NaN or infinite, or the
-            full scale of integer frames is unknown.
+    Frames are (T, H, W), (T, C, H, W) or (B, T, C, H, W), a tensor, array or list of these. Floating-point frames keep
+    their values. 8-bit integers have full scale 255; the full scale of other integers must be given, because a 16-bit
+    file may hold 12-bit counts.
 
     Example:
         >>> as_float_frames(torch.full((2, 4, 4), 255, dtype=torch.uint8)).max().item()

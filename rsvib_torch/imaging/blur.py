@@ -27,19 +27,6 @@ from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming
 
-__all__ = [
-    "Interpolation",
-    "RowPSF",
-    "RowVaryingBlur",
-    "blur_rows",
-    "blur_rows_adjoint",
-    "form_rows",
-    "row_psf",
-    "row_taps",
-    "row_transfer",
-    "trajectory_psf",
-]
-
 Interpolation = Literal["linear", "cubic"]
 SPLINE_DEGREES: dict[str, int] = {"linear": 1, "cubic": 3}
 

@@ -14,11 +14,8 @@ from rsvib_torch.core.checks import check_number, check_whole_number, described
 from rsvib_torch.core.validation import NotNegative, Positive, options
 from rsvib_torch.options import OpticsOptions
 
-__all__ = ["Optics", "SensorNoise", "filtered", "sharpened", "target_optics"]
-
-_LEAST_RESPONSE = (
-    0.1  # response of the camera below which the gain does not increase: 0.02 and 0.2 lose up to 5 and 3 dB
-)
+_LEAST_RESPONSE = 0.1  # of the camera, below which the gain does not increase: 0.02 and 0.2 lose up to 5 and 3 dB
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 @options
@@ -65,12 +62,7 @@ class Optics(OpticsOptions):
 
 
 def filtered(images: Tensor, transfer: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Images (..., H, W) after a real filter with mirrored boundaries; same dtype.
-
-    Args:
-        images: The images.
-        transfer: Function of horizontal and vertical frequencies in cycles per point, even in both.
-    """
+    """Images (..., H, W) after a filter, a function of frequencies in cycles per point, with mirrored boundaries."""
     height, width = images.shape[-2:]
     wide = images.to(torch.promote_types(images.dtype, torch.float32))  # there is no FFT of 16 bits on the CPU
     mirrored = torch.cat([wide, wide.flip(-1)], dim=-1)
@@ -95,11 +87,6 @@ def sharpened(images: Tensor, optics: Optics, scale: int) -> Tensor:
     The restored frames are the posterior mean of the scene after the optics of the camera. The posterior mean of what
     follows from it by a linear filter is the filtered posterior mean, so that the prior limits the gain of noise: the
     filter is ``max(1, H_target / max(H_camera, 0.1))``. Frequencies that the camera transmits better are not changed.
-
-    Args:
-        images: Restored frames.
-        optics: Optics of the camera, pixel included.
-        scale: S, points per px.
     """
 
     def gain(u: Tensor, v: Tensor) -> Tensor:
@@ -162,22 +149,16 @@ class SensorNoise:
         default=None,
         description="Bits of the converter (values are then clipped to 0 ... 1); None for no quantisation.",
     )
-    gain_spread: float = Field(
+    gain_spread: Fraction = Field(
         default=0.0,
-        ge=0,
-        le=1,
         description="Standard deviation of the gain of the pixels (photo response non-uniformity), as a fraction.",
     )
-    column_offset: float = Field(
+    column_offset: Fraction = Field(
         default=0.0,
-        ge=0,
-        le=1,
         description="Standard deviation of the offsets of the columns as a fraction of full scale.",
     )
-    row_offset: float = Field(
+    row_offset: Fraction = Field(
         default=0.0,
-        ge=0,
-        le=1,
         description="Standard deviation of the offsets of the rows as a fraction of full scale.",
     )
     pattern_seed: int = Field(

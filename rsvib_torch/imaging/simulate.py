@@ -22,8 +22,6 @@ from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slo
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
-__all__ = ["simulate_frames"]
-
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
 _MARGIN = 16

@@ -15,8 +15,6 @@ from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
-__all__ = ["Quadrature", "exposure_nodes", "exposure_trajectory", "gauss_node_count", "rows_showing"]
-
 Quadrature = Literal["midpoint", "gauss"]
 
 

@@ -104,7 +104,7 @@ class PageOutput:
         finally:
             self._viewers -= 1
 
-    def close(self, *, complete: bool) -> None:
+    def close(self) -> None:
         """End the page."""
         with self._changed:
             self._open = False

@@ -2,10 +2,13 @@
 
 import math
 import queue
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +25,9 @@ __all__ = ["LiveReport", "run_live", "to_counts"]
 
 _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, end of a service, end of a terminal
+_LONGEST_END = 10.0  # s from such a signal until outputs that do not take frames, such as a full pipe, are abandoned
+_CHECK = 0.5  # s between checks whether a signal has arrived
 
 
 @dataclass(eq=False)
@@ -72,12 +78,15 @@ def run_live(
     spectrogram: Spectrogram | None = None,
     progress: Callable[[TrackedFrame, LiveReport], None] | None = None,
 ) -> LiveReport:
-    """Track the frames of a source, and write the restored ones, until the source ends or Ctrl-C is pressed.
+    """Track the frames of a source, and write the restored ones, until the source ends or a signal arrives.
+
+    SIGINT (Ctrl-C), SIGTERM and SIGHUP end the session in the main thread, unless the caller handles or ignores them.
 
     Args:
-        source: The source; it is closed at the end.
+        source: The source.
         tracker: The tracker.
-        outputs: They get frames of 8 bits, (H, W) or (H, W, 3), and are closed at the end.
+        outputs: They get frames of 8 bits, (H, W) or (H, W, 3), and are closed at the end. The session ends if the
+            program behind a pipe does.
         border: Treatment of pixels that the sensor did not record.
         drops: Whether the source must not wait. If processing is too slow, the motion of late frames is then predicted
             instead of measured, and beyond ``waiting`` frames the oldest are dropped.
@@ -97,27 +106,37 @@ def run_live(
     torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
     reader = FrameReader(source, waiting, drops=drops)
     writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
-    try:
-        try:
-            for tracked, arrived in _tracked(reader, tracker, report, drops, max_frames):
-                if spectrogram is not None:
-                    spectrogram.add(tracked)
-                if progress is not None:
-                    progress(tracked, report)
-                writer.put(tracked, arrived)
-        except KeyboardInterrupt:  # the usual end of a session with a camera
-            pass
-        finally:  # frames before an error of the source are not lost
-            writer.finish()
-    finally:
-        torch.set_num_threads(threads)
-        reader.close()
-        writer.stop()
-        for output in outputs:
-            output.close(complete=not writer.failed)
-        report.dropped, report.lost = reader.dropped, source.lost
-        report.seconds = time.perf_counter() - begin
+    with ExitStack() as ending:  # frames before an error of the source are not lost
+        ending.callback(torch.set_num_threads, threads)
+        ending.enter_context(_signals_call(reader.stop))
+        ending.callback(reader.close)
+        ending.callback(writer.finish)
+        for tracked, arrived in _tracked(reader, tracker, report, drops, max_frames):
+            if spectrogram is not None:
+                spectrogram.add(tracked)
+            if progress is not None:
+                progress(tracked, report)
+            if not writer.put((tracked, arrived)):
+                break
+    report.dropped, report.lost = reader.dropped, source.lost
+    report.seconds = time.perf_counter() - begin
     return report
+
+
+@contextmanager
+def _signals_call(stop: Callable[[], None]) -> Iterator[None]:
+    """Signals that end the process call ``stop`` instead; only the main thread can set their handlers."""
+    before: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        usual = (signal.SIG_DFL, signal.default_int_handler)
+        before = {number: signal.getsignal(number) for number in _SIGNALS if signal.getsignal(number) in usual}
+    for number in before:
+        signal.signal(number, lambda *_: stop())
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _tracked(
@@ -152,62 +171,67 @@ class _Writer:
         reader: FrameReader,
         period: float,
     ) -> None:
-        self._outputs, self._border, self._report, self._period = outputs, border, report, period
+        self._outputs, self._border, self._report = outputs, border, report
+        self._reader, self._period = reader, period
         self._queue: queue.Queue[tuple[TrackedFrame, float] | None] = queue.Queue(_WAITING_RESTORED)
         self._error: Exception | None = None
+        self._last: TrackedFrame | None = None
         self._threads = torch.get_num_threads()
         self._thread = threading.Thread(target=self._run, name="rsvib-write", daemon=True)
         self._thread.start()
 
-    def put(self, tracked: TrackedFrame, arrived: float) -> None:
-        """Hand over a frame; waits if the thread is behind."""
-        while True:
-            if self._error is not None:
-                raise self._error
+    def put(self, item: tuple[TrackedFrame, float] | None) -> bool:
+        """Hand over a frame, or None behind the last one; waits while the thread is behind.
+
+        Returns:
+            Whether it was handed over.
+        """
+        while self._is_running():
             try:
-                self._queue.put((tracked, arrived), timeout=0.5)
+                self._queue.put(item, timeout=_CHECK)
             except queue.Full:
                 continue
-            return
+            return True
+        return False
 
-    @property
-    def failed(self) -> bool:
-        """Whether a frame could not be written."""
-        return self._error is not None
+    def _is_running(self) -> bool:
+        """Whether the thread has not ended, and is not abandoned."""
+        stopped = self._reader.stopped_at
+        return self._thread.is_alive() and (stopped is None or time.perf_counter() < stopped + _LONGEST_END)
 
     def finish(self) -> None:
-        """Wait until all frames are written."""
-        self.stop()
+        """Wait until all frames are written and the outputs are closed; raises the error of the thread."""
+        self.put(None)
+        while self._is_running():
+            self._thread.join(_CHECK)
         if self._error is not None:
             raise self._error
-
-    def stop(self) -> None:
-        """End the thread."""
-        if self._thread.is_alive():
-            self._queue.put(None)
-            self._thread.join()
+        if self._last is not None:
+            self._report.detection = self._last.detection
 
     def _run(self) -> None:
         torch.set_num_threads(self._threads)  # of this thread
-        last = None
-        while (item := self._queue.get()) is not None:
-            if self._error is not None:
-                continue
-            tracked, arrived = item
-            try:
-                frame = to_counts(self._border(tracked))
-                index = round(tracked.time / self._period)
+        try:
+            with ExitStack() as opened:
                 for output in self._outputs:
-                    output.write(frame, index)
-                last = tracked
-                self._report.size = frame.shape[:2]
-                self._report.frames += 1
-                late = math.floor((time.perf_counter() - arrived) / self._period)
-                self._report.latencies[min(late, _LATENCY_COUNTS)] += 1
-            except Exception as error:  # raised again in the main thread
-                self._error = error
-        if last is not None and self._error is None:
-            self._report.detection = last.detection
+                    opened.callback(output.close)
+                while (item := self._queue.get()) is not None:
+                    self._write(*item)
+        except BrokenPipeError:  # the program behind a pipe has ended
+            pass
+        except Exception as error:  # raised again in the main thread
+            self._error = error
+
+    def _write(self, tracked: TrackedFrame, arrived: float) -> None:
+        frame = to_counts(self._border(tracked))
+        index = round(tracked.time / self._period)
+        for output in self._outputs:
+            output.write(frame, index)
+        self._last = tracked
+        self._report.size = frame.shape[:2]
+        self._report.frames += 1
+        late = math.floor((time.perf_counter() - arrived) / self._period)
+        self._report.latencies[min(late, _LATENCY_COUNTS)] += 1
 
 
 def to_counts(frame: Tensor) -> NDArray[np.uint8]:

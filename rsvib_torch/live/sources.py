@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol, get_args
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
+_LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +64,7 @@ class FrameSource(Protocol):
     lost: int
 
     def frames(self) -> Iterator[TimedFrame]:
-        """The frames, until the source ends or is closed."""
-
-    def close(self) -> None:
-        """End the source."""
+        """The frames; called once, in the thread that reads. A generator releases the source in its ``finally``."""
 
 
 class FrameCounter:
@@ -117,43 +116,40 @@ class CameraSource:
     Args:
         camera: Index, or URL.
         timing: The sensor.
-
-    Raises:
-        OSError: If the camera cannot be opened.
     """
 
     full_scale: float | None = 255.0
 
     def __init__(self, camera: int | str, timing: SensorTiming) -> None:
+        self._camera, self._period, self.lost = camera, timing.frame_period, 0
+
+    def frames(self) -> Iterator[TimedFrame]:
+        """The frames; times are whole frame periods apart.
+
+        Raises:
+            OSError: If the camera cannot be opened.
+        """
         import cv2  # noqa: PLC0415
 
-        self._period, self.lost, self._stamp = timing.frame_period, 0, cv2.CAP_PROP_POS_MSEC
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # only the error below is shown
         try:
-            self._capture = cv2.VideoCapture(camera)
+            capture = cv2.VideoCapture(self._camera)
         finally:
             cv2.utils.logging.setLogLevel(level)
-        if not self._capture.isOpened():
-            raise OSError(f"camera {camera} cannot be opened; check its number or URL, and whether it is in use")
-
-    def frames(self) -> Iterator[TimedFrame]:
-        """The frames; times are whole frame periods apart."""
+        if not capture.isOpened():
+            raise OSError(f"camera {self._camera} cannot be opened; check its number or URL, and whether it is in use")
         counter, before = FrameCounter(self._period), -1
-        while True:
-            read, pixels = self._capture.read()
-            if not read:
-                return
-            now = time.perf_counter()
-            number = counter.number(now, 1e-3 * self._capture.get(self._stamp))
-            self.lost, before = self.lost + number - before - 1, number
-            yield TimedFrame(
-                _channels_first(pixels[..., ::-1]) if pixels.ndim == 3 else pixels, number * self._period, now
-            )
-
-    def close(self) -> None:
-        """Release the camera."""
-        self._capture.release()
+        try:
+            while (answer := capture.read())[0]:
+                pixels, now = answer[1], time.perf_counter()
+                number = counter.number(now, 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+                self.lost, before = self.lost + number - before - 1, number
+                if pixels.ndim == 3:
+                    pixels = _channels_first(pixels[..., ::-1])
+                yield TimedFrame(pixels, number * self._period, now)
+        finally:
+            capture.release()
 
 
 class PipeSource:
@@ -192,9 +188,6 @@ class PipeSource:
             yield TimedFrame(pixels, index * self._period, time.perf_counter())
             index += 1
 
-    def close(self) -> None:
-        """The pipe belongs to the caller."""
-
 
 class FileSource:
     """A file, as ``open_stack`` reads it.
@@ -211,21 +204,18 @@ class FileSource:
     ) -> None:
         info = read_stack_info(path)
         self._starts = timing_from_first_frame(timing, info).frame_starts(info.shape[0]).tolist()
-        self._reader, self._realtime, self.lost = open_stack(path), realtime, 0
+        self._path, self._realtime, self.lost = path, realtime, 0
         self.full_scale = (full_scale or info.full_scale) if info.is_integer else None
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames of the file."""
-        begin = time.perf_counter()
-        for index, start in enumerate(self._starts):
-            pixels = self._reader.frame(index)
-            if self._realtime and (wait := begin + start - self._starts[0] - time.perf_counter()) > 0:
-                time.sleep(wait)
-            yield TimedFrame(pixels, start - self._starts[0], time.perf_counter())
-
-    def close(self) -> None:
-        """Close the file."""
-        self._reader.close()
+        with closing(open_stack(self._path)) as reader:
+            begin = time.perf_counter()
+            for index, start in enumerate(self._starts):
+                pixels = reader.frame(index)
+                if self._realtime and (wait := begin + start - self._starts[0] - time.perf_counter()) > 0:
+                    time.sleep(wait)
+                yield TimedFrame(pixels, start - self._starts[0], time.perf_counter())
 
 
 def _channels_first(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -242,6 +232,7 @@ class FrameReader:
 
     Attributes:
         dropped: Number of frames that were dropped.
+        stopped_at: s of ``time.perf_counter``, when ``stop`` was called; None before.
     """
 
     def __init__(self, source: FrameSource, waiting: int = 64, *, drops: bool = True) -> None:
@@ -250,6 +241,7 @@ class FrameReader:
         self._changed, self._ended = threading.Condition(), False
         self._error: Exception | None = None
         self.dropped = 0
+        self.stopped_at: float | None = None
         self._thread = threading.Thread(target=self._read, name="rsvib-read", daemon=True)
         self._thread.start()
 
@@ -257,9 +249,9 @@ class FrameReader:
         try:
             for frame in self._source.frames():
                 with self._changed:
-                    while not self._drops and len(self._frames) >= self._limit and not self._ended:
+                    while not self._drops and len(self._frames) >= self._limit and self.stopped_at is None:
                         self._changed.wait()
-                    if self._ended:
+                    if self.stopped_at is not None:
                         return
                     if len(self._frames) >= self._limit:
                         self._frames.popleft()
@@ -274,22 +266,29 @@ class FrameReader:
                 self._changed.notify_all()
 
     def __iter__(self) -> Iterator[TimedFrame]:
-        while True:
+        while self.stopped_at is None:
             with self._changed:
-                while not self._frames and not self._ended:
-                    self._changed.wait(0.5)  # s; Ctrl-C is handled in between
-                if not self._frames:
+                if not self._frames and self._ended:
                     break
+                if not self._frames:
+                    self._changed.wait(0.5)  # s; ``stop`` is noticed in between
+                    continue
                 frame = self._frames.popleft()
                 self._changed.notify_all()
             yield frame
         if self._error is not None:
             raise self._error
 
+    def stop(self) -> None:
+        """End the iteration; may be called by a signal handler, because it waits for no other thread."""
+        self.stopped_at = self.stopped_at or time.perf_counter()
+
     def close(self) -> None:
-        """Stop reading."""
+        """Stop reading. The thread itself releases the source, because libraries crash if another one does so.
+
+        A thread that waits for a source longer than ``_LONGEST_READ`` ends with the process.
+        """
+        self.stop()
         with self._changed:
-            self._ended = True
-            self._frames.clear()
             self._changed.notify_all()
-        self._source.close()
+        self._thread.join(_LONGEST_READ)

@@ -10,8 +10,6 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_broadcast, checked_methods
 from rsvib_torch.core.checks import check_number, check_whole_number
 
-__all__ = ["Camera"]
-
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees
 
 

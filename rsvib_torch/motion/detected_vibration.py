@@ -9,8 +9,6 @@ from rsvib_torch.core.presentation import JudgedResult, verdict_table
 from rsvib_torch.core.text import wrapped
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
 
-__all__ = ["DetectedVibration"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DetectedVibration(

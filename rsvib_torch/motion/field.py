@@ -20,15 +20,6 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 
-__all__ = [
-    "ColumnMotion",
-    "check_two_axes",
-    "displacement_at",
-    "displacement_factors",
-    "largest_in_frame",
-    "largest_slope",
-]
-
 _FIXED_POINT_STEPS = 2  # the displacement of 10 px changes by 1 % along y: two steps leave 1e-5 px
 _RAY_DEGREE = 9  # of a polynomial along a column; rays are then within 1e-6 rad for a field of 80 degrees
 _STEP = 1e-6  # s, of the derivative with respect to time; float64 leaves 1e-8 of the velocity
@@ -36,16 +27,9 @@ _BEYOND_LINEAR = 1.1  # a rotation by 0.05 rad displaces a corner at 60 degrees 
 
 
 def displacement_factors(x: Tensor, y: Tensor, axes: int, camera: Camera | None = None) -> Tensor:
-    """Displacement by unit components at positions of the scene: ``((1, 0, -y, x), (0, 1, x, y))``.
+    """Displacement by unit components at positions of the scene: ``((1, 0, -y, x), (0, 1, x, y))``, (S, 2, A).
 
-    Args:
-        x: px from the centre of the frame, shape S.
-        y: The same along y, shape S.
-        axes: Number A of components, 2 to 4.
-        camera: Focal length and lens; the factors are then those of small angles.
-
-    Returns:
-        (S, 2, A): the displacement in px is its product with the components.
+    Positions (S) are in px from the centre of the frame. With a camera, the factors are those of small angles.
 
     Example:
         >>> displacement_factors(torch.tensor(100.0), torch.tensor(-50.0), 3).tolist()

@@ -16,8 +16,6 @@ from rsvib_torch.core.text import text_table
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-__all__ = ["AngularRates"]
-
 Array = NDArray[np.float64]
 MAX_SAMPLES = 10**7  # 80 minutes at 2 kHz
 

@@ -15,8 +15,6 @@ from rsvib_torch.core.presentation import Result
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
 
-__all__ = ["Motion"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_methods

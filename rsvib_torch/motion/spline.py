@@ -19,8 +19,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
 
-__all__ = ["FreeMotion"]
-
 MAX_DISPLACEMENT = 1e9  # px; image motion of 1e5 px/s for three hours
 MAX_KNOTS = 100_000_000  # 1.6 GB of coefficients; a gyroscope with 8 kHz for three hours
 MAX_EXPOSURE_NODES = 10_000  # times; an exposure of 1 s of a gyroscope with 5 kHz

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-__all__ = ["RowTiming", "SensorTiming", "check_timing"]
-
 MIN_ROW_TIME = 1e-9  # s; the fastest sensors read a row in 0.1 us
 MAX_FRAMES, MAX_ROWS = 10**8, 10**6  # 40 days of a camera with 30 frames/s; the largest sensors have 3e4 rows
 MAX_BATCH = 10**6  # stacks; their frames of 128 x 128 px would fill 130 GB
@@ -253,10 +251,6 @@ def row_axes(timing: SensorTiming, num_axes: int) -> tuple[list[int], list[float
 
     Transposing frames exchanges x and y; flipping them along the rows changes the sign of y. Both are reflections and
     change the sign of roll. Component i in row order is component ``order[i]`` in image axes times ``signs[i]``.
-
-    Args:
-        timing: The sensor.
-        num_axes: Number of components (x, y, roll, zoom), 2 to 4.
 
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")

@@ -19,8 +19,6 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
 
-__all__ = ["Vibration", "VibrationStd", "blind_frequencies", "image_motion_line", "tone_head", "tone_rows"]
-
 _UNITS = {
     "amplitude": "px; of roll rad, of zoom 1",
     "frequency": "Hz",
@@ -291,29 +289,15 @@ class Vibration(Motion, units=_UNITS):
         return torch.addcmul(velocity, acceleration, times, value=0.5) * times
 
     def displacement(self, times: Tensor) -> Tensor:
-        """Displacement D(t) in px (Eq. 1).
-
-        Args:
-            times: Seconds, any shape S; for a batched vibration the batch dimensions (or 1) lead: (B, ...).
-
-        Returns:
-            float64 tensor of shape (S, 2), axes (x, y).
-        """
+        """Displacement D(t) in px (Eq. 1), float64 (S, axes), at times of shape S as in ``Motion.displacement``."""
         times = times.to(dtype=torch.float64, device=self.device)
         angle, amplitude, _ = self._angle(times)
         return (amplitude * angle.sin()).sum(-1) + self.drift(times) + self._at(times[..., None], self.image_shift)
 
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
-        """Mean displacement over exposures [start, start + T_e] in px (Eq. 2).
+        """Mean displacement over exposures [start, start + T_e] in px (Eq. 2), as in ``Motion.mean_displacement``.
 
         A tone keeps its angle at mid-exposure and is attenuated by sinc(f T_e).
-
-        Args:
-            starts: Exposure starts in seconds, any shape S (batch dimensions lead as in ``displacement``).
-            exposure_time: T_e in seconds, a number or a tensor that broadcasts against ``starts``.
-
-        Returns:
-            float64 tensor of shape (S, 2), axes (x, y).
         """
         check_broadcast(starts=starts, exposure_time=exposure_time)
         middle = starts.to(dtype=torch.float64, device=self.device) + 0.5 * exposure_time
@@ -399,10 +383,8 @@ class VibrationStd(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> std = rsv.detect_vibration(frames, timing).std
         >>> bool((std.frequency < 0.1).all())  # Hz
         True
@@ -460,13 +442,10 @@ def tone_rows(
     quantities: Sequence[str] = _QUANTITIES,
     hidden: VibrationStd | None = None,
 ) -> list[tuple[tuple[int, ...], list[str]]]:
-    """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells.
+    """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells of the ``quantities``.
 
-    Args:
-        vibration: The tones; of a batch, the strongest of each axis is shown.
-        std: Their standard deviations.
-        quantities: Columns: ``"amplitude"``, ``"frequency"``, ``"period"``, ``"phase"``.
-        hidden: Standard deviations if a further tone is hidden, which are added where they are larger.
+    Of a batch, the strongest tone of each axis is shown. Standard deviations if a further tone is hidden are added
+    where they are larger.
     """
     rows = []
     for at, labels in _tones(vibration):

@@ -43,29 +43,11 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 
-__all__ = [
-    "axis_offset_figure",
-    "comparison_figure",
-    "detailed_places",
-    "free_motion_figure",
-    "gain_figure",
-    "motion_blur",
-    "motion_figure",
-    "mtf_figure",
-    "offset_figure",
-    "picture",
-    "plain_axes",
-    "psf_figure",
-    "rows_figure",
-    "save_figure",
-    "tones_text",
-    "verdict_figure",
-    "windows_figure",
-]
-
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
 _AXIS_COLOURS = {"x": "#14487a", "y": "#c8102e"}
 _FIT_COLOUR = _AXIS_COLOURS["y"]
+_LEGEND_ABOVE: dict[str, Any] = {"fontsize": 9, "frameon": False, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+_OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
 
 
@@ -121,13 +103,36 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
 
-def plain_axes(axes: Axes) -> None:
-    """Apply the style of the package: a light grid, no upper and right border."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(_INK)
-    axes.tick_params(colors=_INK, labelsize=9)
-    axes.grid(color=_GRID, linewidth=0.6)
-    axes.set_axisbelow(True)
+def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", heading: str = "") -> None:
+    """Apply the style of the package: a light grid, no upper and right border, labels, and a title or a heading."""
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.spines[["left", "bottom"]].set_color(_INK)
+    panel.tick_params(colors=_INK, labelsize=9)
+    panel.grid(color=_GRID, linewidth=0.6)
+    panel.set_axisbelow(True)
+    if x:
+        panel.set_xlabel(x, color=_INK)
+    if y:
+        panel.set_ylabel(y, color=_INK)
+    if title:
+        panel.set_title(title, loc="left", fontsize=9.5, color=_INK)
+    if heading:
+        panel.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=_INK)
+
+
+def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Any]:
+    """A figure of a size in inches, and its panels (rows, columns)."""
+    figure = _Drawing(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **grid)
+
+
+def _symbol(label: str, **style: Any) -> Line2D:
+    """An entry of a legend: a point, or a line if its style is given."""
+    return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
+
+
+def _legend_below(figure: Figure, symbols: list[Line2D]) -> None:
+    figure.legend(handles=symbols, loc="outside lower center", ncols=len(symbols), fontsize=9.5, frameon=False)
 
 
 def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) -> Any:
@@ -155,23 +160,19 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     smallest = 1e-3 if axis < 2 else 1e-6
     lower.set_ylim(-max(spread, smallest), max(spread, smallest))
     unit, mean = AXIS_UNITS[axis], float(result.residual[axis])
-    lower.set_title(f"mean |residual| {mean:.3g} {unit}", loc="left", fontsize=9.5, color=_INK)
-    lower.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
-    upper.set_ylabel(f"offset ({unit})", color=_INK)
-    lower.set_ylabel(f"residual ({unit})", color=_INK)
-    plain_axes(upper)
-    plain_axes(lower)
+    plain_axes(upper, y=f"offset ({unit})")
+    plain_axes(lower, _OFFSET_TIME, f"residual ({unit})", title=f"mean |residual| {mean:.3g} {unit}")
     return points
 
 
 def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     """Add the legend and the colour bar."""
-    handles = [
-        Line2D([], [], color=_QUALITY_COLOURS(1.0), marker="o", markersize=5, linewidth=0, label="measured rows"),
-        Line2D([], [], color=_FIT_COLOUR, linewidth=1.3, label="detected vibration"),
-        Line2D([], [], color=_GREY, marker="x", markersize=5, linewidth=0, label="not measured"),
+    symbols = [
+        _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
+        _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
+        _symbol("not measured", color=_GREY, marker="x", markersize=5),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9.5, frameon=False)
+    _legend_below(figure, symbols)
     bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
@@ -190,30 +191,21 @@ def offset_figure(result: DetectionResult) -> Figure:
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
         >>> [panel.get_ylabel() for panel in rsv.offset_figure(detection).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     _check_one(result)
     axes = result.vibration.num_axes
-    figure = _Drawing(figsize=(6.5 * axes, 6.4), layout="constrained")
-    panels = figure.subplots(2, axes, sharex=True, height_ratios=(3, 1), squeeze=False)
+    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True, height_ratios=(3, 1))
     points: Any = None
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         upper, lower = panels[0, axis], panels[1, axis]
         points = _draw_offsets(upper, lower, result, axis)
-        upper.set_title(
-            f"Offset along {name}" if axis < 2 else f"Offset of {name}",
-            loc="left",
-            fontsize=12,
-            fontweight="bold",
-            color=_INK,
-            pad=36,
-        )
+        heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
+        upper.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
         text = ",  ".join(tones_text(result, axis))
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
@@ -243,28 +235,19 @@ def windows_figure(
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
+        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
         >>> manifest = rsv.read_manifest(report.manifest)
         >>> starts = [window.start_time for window in manifest.windows]
         >>> figure = rsv.windows_figure(starts, manifest.detections())
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
-    figure = _Drawing(figsize=(11, 5.6), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, squeeze=False)
+    figure, panels = _panels(11, 5.6, 2, 2, sharex=True)
     for axis, name in enumerate("xy"):
         for panel, (quantity, unit) in zip(panels[:, axis], (("amplitude", "px"), ("frequency", "Hz")), strict=True):
             reliable_values: list[float] = []
@@ -285,18 +268,17 @@ def windows_figure(
                 low, high = min(reliable_values), max(reliable_values)
                 margin = max(0.15 * (high - low), 0.002 * abs(high))
                 panel.set_ylim(low - margin, high + margin)
-            panel.set_ylabel(f"{quantity} ({unit})", color=_INK)
             panel.ticklabel_format(axis="y", useOffset=False)
-            plain_axes(panel)
-        panels[0, axis].set_title(f"Tones along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
-        panels[1, axis].set_xlabel(time_label, color=_INK)
-    handles = [
-        Line2D([], [], color=_INK, marker="o", linewidth=0, label="strongest tone, reliable"),
-        Line2D([], [], color=_INK, marker="o", markerfacecolor="white", linewidth=0, label="not reliable"),
-        Line2D([], [], color=_GREY, marker="o", linewidth=0, label="weaker tone"),
-        Line2D([], [], color=_GREY, linestyle=":", label="detection failed"),
+            first = quantity == "amplitude"
+            label, heading = ("", f"Tones along {name}") if first else (time_label, "")
+            plain_axes(panel, label, f"{quantity} ({unit})", heading=heading)
+    symbols = [
+        _symbol("strongest tone, reliable", color=_INK),
+        _symbol("not reliable", color=_INK, markerfacecolor="white"),
+        _symbol("weaker tone", color=_GREY),
+        _symbol("detection failed", color=_GREY, marker="", linewidth=None, linestyle=":"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
+    _legend_below(figure, symbols)
     return figure
 
 
@@ -333,14 +315,11 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     times = torch.linspace(first, last, 2000, dtype=torch.float64, device=motion.device)
     displacement = motion.displacement(times).detach().cpu()
     further = motion.num_axes - 2
-    figure = _Drawing(figsize=(8, 3.6 + 2.0 * further), layout="constrained")
-    panels = figure.subplots(1 + further, 1, sharex=True, squeeze=False)[:, 0]
-    _draw_displacement(panels[0], times.cpu(), displacement)
-    for axis, panel in enumerate(panels[1:], start=2):
+    figure, panels = _panels(8, 3.6 + 2.0 * further, 1 + further, sharex=True)
+    _draw_displacement(panels[0, 0], times.cpu(), displacement)
+    for axis, panel in enumerate(panels[1:, 0], start=2):
         panel.plot(1e3 * times.cpu(), displacement[:, axis], color=_INK, linewidth=1.3)
-        panel.set_xlabel("time (ms)")
-        panel.set_ylabel(f"{AXIS_NAMES[axis]} ({AXIS_UNITS[axis]})")
-        plain_axes(panel)
+        plain_axes(panel, "time (ms)", f"{AXIS_NAMES[axis]} ({AXIS_UNITS[axis]})")
     return figure
 
 
@@ -352,10 +331,8 @@ def _draw_displacement(panel: Axes, times: Tensor, displacement: Tensor, std: Te
         if std is not None:
             low, high = values - 2 * std[:, axis], values + 2 * std[:, axis]
             panel.fill_between(1e3 * times, low, high, color=_AXIS_COLOURS[name], alpha=0.2, linewidth=0)
-    panel.set_xlabel("time (ms)")
-    panel.set_ylabel("displacement (px)")
     panel.legend(fontsize=9, frameon=False, ncols=2)
-    plain_axes(panel)
+    plain_axes(panel, "time (ms)", "displacement (px)")
 
 
 def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
@@ -376,13 +353,8 @@ def _swept_figure(result: SweptTone) -> Figure:
 
 
 def free_motion_figure(result: MotionDetection) -> Figure:
-    """Draw a detected motion at the rows of the frames, with a band of two standard deviations.
-
-    Args:
-        result: A detection of a free motion (not a batch).
-    """
-    figure = _Drawing(figsize=(8, 3.6), layout="constrained")
-    panel = figure.subplots()
+    """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
+    figure, ((panel,),) = _panels(8, 3.6)
     for frame in range(len(result.times)):
         parts = (values[frame].cpu() for values in (result.times, result.displacement, result.std))
         _draw_displacement(panel, *parts)
@@ -392,15 +364,10 @@ def free_motion_figure(result: MotionDetection) -> Figure:
 
 
 def verdict_figure(verdict: RestorationVerdict) -> Figure:
-    """Draw the displacement between the frames of each pair before and after restoration, and the improvement.
-
-    Args:
-        verdict: The verdict on a restoration.
-    """
-    figure = _Drawing(figsize=(10, 3.4), layout="constrained")
-    panels = figure.subplots(1, 3)
+    """Draw the displacement between the frames of each pair before and after restoration, and the improvement."""
+    figure, (panels,) = _panels(10, 3.4, 1, 3)
     pairs = np.arange(len(verdict.outcome))
-    for axis, name in enumerate("xy"):
+    for axis in range(2):
         for values, style, label in (
             (verdict.misfit_before, "o-", "frames as taken"),
             (verdict.misfit_after, "s-", "after restoration"),
@@ -408,30 +375,22 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
         ):
             colour = _GREY if style == ":" else _AXIS_COLOURS["y" if style == "s-" else "x"]
             panels[axis].plot(pairs, values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
-        panels[axis].set_title(f"displacement along {name} (px rms)", loc="left", fontsize=10, color=_INK)
         panels[axis].set_ylim(bottom=0)
     panels[0].legend(fontsize=9, frameon=False)
     panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_AXIS_COLOURS["x"], markersize=4)
     panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
-    panels[2].set_title("estimated improvement (dB)", loc="left", fontsize=10, color=_INK)
-    for panel in panels:
-        panel.set_xlabel("pair of frames")
+    titles = ("displacement along x (px rms)", "displacement along y (px rms)", "estimated improvement (dB)")
+    for panel, title in zip(panels, titles, strict=True):
         panel.xaxis.get_major_locator().set_params(integer=True)
-        plain_axes(panel)
+        plain_axes(panel, "pair of frames", title=title)
     return figure
 
 
 def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
-    """Draw the offset curve of one axis with its fit and residuals.
-
-    Args:
-        result: A detection (not a batch).
-        axis: 0 for x, 1 for y.
-    """
+    """Draw the offset curve of one axis of a detection (not a batch) with its fit and residuals."""
     _check_one(result)
-    figure = _Drawing(figsize=(5.6, 4.4), layout="constrained")
-    panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    _finish_offsets(figure, panels, _draw_offsets(panels[0], panels[1], result, axis))
+    figure, panels = _panels(5.6, 4.4, 2, sharex=True, height_ratios=(3, 1))
+    _finish_offsets(figure, panels, _draw_offsets(panels[0, 0], panels[1, 0], result, axis))
     return figure
 
 
@@ -448,10 +407,8 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
         >>> rsv.gain_figure(detection, timing).axes[-1].get_xlabel()
         'frequency (Hz)'
@@ -461,8 +418,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
     frequency = np.linspace(0.0, highest, 2000)
     gain = np.abs(2 * np.sin(np.pi * frequency * timing.frame_period) * np.sinc(frequency * timing.exposure_time))
-    figure = _Drawing(figsize=(5.6, 4.6), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.2, 1))
+    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True, height_ratios=(1.2, 1))
     upper.plot(frequency, gain, color="#555555", linewidth=1.2)
     for panel in (upper, lower):
         for blind in blind_frequencies(timing, highest).tolist():
@@ -486,22 +442,13 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     upper.set_ylim(0, 2.4)
     lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
     upper.set_xlim(0, highest)
-    upper.set_ylabel("offset gain (px per px)")
-    lower.set_ylabel("amplitude (px)")
-    lower.set_xlabel("frequency (Hz)")
-    plain_axes(upper)
-    plain_axes(lower)
+    plain_axes(upper, y="offset gain (px per px)")
+    plain_axes(lower, "frequency (Hz)", "amplitude (px)")
     return figure
 
 
 def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tensor:
-    """Range of the displacement during the exposure of each row, (..., 2) in px.
-
-    Args:
-        vibration: The motion.
-        starts: Exposure starts of the rows in seconds.
-        timing: The sensor.
-    """
+    """Range of the displacement during the exposure of rows, (..., 2) in px, that start at (...) seconds."""
     nodes, _ = exposure_nodes(timing, "gauss", 16)
     ends = torch.tensor([0.0, timing.exposure_time], dtype=torch.float64, device="cpu")
     path = vibration.displacement(starts[..., None] + torch.cat([ends, nodes.cpu()]).to(starts.device))
@@ -526,17 +473,14 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     _check_one(vibration)
     vibration = vibration.detached()
     starts = timing.row_starts(1, num_rows)[0]
-    figure = _Drawing(figsize=(5.6, 4.6), layout="constrained")
-    panels = figure.subplots(2, 1, sharex=True)
+    figure, panels = _panels(5.6, 4.6, 2, sharex=True)
     curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
-    for panel, values, label in zip(panels, curves, ("displacement (px)", "motion blur (px)"), strict=True):
+    for panel, values, label in zip(panels[:, 0], curves, ("displacement (px)", "motion blur (px)"), strict=True):
         for axis, name in enumerate("xy"):
             panel.plot(np.arange(num_rows), values[:, axis].numpy(), color=_AXIS_COLOURS[name], lw=1.3, label=name)
-        panel.set_ylabel(label)
-        plain_axes(panel)
-    panels[0].legend(fontsize=9, frameon=False, ncols=2)
-    panels[1].set_ylim(bottom=0)
-    panels[1].set_xlabel("row (in readout order)")
+        plain_axes(panel, "row (in readout order)" if panel is panels[1, 0] else "", label)
+    panels[0, 0].legend(fontsize=9, frameon=False, ncols=2)
+    panels[1, 0].set_ylim(bottom=0)
     return figure
 
 
@@ -576,17 +520,15 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
     cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
     for index, (left, top) in enumerate((first.long() + reach).tolist()):
         cells[index, top : top + height, left : left + width] = psf.weights[index].numpy()
-    figure = _Drawing(figsize=(11.4, 4.9), layout="constrained")
-    panels = figure.subplots(down, across).flatten()
+    figure, panels = _panels(11.4, 4.9, down, across)
     extent = (-reach - 0.5, reach + 0.5, reach + 0.5, -reach - 0.5)
-    for index, panel in enumerate(panels):
+    for index, panel in enumerate(panels.flat):
         panel.imshow(cells[index], cmap="Greys", vmin=0, vmax=cells.max(), interpolation="nearest", extent=extent)
         panel.plot(path[index, :, 0], path[index, :, 1], color=_AXIS_COLOURS["y"], linewidth=1.6)
         panel.set_title(f"row {int(rows[index])}", fontsize=9, loc="left", pad=3)
-        panel.set_xticks([])
-        panel.set_yticks([])
+        panel.set(xticks=[], yticks=[])
         panel.spines[:].set_color(_GRID)
-    panels[-across].set_xlabel(f"{2 * reach + 1} px", fontsize=9)
+    panels[-1, 0].set_xlabel(f"{2 * reach + 1} px", fontsize=9)
     return figure
 
 
@@ -602,8 +544,7 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str,
     Example:
         >>> figure = mtf_figure({"raw": [raw_curve], "restored": [restored_curve]})  # doctest: +SKIP
     """
-    figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
-    panel = figure.subplots()
+    figure, ((panel,),) = _panels(5.6, 3.9)
     points = points or {}
     highest = 0.5 * max([1, *points.values()])
     frequency = torch.linspace(0, highest, 101, dtype=torch.float64, device="cpu")
@@ -614,27 +555,27 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str,
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
         if values:
             panel.plot(frequency, torch.stack(values).mean(0), color=colour, linewidth=2.0, label=name)
-    panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
+    _finish_mtf(panel, highest, "MTF")
     if highest > 0.5:
-        panel.axvline(0.5, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
         panel.text(0.51, 1.0, "Nyquist frequency of the pixels", fontsize=8, color=_GREY)
-    panel.set_xlim(0, highest)
-    panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
-    panel.set_xlabel("spatial frequency (cycles/px)")
-    panel.set_ylabel("MTF")
-    panel.legend(fontsize=9, frameon=False)
-    plain_axes(panel)
     return figure
 
 
-def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[tuple[int, int]]:
-    """Corners (row, column) of the square windows with the strongest detail that do not overlap.
+def _finish_mtf(panel: Axes, highest: float, label: str, legend: str | None = None) -> None:
+    """Add half of the contrast, the Nyquist frequency of the pixels, labels and a legend to transfer functions."""
+    panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
+    if highest > 0.5:
+        panel.axvline(0.5, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
+    panel.set_xlim(0, highest)
+    panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
+    panel.legend(title=legend, fontsize=9, frameon=False)
+    plain_axes(panel, "spatial frequency (cycles/px)", label)
 
-    Args:
-        image: (H, W), finite.
-        size: Side of the windows in px; at most the sides of the image.
-        count: Largest number of windows.
-        rim: Width of the border in px that the windows avoid, where the image is large enough.
+
+def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[tuple[int, int]]:
+    """Corners (row, column) of the ``count`` square windows with the strongest detail that do not overlap.
+
+    They avoid a border of ``rim`` px where the image (H, W) is large enough.
     """
     rim = min(rim, (min(image.shape) - size) // 2)
     image = image[rim : image.shape[0] - rim, rim : image.shape[1] - rim]
@@ -677,8 +618,7 @@ def comparison_figure(
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border
-    figure = _Drawing(figsize=(4.0 * len(places) + 0.4, 8.6), layout="constrained")
-    panels = figure.subplots(2, len(places), squeeze=False)
+    figure, panels = _panels(4.0 * len(places) + 0.4, 8.6, 2, len(places))
     for index, (row, column) in enumerate(places):
         crops = [frame[row : row + size, column : column + size] for frame in (raw, restored)]
         low, high = (float(torch.stack(crops).quantile(q)) for q in (0.002, 0.998))
@@ -709,36 +649,25 @@ def _curve_figure(curve: MtfCurve) -> Figure:
 
 
 def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
-    figure = _Drawing(figsize=(5.6, 3.9), layout="constrained")
-    panel = figure.subplots()
+    figure, ((panel,),) = _panels(5.6, 3.9)
     frequency = result.frequency.cpu().numpy()
     for name, values, limit in zip("xy", result.mtf.cpu().numpy(), result.resolution.tolist(), strict=True):
         label = f"{name}: 0.5 at {limit:.2f} cycles/px"
         panel.plot(frequency, values, color=_AXIS_COLOURS[name], linewidth=2.0, label=label)
-    panel.axhline(0.5, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    panel.axvline(0.5, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)  # Nyquist frequency of the frames
-    panel.set_xlim(0, float(frequency[-1]))
-    panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
-    panel.set_xlabel("spatial frequency (cycles/px)")
-    panel.set_ylabel("MTF of the restoration")
-    panel.legend(title=f"noise gain {result.noise_gain:.2f}", fontsize=9, frameon=False)
-    plain_axes(panel)
+    legend = f"noise gain {result.noise_gain:.2f}"
+    _finish_mtf(panel, float(frequency[-1]), "MTF of the restoration", legend)
     return figure
 
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
-    figure = _Drawing(figsize=(13, 4.2), layout="constrained")
-    panels = figure.subplots(1, 2, sharex=True, squeeze=False)
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
     times, good = (values.cpu().numpy() for values in (1e3 * curve.times, curve.good))
-    for axis, (name, panel) in enumerate(zip("xy", panels[0], strict=True)):
+    for axis, (name, panel) in enumerate(zip("xy", panels, strict=True)):
         offsets = curve.offsets[..., axis].cpu().numpy()[good]
         std = None if curve.std is None else curve.std[..., axis].cpu().numpy()[good]
         panel.errorbar(times[good], offsets, std, fmt=".", color=_AXIS_COLOURS[name], ecolor=_GRID, zorder=2)
-        panel.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
-        panel.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
-        panel.set_ylabel("offset (px)", color=_INK)
-        plain_axes(panel)
+        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
     return figure
 
 
@@ -747,25 +676,20 @@ def _calibration_figure(result: RowTimeCalibration) -> Figure:
     if result.light is None or result.fitted_light is None:
         raise ValueError("a calibration by motion has no figure; that of a flickering light has")
     shown = min(4, len(result.light))
-    figure = _Drawing(figsize=(8, 0.9 + 1.7 * shown), layout="constrained")
-    panels = figure.subplots(shown, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    for frame, panel in enumerate(panels):
+    figure, panels = _panels(8, 0.9 + 1.7 * shown, shown, sharex=True, sharey=True)
+    for frame, panel in enumerate(panels[:, 0]):
         panel.plot(result.light[frame].cpu(), ".", color=_GREY, markersize=2.5, label="measured rows")
         panel.plot(result.fitted_light[frame].cpu(), color=_FIT_COLOUR, linewidth=1.3, label="fitted bands")
-        panel.set_title(f"frame {frame}", loc="left", fontsize=9.5, color=_INK)
-        panel.set_ylabel("light / mean", color=_INK)
-        plain_axes(panel)
-    panels[-1].set_xlabel("row", color=_INK)
-    panels[0].legend(fontsize=9, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        plain_axes(panel, "row" if frame == shown - 1 else "", "light / mean", title=f"frame {frame}")
+    panels[0, 0].legend(**_LEGEND_ABOVE, ncols=2)
     return figure
 
 
 def _check_figure(result: MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    figure = _Drawing(figsize=(13, 4.2), layout="constrained")
-    panels = figure.subplots(1, 2, sharex=True, squeeze=False)
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
     times = 1e3 * result.times.cpu()
-    for axis, (name, panel) in enumerate(zip("xy", panels[0], strict=True)):
+    for axis, (name, panel) in enumerate(zip("xy", panels, strict=True)):
         before, after = (
             f"{label} {measured_text(values[axis], digits=3)} px rms"
             for label, values in (("offsets", result.before), ("without the motion", result.after))
@@ -773,31 +697,25 @@ def _check_figure(result: MotionCheck) -> Figure:
         panel.plot(times, result.offsets[:, axis].cpu(), ".", color=_GREY, label=before)
         panel.plot(times, result.residual[:, axis].cpu(), ".", color=_AXIS_COLOURS[name], label=after)
         panel.axhline(0.0, color=_INK, linewidth=0.8)
-        panel.set_title(f"Offset along {name}", loc="left", fontsize=12, fontweight="bold", color=_INK)
-        panel.set_xlabel("exposure start of the rows in the earlier frame (ms)", color=_INK)
-        panel.set_ylabel("offset (px)", color=_INK)
         panel.legend(fontsize=9)
-        plain_axes(panel)
+        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
     return figure
 
 
 def _rotation_figure(result: RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
-    figure = _Drawing(figsize=(8, 7.2), layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
+    figure, panels = _panels(8, 7.2, 3, sharex=True)
     times = result.times.cpu()
     for axis, (name, unit, factor) in enumerate((("x", "px", 1.0), ("y", "px", 1.0), ("roll", "mrad", 1e3))):
         measured, predicted = factor * result.measured[:, axis].cpu(), factor * result.predicted[:, axis].cpu()
         rms = float((measured - predicted).square().mean().sqrt())
-        panel = panels[axis]
+        panel = panels[axis, 0]
         panel.plot(times, predicted, color=_FIT_COLOUR, linewidth=1.3, label="gyroscope")
         panel.plot(times, measured, "o", color=_AXIS_COLOURS["x"], markersize=3.5, label="frames")
         panel.plot(times, measured - predicted, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
-        panel.set_ylabel(f"{name} ({unit})", color=_INK)
-        panel.legend(fontsize=9, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-        plain_axes(panel)
-    panels[0].set_title("Between consecutive frames", loc="left", fontsize=12, fontweight="bold", color=_INK)
-    panels[-1].set_xlabel("time (s)", color=_INK)
+        panel.legend(**_LEGEND_ABOVE, ncols=3)
+        plain_axes(panel, "" if axis < 2 else "time (s)", f"{name} ({unit})")
+    panels[0, 0].set_title("Between consecutive frames", loc="left", fontsize=12, fontweight="bold", color=_INK)
     return figure
 
 

@@ -19,15 +19,6 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks import RestoredFrames, StackManifest
 
-__all__ = [
-    "check_same_timing",
-    "read_vibration",
-    "write_offsets",
-    "write_restoration",
-    "write_vibration",
-    "write_windows",
-]
-
 
 @checks_arguments
 def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
@@ -44,10 +35,8 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> import tempfile
         >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
         >>> path = tempfile.mkdtemp() + "/vibration.json"
@@ -79,10 +68,8 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> import tempfile
         >>> path = tempfile.mkdtemp() + "/vibration.json"
         >>> rsv.detect_vibration(frames, timing).save(path)
@@ -107,16 +94,7 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
 
 
 def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -> None:
-    """Check that a stored detection was made with the timing of the frames that are to be restored.
-
-    Args:
-        source: File of the detection, for the message.
-        stored: Timing in that file.
-        timing: Timing of the frames.
-
-    Raises:
-        ValueError: If they differ by more than rounding.
-    """
+    """Raise an error if a detection was stored with another timing than that of the frames to be restored."""
     theirs, ours = stored.to_dict(), timing.to_dict()
     different = [name for name in ours if not _equal(theirs[name], ours[name])]
     if different:
@@ -154,10 +132,8 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> import tempfile
         >>> from pathlib import Path
         >>> path = Path(tempfile.mkdtemp()) / "offsets.csv"
@@ -214,20 +190,12 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
+        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
         >>> rsv.write_windows(f"{folder}/windows.csv", rsv.read_manifest(report.manifest))
         >>> with open(f"{folder}/windows.csv") as file:
         ...     print(len(file.readlines()))  # a line for each window below the header
@@ -238,7 +206,7 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
     found = (record.detection for record in manifest.windows)
     axes = max((len(one.reliable) for one in found if one is not None), default=2)
     for axis in AXIS_NAMES[:axes]:
-        head += [f"{name}_{axis}{end}" for name in quantities for end in ("", "_std")]
+        head += [f"{name}_{axis}{end}" for name in quantities for end in ("", "_std", "_std_if_hidden_tone")]
         head += [f"image_motion_{axis}", f"reliable_{axis}"]
     lines = []
     for record in manifest.windows:
@@ -246,11 +214,12 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
         detection = record.detection
         for number in range(axes):
             if detection is None or number >= len(detection.reliable):
-                line += [None] * (2 * len(quantities) + 2)
+                line += [None] * (3 * len(quantities) + 2)
                 continue
             vibration, std = detection.vibration, detection.std
+            columns = (vibration, std, detection.std_if_hidden_tone or std)
             for name in quantities:
-                line += plain_values([getattr(vibration, name)[number, 0], getattr(std, name)[number, 0]])
+                line += plain_values([getattr(of_column, name)[number, 0] for of_column in columns])
             line += [float(vibration.image_motion[number]), bool(detection.reliable[number])]
         note = record.error or "; ".join(map(str, record.left_alone))
         lines.append([*line, record.frames, record.outcome, len(record.bad_frames), note])

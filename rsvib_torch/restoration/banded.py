@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, runs
 from rsvib_torch.core.fourier import extend_rows, extended_length
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.splines import bspline_weights, mirrored
@@ -19,10 +19,6 @@ from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
 from rsvib_torch.options import BandedOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
-
-__all__ = ["restore_banded"]
-
-_CHUNK_ELEMENTS = {"cpu": 1 << 19, "cuda": 1 << 26}  # values of a filter bank; fit into the cache, or fill a GPU
 
 
 def _waves(frequencies: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,25 +108,15 @@ def restore_banded(
     motion: FrameMotion,
     options: BandedOptions,
 ) -> Tensor:
-    """Restore frames slab by slab (Sec. 3.2 of Liu et al. 2023).
+    """Restore frames (B, T, C, H, W) slab by slab (Sec. 3.2 of Liu et al. 2023).
 
-    Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l is assumed to have the PSF of that
-    row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, and its central
-    rows are kept. Whole pixels of the displacement shift the slab, so that a low slab suffices. The prior penalises
-    image gradients, which preserves the mean. Rows are transformed once per frame, and the filter is evaluated at the
-    central rows only. Rows are extended smoothly at their ends and mirrored above and below. All pixels count:
-    ``restore`` replaces those without data by local means, and saturated ones count at their level.
-
-    Args:
-        frames: (B, T, C, H, W) in row order.
-        motion: Motion of the frames.
-        options: Options of the method; ``half_rows`` is l, ``noise_to_signal`` w.
-
-    Returns:
-        Restored frames of the same shape.
-
-    Raises:
-        ValueError: If slabs or their steps are larger than the frames.
+    Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
+    the PSF of that row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, w =
+    ``noise_to_signal``, and its central rows are kept. Whole pixels of the displacement shift the slab, so that a low
+    slab suffices. The prior penalises image gradients, which preserves the mean. Rows are transformed once per frame,
+    and the filter is evaluated at the central rows only. Rows are extended smoothly at their ends and mirrored above
+    and below. All pixels count: ``restore`` replaces those without data by local means, and saturated ones count at
+    their level.
     """
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))
@@ -144,7 +130,7 @@ def restore_banded(
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=frames.device)
     v = torch.fft.fftfreq(size, dtype=torch.float64, device=frames.device)
     if chunk_rows is None:
-        chunk_rows = max(1, _CHUNK_ELEMENTS.get(frames.device.type, 1 << 22) // (size * len(u)))
+        chunk_rows = at_once(16 * size * len(u), frames.device)  # bytes of a filter bank
 
     # one slab for every `stride` scene rows: its middle, the frame row at which it appears, the motion relative to it
     centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]

@@ -22,28 +22,18 @@ from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming, check_timing
 from rsvib_torch.options import DewarpOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
-__all__ = ["FixedDewarp", "restore_dewarp"]
-
-
 _DEGREE = 5  # of the B-spline across rows
 _CHUNK_ROWS = 128  # interpolated at a time
 
 
 @dataclass(frozen=True, eq=False)
 class _Moves:
-    """Where the rows of restored frames are found in the frames; all tensors are real.
+    """Where the rows of restored frames are found in the frames; all tensors are real."""
 
-    Attributes:
-        taps: (B, T, H, 6) int64, rows of a frame.
-        weights: (B, T, H, 6) of these rows.
-        coarse: (B, T, H, n, 2) phase factors, from ``phase_tables``.
-        fine: (B, T, H, 64, 2) phase factors.
-    """
-
-    taps: Tensor
-    weights: Tensor
-    coarse: Tensor
-    fine: Tensor
+    taps: Tensor  # (B, T, H, 6) int64, rows of a frame
+    weights: Tensor  # (B, T, H, 6) of these rows
+    coarse: Tensor  # (B, T, H, n, 2) phase factors, from ``phase_tables``
+    fine: Tensor  # (B, T, H, 64, 2) phase factors
 
     @classmethod
     def of(cls, motion: FrameMotion, length: int, dtype: torch.dtype) -> "_Moves":
@@ -58,18 +48,10 @@ class _Moves:
 
 
 def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions = DewarpOptions()) -> Tensor:  # noqa: B008
-    """Undo the displacement of every row, not its blur: fast, and sufficient for short exposures.
+    """Undo the displacement of every row of frames (B, T, C, H, W), not its blur: sufficient for short exposures.
 
     Scene row s is interpolated at frame row r(s) by a quintic B-spline across rows and moved back along the row by the
     mean displacement (Eq. 2) of that row with a phase ramp. Noise is not amplified.
-
-    Args:
-        frames: (B, T, C, H, W) in row order.
-        motion: Motion of the frames.
-        options: Options of the method.
-
-    Returns:
-        Restored frames of the same shape.
     """
     length = extended_length(frames.shape[-1], motion.displacement_bound())
     moves, spectra = (
@@ -85,15 +67,9 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions =
 
 
 def _moved_back(spectra: Tensor, moves: _Moves, rows_of: Callable[[Tensor], Tensor], chunk_rows: int) -> Tensor:
-    """Restored frames (B, T, C, H, W) in row order.
+    """Restored frames (B, T, C, H, W) of transforms along rows (B, T, C, H, U, 2) of spline coefficients.
 
-    Shapes are changed as real tensors: ONNX has no complex ones.
-
-    Args:
-        spectra: (B, T, C, H, U, 2) real and imaginary part of the transforms along rows of spline coefficients.
-        moves: Where the rows are found.
-        rows_of: Function from moved spectra (..., U, 2) to rows (..., W).
-        chunk_rows: Rows that are interpolated at a time.
+    Shapes are changed as real tensors: ONNX has no complex ones. ``rows_of`` takes moved spectra (..., U, 2) to rows.
     """
     B, T, C, H, count, _ = spectra.shape
     flat = spectra.movedim(2, 3).reshape(B * T * H, -1)  # one entry per row, with all channels
@@ -137,10 +113,8 @@ class FixedDewarp(nn.Module):
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> dewarp = rsv.FixedDewarp(timing, vibration, frames.shape[-2:], num_frames=2)
         >>> program = torch.export.export(dewarp, (frames,))
         >>> expected = rsv.restore(frames, timing, vibration, method="dewarp", check=False)

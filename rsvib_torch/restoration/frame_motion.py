@@ -29,8 +29,6 @@ from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slo
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 
-__all__ = ["FrameMotion", "frame_motion", "joint_groups", "motion_in_row_order", "restore_in_strips", "visible_pixels"]
-
 
 @dataclass(frozen=True, eq=False)
 class FrameMotion:
@@ -39,22 +37,15 @@ class FrameMotion:
     A restored frame contains the scene at rest, moved by ``shift``: the displacement by the uniform image motion at
     the middle of the frame, rounded to whole pixels. A push-scan frame is thus restored in place. Without image motion
     the shift is zero.
-
-    Attributes:
-        vibration: The motion, batch shape (B,).
-        timing: The sensor, in row order.
-        frame_starts: (T,) seconds.
-        shift: (B, T, 2) whole px, axes (x, y), float64.
-        num_rows: Rows of a frame.
-        neglected: Standard deviation in px of the displacement of the columns of a strip about that of its middle,
-            which is that of all columns in this motion. Only the exact method with ``scale=2`` uses it.
     """
 
-    vibration: Motion
-    timing: RowTiming
-    frame_starts: Tensor
-    shift: Tensor
-    num_rows: int
+    vibration: Motion  # the motion, batch shape (B,)
+    timing: RowTiming  # the sensor, in row order
+    frame_starts: Tensor  # (T,) seconds
+    shift: Tensor  # (B, T, 2) whole px, axes (x, y), float64
+    num_rows: int  # rows of a frame
+    # standard deviation in px of the displacement of the columns of a strip about that of its middle, which is that
+    # of all columns in this motion. Only the exact method with ``scale=2`` uses it
     neglected: float = 0.0
 
     def of(self, stacks: list[int], frames: list[int] | None = None) -> "FrameMotion":
@@ -204,12 +195,8 @@ def visible_pixels(
 def joint_groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
     """Indices of the frames that are restored together, and the index of the reference frame, for every result.
 
-    The result is in the coordinates of the reference frame.
-
-    Args:
-        count: Frames of the stack.
-        joint: ``True``: all frames, with the middle one as reference; a number K: every frame with its neighbours,
-            K in all; ``False``: every frame by itself.
+    With ``joint=True`` all frames, with the middle one as reference; a number K: every frame with its neighbours, K in
+    all; ``False``: every frame by itself. The result is in the coordinates of the reference frame.
 
     Example:
         >>> joint_groups(3, True)

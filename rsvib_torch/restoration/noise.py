@@ -15,15 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, runs
 from rsvib_torch.core.fourier import squared_modulus, waves
 from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
 from rsvib_torch.restoration.scene_model.observation import row_kernels
 from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts
-
-__all__ = ["ESTIMATORS", "estimate_noise", "fit_noise", "noise_floor", "noise_levels", "noise_of_blurred_frames"]
 
 # Squares for power spectra, and which parts of images count
 
@@ -52,8 +50,6 @@ def _mostly_measured(missing: Tensor, dims: tuple[int, ...], *, max_missing: flo
 
 
 # Single images: the quietest blocks of a high-pass residual
-
-_PIXELS = {"cpu": 1 << 22, "cuda": 1 << 26}  # px filtered at a time; bounds the memory
 
 
 def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
@@ -98,7 +94,7 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
     pixels = height * width // stride
     parts = [
         (down @ (blocks_of(images[part]) @ along.mT)).square().mean((-2, -1))
-        for part in runs(len(images), max(1, _PIXELS.get(frames.device.type, 1 << 22) // pixels))
+        for part in runs(len(images), at_once(16 * pixels, frames.device, cpu_bytes=2**26))
     ]
     energy = torch.cat(parts).view(*frames.shape[:-2], *parts[0].shape[1:])
     energy = energy / math.prod(math.comb(2 * order, order) for order in orders)
@@ -471,16 +467,10 @@ def _fit_floor(
     iterations: int = 16,
     max_step: float = 0.7,
 ) -> Tensor:
-    """Floor (N,) by Fisher scoring of ``n + c_d f^(-a_d) exp(-b f^2)`` in the logarithms of n and c.
+    """Floor (N,) of powers (N, K) by Fisher scoring of ``n + c_d f^(-a_d) exp(-b f^2)`` in the logarithms of n and c.
 
-    Args:
-        power: (N, K) at K frequencies.
-        frequency: (K,) cycles per px.
-        sector: (K,) index of the direction.
-        steepness_mean: Mean of the weak prior of the exponents a.
-        steepness_std: Its standard deviation.
-        iterations: Scoring steps.
-        max_step: Largest change of a parameter in one step.
+    The frequencies f (K,) are in cycles per px, ``sector`` (K,) is the direction d, and the exponents a have a weak
+    prior. ``max_step`` is the largest change of a parameter in one step.
     """
     # start from half of the lowest power as floor, and from half of the mean power of each sector as scene
     inside = torch.nn.functional.one_hot(sector, _SECTORS).to(torch.float64)  # (K, D)

@@ -14,8 +14,6 @@ from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
-__all__ = ["predict_noise_gain"]
-
 
 @vibration_options(NoiseGainOptions)
 def predict_noise_gain(

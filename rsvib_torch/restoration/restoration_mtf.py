@@ -25,8 +25,6 @@ from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
-__all__ = ["RestorationMtf", "restoration_mtf"]
-
 # Waves of neighbouring frequencies are in different probes: uneven sampling mixes them
 _GROUPS = 2
 _RIM = 16  # px at the borders that are excluded

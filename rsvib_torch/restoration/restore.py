@@ -31,16 +31,6 @@ from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
-__all__ = [
-    "METHODS",
-    "RestorationMethod",
-    "VibrationRestorer",
-    "check_optics",
-    "restore",
-    "restore_prepared",
-    "unchanged_frames",
-]
-
 
 @dataclass(frozen=True)
 class RestorationMethod:
@@ -191,13 +181,7 @@ def restore(
 def restore_prepared(frames: PreparedFrames, vibration: Motion, options: RestorationOptions) -> Tensor:
     """``restore`` of prepared frames, without a check of motion and result, and without sharpening by ``optics``.
 
-    Args:
-        frames: The frames.
-        vibration: The motion in image axes, batch shape () or (B,).
-        options: Method and its options.
-
-    Returns:
-        Restored frames (B, T, C, H, W) in row order.
+    The motion is in image axes, the result (B, T, C, H, W) in row order.
     """
     return _restored(frames, motion_in_row_order(frames, vibration), options)
 
@@ -218,12 +202,9 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
 
 
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
-    """The frames as taken, instead of the result of ``restore``: NaN at missing pixels; with ``joint=True`` one frame.
+    """The frames as taken in place of restored ones: NaN at missing pixels; with ``joint=True`` the middle one.
 
-    Args:
-        frames: The frames.
-        joint: As in ``restore_exact``; the middle frame replaces the image of all frames.
-        scale: As in ``restore_exact``; values between the pixels are interpolated.
+    On a finer grid, values between the pixels are interpolated.
     """
     images = frames.images if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
     if frames.missing is not None:
@@ -257,10 +238,8 @@ class VibrationRestorer(nn.Module):
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
         >>> model = torch.nn.Conv2d(1, 4, 3)  # any network
         >>> batch = frames[None, :, None].requires_grad_()  # (B, T, C, H, W)

@@ -14,8 +14,6 @@ from rsvib_torch.options import RichardsonLucyOptions
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 
-__all__ = ["restore_richardson_lucy"]
-
 
 def restore_richardson_lucy(
     frames: Tensor,
@@ -102,11 +100,9 @@ def _depends_on_boundary(kernels: RowPSF, width: int) -> Tensor:
 
 
 def _mean_of_overlap(dewarped: Tensor, apart: Sequence[Sequence[int]]) -> Tensor:
-    """Mean (1, C, H, W) of frames, pixel by pixel, over the frames that contain the pixel.
+    """Mean (1, C, H, W) of frames (M, C, H, W), pixel by pixel, over the frames that contain the pixel.
 
-    Args:
-        dewarped: Frames (M, C, H, W) without distortion.
-        apart: Displacement (x, y) in px of their content relative to that of the mean.
+    Their content is ``apart`` (x, y) px from that of the mean.
     """
     height, width = dewarped.shape[-2:]
     total, number = torch.zeros_like(dewarped[:1]), torch.zeros_like(dewarped[:1])

@@ -17,8 +17,6 @@ from rsvib_torch.stacks.heap import keep_freed_memory, share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
 from rsvib_torch.stacks.windows import Window
 
-__all__ = ["compute_here", "compute_with_dask", "results_in_order"]
-
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
@@ -37,11 +35,8 @@ def results_in_order(
 ) -> Generator[Any, None, None]:
     """Results of items in their order.
 
-    Args:
-        items: Windows or frames.
-        submit: Starts the computation of one; returns an object with ``result()``.
-        capacity: Number of items that are computed or wait at the same time.
-        waiting: They are put there.
+    ``submit`` starts the computation of one and returns an object with ``result()``; as many as ``capacity()`` are
+    computed or wait, in ``waiting``.
     """
     remaining = iter(items)
     while True:
@@ -59,16 +54,10 @@ def compute_here(
     *,
     at_once: int,
 ) -> Generator[_Result, None, None]:
-    """Compute windows in threads of this process; one more thread reads ahead.
+    """Compute windows in threads of this process, ``at_once`` at a time; one more thread reads ahead.
 
-    Args:
-        job: What to compute.
-        windows: The windows, in order.
-        finish: Function of a result and the frames from which it was computed, called in the thread that computed it.
-        at_once: Number of windows to compute at once.
-
-    Yields:
-        Results of ``finish``, in the order of the windows.
+    ``finish`` is called with a result and its frames in the thread that computed it. Its results are in the order of
+    the windows.
     """
     share_one_heap()
     reader = WindowReader(job.source, job.info)
@@ -186,21 +175,10 @@ class _DaskResult:
 def compute_with_dask(
     job: StackJob, windows: Sequence[Window], *, scheduler: str, workers: int
 ) -> Generator[StoredWindow, None, None]:
-    """Compute windows with Dask: each is one task that reads its frames and returns the frames to store.
+    """Compute windows with Dask: each is one task that reads its frames and returns the frames to store, in order.
 
-    Workers must be able to read the stack under the same path. If a worker fails, its tasks are repeated elsewhere.
-
-    Args:
-        job: What to compute.
-        windows: The windows, in order.
-        scheduler: Address like ``tcp://host:8786``, or ``"local"`` for workers on this machine.
-        workers: Number of workers on this machine.
-
-    Yields:
-        Frames to store, in the order of the windows.
-
-    Raises:
-        OSError: If workers cannot be started, die repeatedly, or are missing for a minute.
+    Workers must be able to read the stack under the same path. If a worker fails, its tasks are repeated elsewhere. The
+    scheduler ``"local"`` starts a number of workers on this machine.
     """
     job = replace(job, source=job.source.absolute())
     one_thread = _one_thread_each(windows)

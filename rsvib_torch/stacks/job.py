@@ -1,17 +1,17 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypedDict, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_choice, check_whole_number
+from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
@@ -23,33 +23,13 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import BadFrames, RestorationOptions, WindowOptions
+from rsvib_torch.options import BadFrames, ProcessStackOptions, RestorationOptions, StackDetectionOptions, StackOptions
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
 from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
 
-__all__ = ["StackJob", "StoredWindow", "WindowFrames", "WindowReader", "WindowResult", "plan_job"]
-
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
-
-
-class DetectOptions(TypedDict, total=False):
-    """Options of ``detect_stack``, see ``iterate_stack``."""
-
-    window: int
-    detection: Mapping[str, Any] | None
-    full_scale: float | None
-    memory: str | float | None
-    workers: int | None
-    device: str
-
-
-class RestoreOptions(DetectOptions, total=False):
-    """Options of ``iterate_stack`` and ``process_stack``."""
-
-    restoration: Mapping[str, Any] | None
-    force: bool
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,33 +79,21 @@ class StoredWindow:
 
 @dataclass(frozen=True, eq=False)
 class StackJob:
-    """Everything on which the result of a window depends, except its frames.
+    """Everything on which the result of a window depends, except its frames."""
 
-    Attributes:
-        source: The stack.
-        info: What its file states.
-        timing: Timing of the whole stack.
-        full_scale: Count that corresponds to 1.0; None for floats.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; None for detection only.
-        given: Detections to use instead, by number of the window; None where a window has none.
-        bad_frames: Whether frames that cannot be used are written unchanged or omitted.
-        force: Whether to write restored frames even if they are judged worse than the raw ones.
-        device: Device for the computation.
-        window: Maximum number of frames of a window.
-    """
-
-    source: Path
-    info: StackInfo
-    timing: SensorTiming
-    full_scale: float | None
-    detection: Mapping[str, Any] = field(default_factory=dict)
+    source: Path  # the stack
+    info: StackInfo  # what its file states
+    timing: SensorTiming  # timing of the whole stack
+    full_scale: float | None  # count that corresponds to 1.0; None for floats
+    detection: Mapping[str, Any] = field(default_factory=dict)  # options of ``detect_vibration``
+    # options of ``restore``, for frames whose full scale is 1; None for detection only
     restoration: Mapping[str, Any] | None = field(default_factory=dict)
+    # detections to use instead, by number of the window; None where a window has none
     given: Mapping[int, DetectedVibration | None] | None = None
-    bad_frames: BadFrames = "pass"
-    force: bool = False
-    device: str = "cpu"
-    window: int = WindowOptions.window
+    bad_frames: BadFrames = "pass"  # whether frames that cannot be used are written unchanged or omitted
+    force: bool = False  # whether to write restored frames even if they are judged worse than the raw ones
+    device: str = "cpu"  # device for the computation
+    window: int = StackOptions.window  # maximum number of frames of a window
 
     @property
     def joined(self) -> bool:
@@ -151,12 +119,7 @@ class StackJob:
         return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
-        """Detect the vibration in a window, restore its frames and judge the result.
-
-        Args:
-            window: The window.
-            pixels: Its frames, or why they cannot be read.
-        """
+        """Detect the vibration in a window, restore its frames and judge the result."""
         faults: dict[int, str] = {}
         nodata = self.info.nodata
         usable: dict[int, NDArray[Any]] = {}
@@ -298,78 +261,60 @@ class WindowReader:
 
 
 def plan_job(
-    source: PathLike,
-    timing: SensorTiming,
-    options: Mapping[str, Any],
-    *,
-    restores: bool = True,
-    given: Sequence[DetectedVibration | None] | None = None,
-    bad_frames: BadFrames = "pass",
-    here: bool = True,
+    source: PathLike, timing: SensorTiming, options: StackDetectionOptions, *, here: bool = True
 ) -> tuple[StackJob, list[Window], int]:
     """The job of a run, its windows, and how many of them to compute at once.
 
-    Args:
-        source: As in ``process_stack``.
-        timing: As in ``process_stack``.
-        options: ``RestoreOptions``, or ``DetectOptions`` if frames are not restored.
-        restores: Whether frames are restored.
-        given: As in ``process_stack``.
-        bad_frames: As in ``process_stack``.
-        here: Whether windows are computed on this machine, in the memory that is free.
-
-    Raises:
-        OSError: If the stack cannot be read.
-        TypeError: If an option is unknown.
-        ValueError: If a value is out of range or contradicts the stack, or a window does not fit into the memory.
+    Frames are restored if the options are ``StackOptions``. The free memory limits the number of windows that are
+    computed ``here``, on this machine.
     """
-    known = (RestoreOptions if restores else DetectOptions).__optional_keys__
-    if unknown := sorted(options.keys() - known):
-        raise TypeError(f"unknown option {unknown[0]!r}; the options are {', '.join(sorted(known))}")
-    check_choice("bad_frames", bad_frames, get_args(BadFrames))
     info = read_stack_info(source)
     full_scale = None
     if info.is_integer:
-        stated = options.get("full_scale")
-        full_scale = required_full_scale(info.full_scale if stated is None else stated, np.dtype(info.dtype), source)
+        stated = info.full_scale if options.full_scale is None else options.full_scale
+        full_scale = required_full_scale(stated, np.dtype(info.dtype), source)
     timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
-    detection = dict(options.get("detection") or {})
+    detection = dict(options.detection or {})
     for name in ("window", "window_step"):
         if name in detection:
             raise TypeError(f"{name!r} is not an option of detection here: a stack is cut into windows by window=")
     if detection.get("model", "tones") != "tones":
         raise ValueError(f"model={detection['model']!r}: in windows only tones are detected; see detect_vibration")
-    device = options.get("device", "auto")
-    check_choice("device", device.partition(":")[0], ("auto", "cpu", "cuda"))
+    check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
+    device = options.device
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
+    restored = options if isinstance(options, StackOptions) else None
+    run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
     job = StackJob(
         Path(source),
         info,
         timing,
         full_scale,
         detection,
-        dict(options.get("restoration") or {}) if restores else None,
-        None if given is None else dict(enumerate(given)),
-        bad_frames,
-        options.get("force", False),
+        None if restored is None else dict(restored.restoration or {}),
+        None if run.given is None else dict(enumerate(run.given)),
+        run.bad_frames,
+        restored is not None and restored.force,
         device,
-        options.get("window", WindowOptions.window),
+        options.window,
     )
     if job.mosaic is not None:
         check_mosaic(job.mosaic, info.shape, str(source))
     if job.restoration is not None:
         check_optics(RestorationOptions(**job.restoration).optics)
     windows = cut_windows(info.shape[0], job.window)
-    if options.get("workers") is not None:
-        most = check_whole_number("workers", options["workers"], at_least=1)
+    if options.workers is not None:
+        most = options.workers
     elif device != "cpu":
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not here:  # the memory of other machines is not known
         return job, windows, most
-    limits = {"memory": options.get("memory"), "most": most, "on_gpu": device != "cpu"}
-    return job, windows, windows_at_once(info, job.window, restoration=job.restoration, **limits)
+    at_once = windows_at_once(
+        info, job.window, memory=options.memory, most=most, restoration=job.restoration, on_gpu=device != "cpu"
+    )
+    return job, windows, at_once

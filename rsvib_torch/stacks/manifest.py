@@ -19,8 +19,6 @@ from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.stacks.job import StackJob
 
-__all__ = ["StackManifest", "WindowRecord", "fingerprint", "manifest_header", "read_manifest", "write_manifest"]
-
 
 @dataclass(frozen=True, eq=False)
 class WindowRecord:
@@ -177,19 +175,10 @@ def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> 
 
 
 def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: int = 32) -> dict[str, Any]:
-    """Name, size and hash of a file or folder.
+    """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
     The hash covers the names and sizes of all files, and evenly spaced blocks of them that include the first and the
     last; with the defaults, files of up to 2 MiB completely.
-
-    Args:
-        path: The file or folder; a file ``NAME.json`` beside a file is included.
-        block: Bytes per block.
-        blocks: Maximum number of blocks of a file.
-        files: Maximum number of files of a folder whose blocks are read.
-
-    Raises:
-        OSError: If it cannot be read.
     """
 
     def spread(count: int, most: int) -> list[int]:
@@ -242,15 +231,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
 def write_manifest(
     path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
 ) -> None:
-    """Write a manifest with one line per key and window; records are not kept in memory.
-
-    Args:
-        path: Temporary name of the file.
-        header: As made by ``manifest_header``.
-        records: Contents of ``WindowRecord``.
-        not_kept: Metadata of the input that the output does not contain.
-        **results: Further keys of ``StackManifest``.
-    """
+    """Write a manifest with one line per key and ``WindowRecord``; records are not kept in memory."""
     units = {
         "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
         "amplitude": "px",
@@ -291,22 +272,14 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
+        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
+        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
+        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
         >>> manifest = rsv.read_manifest(report.manifest)
         >>> manifest.detections()[0].vibration.frequency[:, 0].round().tolist()  # Hz, first window
-        [155.0, 145.0]
+        [110.0, 90.0]
     """
     return StackManifest.load(path)

@@ -11,8 +11,6 @@ from rsvib_torch.core.free_memory import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.restoration.exact.priors import PRIORS
 
-__all__ = ["check_stack_fits", "memory_limit", "memory_needed", "parse_memory", "windows_at_once"]
-
 # bytes; of the process with its libraries, and of a window independent of its size; peaks measured by
 # scripts/benchmark.py --only memory, rounded up
 _PROCESS_BYTES, _WINDOW_BYTES = 450 * 10**6, 80 * 10**6
@@ -24,9 +22,6 @@ _FINER = 4  # times that with scale=2; 3.5 measured for windows of 4 frames of 5
 
 def parse_memory(text: str | float) -> int:
     """Number of bytes of a text like ``"2GB"``, ``"500 MB"`` or ``"1.5GiB"``.
-
-    Raises:
-        ValueError: If it is not a positive size.
 
     Example:
         >>> parse_memory("2GB"), parse_memory("1.5 GiB"), parse_memory(4096)
@@ -83,18 +78,9 @@ def windows_at_once(
     restoration: Mapping[str, Any] | None,
     on_gpu: bool = False,
 ) -> int:
-    """Number of windows that can be processed at once.
+    """Number of windows that can be processed at once, at most ``most``, within the memory of the machine.
 
-    Args:
-        info: The stack.
-        window: Frames per window.
-        memory: As in ``iterate_stack``.
-        most: Number of processors.
-        restoration: Options of ``restore``; None for detection only.
-        on_gpu: Whether windows are computed on a GPU; only the memory of the machine is limited.
-
-    Raises:
-        ValueError: If the limit is too small for one window, with the required size and the largest window that fits.
+    The error about too little memory states the required size and the largest window that fits.
     """
     limit = memory_limit(memory)
 
@@ -124,13 +110,7 @@ def windows_at_once(
 
 
 def check_stack_fits(info: StackInfo, restoration: Mapping[str, Any] | None = None, *, on_gpu: bool = False) -> None:
-    """Raise a ``ValueError`` if a stack that is processed as a whole does not fit into the free memory.
-
-    Args:
-        info: The stack.
-        restoration: As in ``windows_at_once``.
-        on_gpu: As in ``windows_at_once``.
-    """
+    """Raise a ``ValueError`` if a stack that is processed as a whole does not fit into the free memory."""
     needed = memory_needed(info, info.shape[0], restoration, on_gpu=on_gpu)
     check_fits(
         f"{info.path or 'the frames'}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px, processed "

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.validation import fields_of
+from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
@@ -28,19 +28,17 @@ from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, s
 from rsvib_torch.io.video import CONTAINERS
 from rsvib_torch.io.video_parts import PartWriter, PlaneReader, join_parts, planes_of
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import RestorationOptions
+from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, plan_job
 from rsvib_torch.stacks.manifest import manifest_header
-from rsvib_torch.stacks.resumable_run import StackReport, run_to_file
+from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
 from rsvib_torch.stacks.video_frames import FrameLayout, RestoredFrame, VideoRestorer
 from rsvib_torch.stacks.video_passes import PART_FRAMES, VideoPasses
 from rsvib_torch.stacks.video_tracks import FrameTrack
 from rsvib_torch.tracking import Margins
-
-__all__ = ["process_video"]
 
 _MAX_INITIAL_FAILURES = 8  # parts; a run stops if the motion is known in none of them
 
@@ -48,25 +46,8 @@ Frame = NDArray[Any]
 Planes = list[Frame]
 
 
-@checks_arguments
-def process_video(
-    source: PathLike,
-    sink: PathLike,
-    timing: SensorTiming,
-    *,
-    border: str = "mirror",
-    steady: float = 0.0,
-    restoration: Mapping[str, Any] | None = None,
-    columns: int | None = 384,
-    window: int = 8,
-    full_scale: float | None = None,
-    resume: bool = False,
-    manifest: PathLike | None = None,
-    memory: str | float | None = None,
-    workers: int | None = None,
-    device: str = "auto",
-    progress: Callable[[int, int], None] | None = None,
-) -> StackReport:
+@file_options(ProcessVideoOptions)
+def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessVideoOptions) -> StackReport:
     """Restore a video of any length from file to file, and steady it.
 
     The vibration is followed from frame to frame (``VibrationTracker``) instead of detected in windows: neighbouring
@@ -83,25 +64,8 @@ def process_video(
         sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv, .avi (FFV1, without loss). Times, sound and metadata
             are those of the source.
         timing: As in ``process_stack``.
-        border: Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself;
-            ``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins, for which the video is read
-            twice.
-        steady: s; every frame is moved to the mean of its path in the interval of this length around it: vibration,
-            rolling-shutter wobble and shaking are removed, slow motion is kept. 0: frames stay where they are.
-        restoration: ``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames
-            whose full scale is 1. Without ``saturation``, saturated pixels count as measured: their values are restored
-            0.2 dB worse if 1 % of the pixels are saturated, in a quarter of the time. Not ``joint``, ``scale``,
-            ``mosaic`` or ``optics``.
-        columns: As in ``VibrationTracker``.
-        window: As in ``VibrationTracker``.
-        full_scale: As in ``read_stack``.
-        resume: Whether to continue an interrupted run; a complete output is not changed.
-        manifest: As in ``process_stack``. A part of the video is a window there; its detection is that of the last
-            frame, at ``start_time``.
-        memory: As in ``process_stack``.
-        workers: Number of frames that are restored at the same time; by default the number of processors.
-        device: As in ``process_stack``.
-        progress: As in ``process_stack``. Both passes of ``border="crop"`` count as half.
+        options: Options. A part of the video is a window in the manifest; its detection is that of the last frame, at
+            ``start_time``.
 
     Returns:
         Summary of the run.
@@ -118,14 +82,12 @@ def process_video(
         >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
     """
     begin, source, sink = time.perf_counter(), Path(source), Path(sink)
-    check_choice("border", border, ("mirror", "hold", "crop"))
-    check_number("steady", steady, at_least=0.0)
-    plan = {"full_scale": full_scale, "memory": memory, "workers": workers, "device": device}
-    video, at_once = _planned(source, timing, restoration, plan, steady, (columns, window), masks=border != "mirror")
+    border, steady = options.border, options.steady
+    video, at_once = _planned(source, timing, options)
     job = video.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
-    target = sink.with_name(sink.name + ".manifest.json") if manifest is None else Path(manifest)
+    target = manifest_path(sink, options)
     check_outputs([sink, work_folder(sink), target], stack_files(source))
     content = _content(job, timing)
     if border != "crop":
@@ -133,14 +95,14 @@ def process_video(
     header = manifest_header(job, sink.name, None)
     header["settings"] |= {
         "window": None,  # for the commands that read manifests: parts are not windows of their own
-        "video": {"border": border, "steady": steady, "columns": columns, "window": window},
+        "video": {"border": border, "steady": steady, "columns": options.columns, "window": options.window},
     }
     waiting = math.ceil(0.5 * steady / timing.frame_period) * 2 * content.frame_bytes
     check_fits(f"{source}: the frames of half of steady={steady:g} s", waiting, "choose a shorter time")
 
     def compute(folder: RunFolder) -> dict[str, Any]:
         nonlocal content
-        shown = _Progress(progress, len(video.starts), 2 if border == "crop" else 1)
+        shown = _Progress(options.progress, len(video.starts), 2 if border == "crop" else 1)
         with tempfile.TemporaryFile() as tracks, closing(open_stack(source)) as reader:
             margins = video.margins(tracks, shown) if border == "crop" else None
             content = _cut_content(content, margins)
@@ -160,7 +122,7 @@ def process_video(
         target,
         header,
         windows=video.parts,
-        resume=resume,
+        resume=options.resume,
         compute=compute,
         write=write,
         not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
@@ -229,7 +191,7 @@ def _check_known(known: list[bool], parts: int, folder: RunFolder) -> None:
 class _Progress:
     """Progress over the passes through a video, each of which counts alike."""
 
-    def __init__(self, show: Callable[[int, int], None] | None, count: int, passes: int) -> None:
+    def __init__(self, show: Progress, count: int, passes: int) -> None:
         self._show, self._count, self._passes, self._done = show, count, passes, 0
         if show is not None:
             show(0, count)
@@ -241,37 +203,30 @@ class _Progress:
             self._show(self._done // self._passes, self._count)
 
 
-def _planned(
-    source: Path,
-    timing: SensorTiming,
-    restoration: Mapping[str, Any] | None,
-    plan: Mapping[str, Any],
-    steady: float,
-    tracking: tuple[int | None, int],
-    *,
-    masks: bool,
-) -> tuple[VideoPasses, int]:
+def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -> tuple[VideoPasses, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
-    given = dict(restoration or {})
+    given = dict(options.restoration or {})
     for name in ("joint", "scale", "mosaic", "optics"):
         if given.pop(name, None) not in (None, False, 1):
             raise ValueError(f"{name} is not available for videos that are followed frame by frame; use process_stack")
-    job, _, at_once = plan_job(source, timing, {**plan, "restoration": given, "window": 2})
+    resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
+    job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     reader: FrameReader = open_stack(source)
     try:
         planes = planes_of(reader)
     finally:
         reader.close()
-    options = RestorationOptions(**given)
+    method = RestorationOptions(**given)
     white = None
-    if isinstance(options.saturation, float):
+    if isinstance(method.saturation, float):
         black, full = (0.0, job.full_scale or 1.0) if planes is None else (planes.black, planes.white)
-        white = black + options.saturation * (full - black)
+        white = black + method.saturation * (full - black)
     scale = 255.0 if planes is not None else job.full_scale
     layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
-    restorer = VideoRestorer(layout, job.timing, options, job.device, masks)
-    starts = job.timing.frame_starts(job.info.shape[0]).tolist()
-    return VideoPasses(job, layout, restorer, [start - starts[0] for start in starts], steady, *tracking), at_once
+    restorer = VideoRestorer(layout, job.timing, method, job.device, masks=options.border != "mirror")
+    times = job.timing.frame_starts(job.info.shape[0]).tolist()
+    starts = [start - times[0] for start in times]
+    return VideoPasses(job, layout, restorer, starts, options.steady, options.columns, options.window), at_once
 
 
 def _content(job: StackJob, timing: SensorTiming) -> StackInfo:

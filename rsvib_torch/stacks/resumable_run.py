@@ -10,11 +10,10 @@ from rsvib_torch.core.arguments import check_fields
 from rsvib_torch.core.atomic import make_folder, remove_abandoned, sync, whole_file
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import number_of
+from rsvib_torch.options import RunOptions
 from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import read_manifest, write_manifest
 from rsvib_torch.stacks.run_folder import RunFolder, describe_difference, disk_errors_named, work_folder
-
-__all__ = ["StackReport", "run_to_file"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,24 +33,10 @@ class StackReport(Summarised):
         not_kept: Metadata of the input that the output does not contain.
 
     Example:
-        >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=100e-6, exposure_rows=10, frame_rows=160)
-        >>> vibration = rsv.Vibration(amplitude=[1.6, 1.2], frequency=[155.0, 145.0])
-        >>> folder = tempfile.mkdtemp()
-        >>> frames = rsv.simulate_frames(city_and_fields(170, 150, seed=3), timing, vibration, num_frames=4)
-        >>> rsv.write_stack(f"{folder}/frames.tif", frames, dtype="uint16", full_scale=4095)
-        >>> report = rsv.process_stack(
-        ...     f"{folder}/frames.tif",
-        ...     f"{folder}/restored.tif",
-        ...     timing,
-        ...     window=3,
-        ...     detection={"tones": 1},
-        ...     restoration={"method": "dewarp"},
-        ... )
-        >>> report.frames, report.windows, report.restored, report.failed
-        (4, 2, 2, 0)
+        >>> report = rsv.process_stack("frames.tif", "restored.tif", timing)  # doctest: +SKIP
+        >>> report.frames, report.windows, report.restored, report.failed  # doctest: +SKIP
+        (200, 28, 28, 0)
     """
 
     frames: int
@@ -84,6 +69,11 @@ class StackReport(Summarised):
         return "\n".join(lines)
 
 
+def manifest_path(sink: Path, options: RunOptions) -> Path:
+    """Path of the manifest of a run."""
+    return sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
+
+
 def run_to_file(
     sink: Path,
     manifest: Path,
@@ -97,23 +87,8 @@ def run_to_file(
 ) -> StackReport:
     """Compute the windows of a run that are not finished, and write the output and its manifest.
 
-    Args:
-        sink: The output.
-        manifest: Path of the manifest.
-        header: As from ``manifest_header``.
-        windows: Number of windows.
-        resume: Whether to continue an interrupted run; a complete output is not changed.
-        compute: Adds the missing windows to the folder, and returns results of the whole run for the manifest.
-        write: Writes the output from the folder.
-        not_kept: Metadata that the output does not contain, for its number of frames.
-
-    Returns:
-        Summary of the run.
-
-    Raises:
-        FileExistsError: If there is an interrupted run and ``resume`` is False.
-        OSError: If a file cannot be written; the run can then be resumed.
-        ValueError: If a run cannot be resumed.
+    ``compute`` adds the missing windows to the folder and returns further keys of the manifest; ``write`` writes the
+    output from the folder; ``not_kept`` names the metadata that an output of a number of frames does not contain.
     """
     start = time.perf_counter()
 

@@ -23,8 +23,6 @@ from typing import Any, BinaryIO
 from rsvib_torch.core.atomic import PART, make_folder, nearest_folder, sync, sync_tree, temporary_folder
 from rsvib_torch.core.free_memory import size_text
 
-__all__ = ["RunFolder", "check_space", "describe_difference", "disk_errors_named", "work_folder"]
-
 _HEADER = "run.json"
 _NAMES = re.compile(r"run\.json|\d{6,}\.(done|done\.part|npy|mkv|avi|mp4|mov|m4v)")  # of the files that a run makes
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
@@ -241,12 +239,7 @@ class RunFolder:
         return os.fdopen(os.open(name, os.O_RDONLY | _SAFELY, dir_fd=self._folder), "rb")
 
     def add(self, record: Mapping[str, Any], names: Iterable[str]) -> None:
-        """Enter a finished window; it is on the disk when the function returns.
-
-        Args:
-            record: Content of its ``WindowRecord``.
-            names: Its files, which are closed.
-        """
+        """Enter the ``WindowRecord`` of a window with its closed files; it is on the disk when the function returns."""
         digests = {}
         for name in names:
             with self.open(name) as file:

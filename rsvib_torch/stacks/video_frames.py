@@ -18,28 +18,18 @@ from rsvib_torch.restoration.restore import METHODS, restore_prepared
 from rsvib_torch.stacks.video_tracks import FrameTrack
 from rsvib_torch.tracking import Margins
 
-__all__ = ["FrameLayout", "RestoredFrame", "VideoRestorer"]
-
 Frame = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """How the pixels of a frame are stored.
+    """How the pixels of a frame are stored."""
 
-    Attributes:
-        shape: (H, W) or (C, H, W) of the pixels.
-        planar: Whether a frame is the planes Y, U and V of a 4:2:0 video (``PlaneReader``), instead of pixels.
-        full_scale: Count that corresponds to 1.0; None for floats.
-        white: Count from which pixels are saturated; None for none.
-        dtype: Data type of the counts.
-    """
-
-    shape: tuple[int, ...]
-    planar: bool
-    full_scale: float | None
-    white: float | None
-    dtype: np.dtype[Any]
+    shape: tuple[int, ...]  # (H, W) or (C, H, W) of the pixels
+    planar: bool  # whether a frame is the planes Y, U and V of a 4:2:0 video (``PlaneReader``), instead of pixels
+    full_scale: float | None  # count that corresponds to 1.0; None for floats
+    white: float | None  # count from which pixels are saturated; None for none
+    dtype: np.dtype[Any]  # data type of the counts
 
     @property
     def size(self) -> tuple[int, int]:

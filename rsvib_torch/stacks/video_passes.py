@@ -31,8 +31,6 @@ from rsvib_torch.stacks.video_tracks import FrameTrack, followed
 from rsvib_torch.tracking import Margins, VibrationTracker
 from rsvib_torch.tracking.steadying import steadied
 
-__all__ = ["PART_FRAMES", "VideoPasses"]
-
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
 _JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 _AHEAD = 4  # frames decoded, and frames tracked, before they are used
@@ -42,25 +40,15 @@ Frame = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class VideoPasses:
-    """What the passes through a video have in common: how frames are read, tracked, steadied, judged and recorded.
+    """What the passes through a video have in common: how frames are read, tracked, steadied, judged and recorded."""
 
-    Attributes:
-        job: Source and settings.
-        layout: Layout of the frames.
-        restorer: Restores them.
-        starts: s, exposure start of every frame, from the first one.
-        steady: As in ``process_video``.
-        columns: As in ``process_video``.
-        window: As in ``process_video``.
-    """
-
-    job: StackJob
-    layout: FrameLayout
-    restorer: VideoRestorer
-    starts: list[float]
-    steady: float
-    columns: int | None
-    window: int
+    job: StackJob  # source and settings
+    layout: FrameLayout  # layout of the frames
+    restorer: VideoRestorer  # restores them
+    starts: list[float]  # s, exposure start of every frame, from the first one
+    steady: float  # as in ``process_video``
+    columns: int | None  # as in ``process_video``
+    window: int  # as in ``process_video``
 
     @property
     def parts(self) -> int:
@@ -120,12 +108,7 @@ class VideoPasses:
                 yield pickle.load(found), frame  # written by this process to a file without a name
 
     def margins(self, found: BinaryIO, progress: Callable[[], None]) -> Margins:
-        """The widest margins of all frames, from a pass that only follows the motion.
-
-        Args:
-            found: File to which the tracks are written.
-            progress: Called for every frame.
-        """
+        """The widest margins of all frames, from a pass that only follows the motion and writes the tracks."""
         widest = Margins()
         with closing(self.tracked()) as tracks:
             for track, _ in tracks:

@@ -13,31 +13,20 @@ from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.tracking.tracker import VibrationTracker
 
-__all__ = ["FrameTrack", "followed"]
-
 _OPPOSITE: dict[str, Literal["forward", "reverse"]] = {"forward": "reverse", "reverse": "forward"}
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTrack:
-    """What is known of a frame of a video.
+    """What is known of a frame of a video."""
 
-    Attributes:
-        index: Number of the frame.
-        time: s, exposure start of its first row, from the first frame.
-        motion: The motion to remove, in image axes; its time origin is the middle of the frame.
-        path: (2,) px, place on the path of the image motion; NaN if it is not known.
-        known: Whether the motion is known.
-        fault: Why the frame could not be used; None if it was used.
-        detection: The vibration at this frame, with the time origin at its first row; None if it is not known.
-    """
-
-    index: int
-    time: float
-    motion: Vibration
-    path: Tensor
-    known: bool
-    fault: str | None = None
+    index: int  # number of the frame
+    time: float  # s, exposure start of its first row, from the first frame
+    motion: Vibration  # the motion to remove, in image axes; its time origin is the middle of the frame
+    path: Tensor  # (2,) px, place on the path of the image motion; NaN if it is not known
+    known: bool  # whether the motion is known
+    fault: str | None = None  # why the frame could not be used; None if it was used
+    # the vibration at this frame, with the time origin at its first row; None if it is not known
     detection: DetectionResult | None = None
 
     def moved_to(self, place: Tensor) -> "FrameTrack":
@@ -52,17 +41,10 @@ def followed(
 ) -> Iterator[tuple[FrameTrack, Any]]:
     """Follow the vibration through a video.
 
-    It is known after a few frames. Those before are followed backwards in time, from frames behind them: the reversed
-    video is that of a sensor which reads its rows in the opposite direction.
-
-    Args:
-        frames: Number, start time in s, pixels to track or the reason why they cannot be used, and anything that
-            belongs to the frame.
-        tracker: A new tracker.
-        reports: Whether a frame of this number gets its detection.
-
-    Yields:
-        What is known of every frame, and what belongs to it.
+    A frame is its number, its start in s, pixels to track or the reason why they cannot be used, and anything that
+    belongs to it. The motion is known after a few frames. Those before are followed backwards in time, from frames
+    behind them: the reversed video is that of a sensor which reads its rows in the opposite direction. ``reports``
+    selects frames that get their detection.
     """
     first: deque[_Given] = deque()  # frames before the motion is known, and a window behind them
     start: int | None = None  # number of the first frame whose motion is known

@@ -35,8 +35,6 @@ from rsvib_torch.restoration.restore import check_optics, restore_prepared, unch
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
-__all__ = ["RestoredFrames", "frame_fault", "restore_block", "restore_trusted", "without_data"]
-
 
 @dataclass(frozen=True, eq=False)
 class RestoredFrames:
@@ -125,15 +123,7 @@ def frame_fault(
     nodata: float | None = None,
     valid_fraction: float = 0.1,
 ) -> str | None:
-    """Why a frame cannot be used, or None.
-
-    Args:
-        frame: Pixels as stored.
-        index: Index of the frame in the stack, for the message.
-        full_scale: Count that corresponds to 1.0; not used for floats.
-        nodata: Value of pixels without data.
-        valid_fraction: Smallest fraction of pixels that must have data, which are not NaN.
-    """
+    """Why a frame as stored cannot be used, or None; the fraction ``valid_fraction`` of its pixels must have data."""
     is_float = frame.dtype.kind == "f"
     valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
     valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size

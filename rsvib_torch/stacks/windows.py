@@ -8,8 +8,6 @@ import torch
 from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["Window", "cut_windows", "window_timing"]
-
 
 @dataclass(frozen=True)
 class Window:
@@ -72,13 +70,7 @@ def cut_windows(num_frames: int, window: int) -> list[Window]:
 
 
 def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> SensorTiming:
-    """Timing of some frames of a window as a separate stack, with the time origin at the window's first frame.
-
-    Args:
-        timing: Timing of the whole stack.
-        window: The window.
-        frames: Indices of its usable frames.
-    """
+    """Timing of the usable ``frames`` of a window as a stack, with the time origin at the first frame of the window."""
     if timing.frame_start_times is None and frames == list(window.frames):
         return timing
     starts = timing.frame_starts(window.last + 1)

@@ -98,9 +98,6 @@ class Repeated:
                 time.sleep(wait)
             yield TimedFrame(self.pixels[index % len(self.pixels)], index / RATE, time.perf_counter())
 
-    def close(self) -> None:
-        """Nothing is open."""
-
 
 @dataclass
 class Output:
@@ -114,7 +111,7 @@ class Output:
         if self.kept.start is not None and self.kept.start <= index < self.kept.stop:
             self.frames.append(frame)
 
-    def close(self, *, complete: bool) -> None:
+    def close(self) -> None:
         """Nothing is open."""
 
 

@@ -47,7 +47,7 @@ def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
 
 def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
     with clip.with_suffix(".raw8").open("rb") as source:
-        monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=source))
+        monkeypatch.setattr("sys.stdin", SimpleNamespace(fileno=source.fileno))
         assert rsvib("live", "-", *CAMERA, "--size", f"{SIZE}x{SIZE}", "--out", "-") == 0
     shown = capfdbinary.readouterr()
     frames = np.frombuffer(shown.out, np.uint8).reshape(-1, SIZE, SIZE) / 255

@@ -1,6 +1,9 @@
 """Sources, outputs, page and spectrogram of live sessions."""
 
 import io
+import os
+import resource
+import signal
 import threading
 import time
 import urllib.error
@@ -45,13 +48,13 @@ class Numbers:
     error: Exception | None = None
 
     def frames(self):
-        for index in range(self.count):
-            yield live.TimedFrame(np.full((1, 1), float(index)), index / 30, time.perf_counter())
-        if self.error is not None:
-            raise self.error
-
-    def close(self):
-        self.closed = True
+        try:
+            for index in range(self.count):
+                yield live.TimedFrame(np.full((1, 1), float(index)), index / 30, time.perf_counter())
+            if self.error is not None:
+                raise self.error
+        finally:
+            self.closed = True
 
 
 def values(reader):
@@ -124,7 +127,6 @@ def test_a_camera_at_an_address():
     try:
         source = live.CameraSource(f"http://127.0.0.1:{server.server_address[1]}/video.mjpg", TIMING)
         frames = list(source.frames())
-        source.close()
     finally:
         server.shutdown()
         server.server_close()
@@ -137,7 +139,7 @@ def test_a_camera_at_an_address():
     assert numbers[-1] == pytest.approx(len(frames) - 1 + source.lost)
     assert np.diff(numbers).min() > 0.99
     with pytest.raises(OSError, match="cannot be opened; check its number or URL"):
-        live.CameraSource("http://127.0.0.1:1/none", TIMING)
+        next(live.CameraSource("http://127.0.0.1:1/none", TIMING).frames())
 
 
 def test_the_page_is_served_to_this_machine_only():
@@ -162,7 +164,7 @@ def test_the_page_is_served_to_this_machine_only():
         assert b"image/jpeg" in head
         assert b"\xff\xd8\xff" in head  # the first bytes of a JPEG image
     finally:
-        page.close(complete=True)
+        page.close()
 
 
 @pytest.mark.parametrize("ending", [".mp4", ".mkv"])
@@ -173,8 +175,8 @@ def test_video_files(tmp_path, ending):
     output = live.VideoOutput(tmp_path / f"video{ending}", 30.0)
     for index, frame in zip((0, 1, 2, 5, 6), frames, strict=True):  # two are missing
         output.write(frame, index)
-    assert not (tmp_path / f"video{ending}").exists()
-    output.close(complete=True)
+    assert len(rsv.read_stack(tmp_path / f"video{ending}")) >= 3  # it can be read while it is written
+    output.close()
     info = rsv.read_stack_info(tmp_path / f"video{ending}")
     assert info.shape == (5, 3, 32, 48)
     assert np.diff(info.frame_times) == pytest.approx(np.array([1, 1, 3, 1]) / 30, abs=2e-3)
@@ -183,11 +185,22 @@ def test_video_files(tmp_path, ending):
     assert np.abs(read.mean((1, 2, 3)) - frames.mean((1, 2, 3))).max() < tolerance
 
 
-def test_an_incomplete_video_leaves_no_file(tmp_path):
-    output = live.VideoOutput(tmp_path / "video.mp4", 30.0)
-    output.write(np.zeros((32, 32), np.uint8), 0)
-    output.close(complete=False)
-    assert list(tmp_path.iterdir()) == []
+def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
+    path, frame = tmp_path / "video.mkv", np.zeros((32, 32), np.uint8)
+    output = live.VideoOutput(path, 30.0)
+    assert not path.exists()  # it is created with the first frame
+    output.close()
+    path.write_bytes(b"created during the session")
+    with pytest.raises(FileExistsError, match=r"video\.mkv was created by another program"):
+        output.write(frame, 0)
+    assert path.read_bytes() == b"created during the session"
+    path.rename(tmp_path / "other")
+    path.symlink_to(tmp_path / "other")
+    output = live.VideoOutput(path, 30.0, overwrite=True)
+    output.write(frame, 0)
+    output.close()
+    assert rsv.read_stack_info(path).shape == (1, 32, 32)
+    assert (tmp_path / "other").read_bytes() == b"created during the session"
     with pytest.raises(ValueError, match=r"a live video is written to \.mp4"):
         live.VideoOutput(tmp_path / "video.gif", 30.0)
 
@@ -247,6 +260,43 @@ def test_the_memory_of_the_spectrogram_is_bounded():
     assert len(spectrogram.result()[0]) <= 9
 
 
+def test_a_full_disk_is_named_and_leaves_the_frames_before(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    frames = list(np.random.default_rng(0).integers(0, 256, (64, 64, 64), np.uint8))  # 5 kB each
+    for ending in (".mkv", ".mp4"):
+        output = live.VideoOutput(path := tmp_path / f"video{ending}", 30.0)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+        try:
+            with pytest.raises(OSError, match=f"video{ending}: File too large; the video has the frames before"):
+                list(map(output.write, frames, range(64)))
+            output.close()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert rsv.read_stack_info(path).shape[0] > 4
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_end_a_session(tmp_path, number):
+    output, before = live.VideoOutput(tmp_path / "video.mkv", 30.0), signal.getsignal(number)
+
+    def end(tracked, report):
+        if round(tracked.time * 30) == 5:
+            signal.raise_signal(number)
+            signal.raise_signal(number)  # a second one does not end the process
+
+    report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end)
+    assert report.frames == len(rsv.read_stack(tmp_path / "video.mkv")) == 6
+    assert signal.getsignal(number) == before
+
+
+def test_the_end_of_a_reader_ends_a_session():
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb", buffering=0) as stream:
+        report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [live.PipeOutput(stream)], drops=False)
+    assert report.frames == 0
+
+
 class Broken:
     """An output that cannot write."""
 
@@ -255,8 +305,8 @@ class Broken:
     def write(self, frame, index):
         raise OSError("disk full")
 
-    def close(self, *, complete):
-        self.closed = complete
+    def close(self):
+        self.closed = True
 
 
 def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
@@ -282,9 +332,6 @@ class Shaking:
             time.sleep(max(0.0, begin + index * TIMING.frame_period - time.perf_counter()))
             yield live.TimedFrame(pixels, index * TIMING.frame_period, time.perf_counter())
 
-    def close(self):
-        pass
-
 
 class SlowTracker(rsv.VibrationTracker):
     """A tracker that needs 1.2 frame periods to measure a frame."""
@@ -309,5 +356,5 @@ def test_an_error_of_an_output_ends_the_session(tmp_path):
     source, output = Numbers(), Broken()
     with pytest.raises(OSError, match="disk full"):
         live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
-    assert output.closed is False
+    assert output.closed
     assert source.closed

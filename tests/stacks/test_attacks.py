@@ -2,6 +2,7 @@
 
 Runs are killed at any call, lose what was not synchronised, are resumed with damaged parts and journals, on full disks,
 with links in place of their files, beside others, with workers that die, and with outputs that are their inputs.
+Recordings of a camera end by signals, on full disks, and without a reader.
 docs/reliability.md has the numbers of many more trials.
 """
 
@@ -18,6 +19,7 @@ ATTACKS = {
     "journals": (16, 0.0),
     "kills": (9, 1.0),
     "links": (16, 0.0),
+    "live_sessions": (5, 0.0),
     "power_losses": (9, 1.0),
 }
 

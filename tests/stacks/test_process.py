@@ -128,7 +128,7 @@ def test_stack_is_restored_with_detections_of_an_earlier_run(place, tmp_path):
 
 
 def test_unknown_options_are_refused(place, tmp_path):
-    with pytest.raises(TypeError, match="unknown option 'windows'; the options are detection, device, force"):
+    with pytest.raises(TypeError, match="unknown option 'windows'; the options are full_scale, memory, workers"):
         next(rsv.iterate_stack(place / "frames.tif", TIMING, windows=3))
     with pytest.raises(TypeError, match="unknown option 'force'"):
         detect_stack(place / "frames.tif", tmp_path / "manifest.json", TIMING, force=True)

@@ -43,8 +43,6 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import BandOptions, MaskedInputOptions, Registration, RegistrationOptions
 
-__all__ = ["AlignOptions", "ClockAlignment", "FittedClock", "align_motion", "best_offset", "fit_clock"]
-
 P = ParamSpec("P")
 
 
@@ -71,13 +69,11 @@ class ClockAlignment(
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
-        >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px
-        >>> motion = rsv.FreeMotion.from_samples(times, path)
-        >>> frames = rsv.simulate_frames(city_and_fields(260, 220, seed=3), timing, motion, num_frames=3)
-        >>> found = rsv.align_motion(frames, timing, motion, offsets=(-0.004, 0.004))
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
+        >>> times = torch.linspace(0.0, 0.05, 101, dtype=torch.float64)
+        >>> recorded = rsv.FreeMotion.from_samples(times, vibration.displacement(times))
+        >>> found = rsv.align_motion(frames, timing, recorded, offsets=(-0.004, 0.004))
         >>> abs(found.offset) < 1e-4  # s: the clocks agree
         True
     """

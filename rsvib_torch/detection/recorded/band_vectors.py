@@ -17,44 +17,26 @@ from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import RegistrationOptions
 
-__all__ = ["BandVectors", "band_vectors"]
-
 
 @dataclass(frozen=True, eq=False)
 class BandVectors:
-    """Displacements of M parts of bands, on the CPU in float64, in image axes.
+    """Displacements of M parts of bands, on the CPU in float64, in image axes."""
 
-    Attributes:
-        pair: (M,) index of the pair of frames.
-        row: (M,) index of the band.
-        location: (M,) index of the part of the band: the same place in all pairs.
-        starts: (M, 2) s, exposure starts of the first rows of both frames.
-        rows: (M, 2) row times from there to the rows that contain the part, in both frames.
-        place: (M, 2) px from the centre of the frame, (x, y) in the earlier frame.
-        offsets: (M, 2) px, (x, y).
-        weight: (M,) inverse variances up to a common factor: signal to noise, q / (1 - q) for a correlation q.
-        shape: (M, 2, 2) structure of the detail with trace 2: edges along one direction determine one component only.
-        radius: px, root-mean-square distance of the pixels from the centre.
-        num_pairs: Pairs of frames.
-        num_rows: Bands of a frame.
-        num_columns: Parts of a band.
-        overlap: Rows of a band over those from one band to the next, at least 1.
-    """
-
-    pair: Tensor
-    row: Tensor
-    location: Tensor
-    starts: Tensor
-    rows: Tensor
-    place: Tensor
-    offsets: Tensor
-    weight: Tensor
+    pair: Tensor  # (M,) index of the pair of frames
+    row: Tensor  # (M,) index of the band
+    location: Tensor  # (M,) index of the part of the band: the same place in all pairs
+    starts: Tensor  # (M, 2) s, exposure starts of the first rows of both frames
+    rows: Tensor  # (M, 2) row times from there to the rows that contain the part, in both frames
+    place: Tensor  # (M, 2) px from the centre of the frame, (x, y) in the earlier frame
+    offsets: Tensor  # (M, 2) px, (x, y)
+    weight: Tensor  # (M,) inverse variances up to a common factor: signal to noise, q / (1 - q) for a correlation q
+    # (M, 2, 2) structure of the detail with trace 2: edges along one direction determine one component only
     shape: Tensor
-    radius: float
-    num_pairs: int
-    num_rows: int
-    num_columns: int
-    overlap: float
+    radius: float  # px, root-mean-square distance of the pixels from the centre
+    num_pairs: int  # pairs of frames
+    num_rows: int  # bands of a frame
+    num_columns: int  # parts of a band
+    overlap: float  # rows of a band over those from one band to the next, at least 1
 
     def times(self, row_time: float) -> Tensor:
         """(M, 2) s, exposure starts of the part in both frames."""
@@ -69,13 +51,7 @@ class BandVectors:
 def band_vectors(stack: GreyFrames, timing: SensorTiming, options: RegistrationOptions) -> BandVectors:
     """Register the bands of consecutive frames of one stack in parts of their columns.
 
-    Args:
-        stack: The frames.
-        timing: The sensor.
-        options: Registration of the bands.
-
-    Raises:
-        ValueError: If frames are too small for two parts, or fewer than a tenth of the bands are found.
+    An error is raised if frames are too small for two parts, or fewer than a tenth of the bands are found.
     """
     height, width = stack.images.shape[-2:]
     narrowest = 4 * (options.search + 8)

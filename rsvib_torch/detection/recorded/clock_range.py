@@ -4,8 +4,6 @@ from typing import Protocol
 
 from rsvib_torch.core.checks import check_number
 
-__all__ = ["offset_range"]
-
 
 class _Recording(Protocol):
     @property

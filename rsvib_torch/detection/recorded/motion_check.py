@@ -29,8 +29,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OffsetOptions
 
-__all__ = ["MotionCheck", "check_motion"]
-
 _MIN_CHANGE = 0.05  # px, registration errors of bands
 
 P = ParamSpec("P")
@@ -56,10 +54,8 @@ class MotionCheck(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> print(rsv.check_motion(frames, timing, vibration))
         axis  offset between frames (px rms)  without the motion (px rms)
         x     2.36                            0.0661
@@ -122,10 +118,8 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> check = rsv.check_motion(frames, timing, vibration)
         >>> check.helps, bool((check.after < 0.2 * check.before).all())
         (True, True)

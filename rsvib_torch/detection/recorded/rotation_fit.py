@@ -29,8 +29,6 @@ from rsvib_torch.detection.recorded.rotation_search import MIN_FOCAL_LENGTH, ori
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
-__all__ = ["NAMES", "RotationFit", "RotationModel", "components_of", "fit_robustly"]
-
 NAMES = ("bias x", "bias y", "bias z", "at", "scale", "focal length", "row time")
 _STEPS = 8  # of Gauss-Newton in a round of weighting; it converges within 4 and stops when no parameter changes
 
@@ -45,23 +43,14 @@ def components_of(rates: AngularRates, orientation: str, parameters: Tensor, tim
 
 @dataclass(frozen=True, eq=False)
 class RotationModel:
-    """What the displacements depend on besides the parameters of the fit.
+    """What the displacements depend on besides the parameters of the fit."""
 
-    Attributes:
-        vectors: The measurements.
-        rates: The recording.
-        orientation: Name of the assignment of the axes.
-        camera: Principal point and lens; its focal length is a parameter of the fit.
-        exposure_time: s.
-        middle: s, mid-time of the frames.
-    """
-
-    vectors: BandVectors
-    rates: AngularRates
-    orientation: str
-    camera: Camera
-    exposure_time: float
-    middle: float
+    vectors: BandVectors  # the measurements
+    rates: AngularRates  # the recording
+    orientation: str  # name of the assignment of the axes
+    camera: Camera  # principal point and lens; its focal length is a parameter of the fit
+    exposure_time: float  # s
+    middle: float  # s, mid-time of the frames
 
     def predicted(self, parameters: Tensor) -> Tensor:
         """Displacements (M, 2) in px for parameters (7,) in the order of ``NAMES``."""
@@ -94,27 +83,16 @@ class RotationModel:
 
 @dataclass(frozen=True, eq=False)
 class _Errors:
-    """Covariance of the displacements.
+    """Covariance of the displacements."""
 
-    Attributes:
-        weight: (M,) weights of the parts, 0 for those that do not follow the gyroscope.
-        shape: (M, 2, 2) structure of the detail of the parts, with trace 2.
-        sigma: px, standard deviation of a part of weight 1.
-        spread: (3,) px, standard deviation of X, Y and radius theta of the pairs.
-        parallax: Standard deviation of m.
-        direction: (3,) unit vector of the translation.
-        lines: (M, 2) px, s.
-        turned: (M, 2, 2) px, s for the two unit vectors perpendicular to the direction.
-    """
-
-    weight: Tensor
-    shape: Tensor
-    sigma: float
-    spread: Tensor
-    parallax: float
-    direction: Tensor
-    lines: Tensor
-    turned: Tensor
+    weight: Tensor  # (M,) weights of the parts, 0 for those that do not follow the gyroscope
+    shape: Tensor  # (M, 2, 2) structure of the detail of the parts, with trace 2
+    sigma: float  # px, standard deviation of a part of weight 1
+    spread: Tensor  # (3,) px, standard deviation of X, Y and radius theta of the pairs
+    parallax: float  # standard deviation of m
+    direction: Tensor  # (3,) unit vector of the translation
+    lines: Tensor  # (M, 2) px, s
+    turned: Tensor  # (M, 2, 2) px, s for the two unit vectors perpendicular to the direction
 
     @property
     def information(self) -> Tensor:
@@ -127,27 +105,16 @@ class _Errors:
 
 @dataclass(frozen=True, eq=False)
 class RotationFit:
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes:
-        model: What was fitted.
-        parameters: (7,) in the order of ``NAMES``.
-        covariance: (7, 7), 0 for parameters that were not free.
-        residual: (M, 2) px.
-        errors: Their covariance.
-        wide: The same, larger by the correlation of neighbours, from which ``covariance`` and ``cost`` follow.
-        effects: (P, 3) px, X, Y and radius theta of every pair that the gyroscope does not explain.
-        cost: Sum of squares over their variance.
-    """
-
-    model: RotationModel
-    parameters: Tensor
-    covariance: Tensor
-    residual: Tensor
-    errors: _Errors
-    wide: _Errors
-    effects: Tensor
-    cost: float
+    model: RotationModel  # what was fitted
+    parameters: Tensor  # (7,) in the order of ``NAMES``
+    covariance: Tensor  # (7, 7), 0 for parameters that were not free
+    residual: Tensor  # (M, 2) px
+    errors: _Errors  # their covariance
+    wide: _Errors  # the same, larger by the correlation of neighbours, from which ``covariance`` and ``cost`` follow
+    effects: Tensor  # (P, 3) px, X, Y and radius theta of every pair that the gyroscope does not explain
+    cost: float  # sum of squares over their variance
 
     def rows_rms(self) -> Tensor:
         """(3,) px, rms X, Y and radius theta of single bands that the gyroscope does not explain."""
@@ -389,14 +356,7 @@ def _estimated(
 
 
 def fit_robustly(model: RotationModel, start: Tensor, free: Sequence[bool], rounds: int = 8) -> RotationFit:
-    """Fit the free parameters; parts of bands that do not follow the gyroscope have no weight.
-
-    Args:
-        model: What to fit.
-        start: (7,) start values.
-        free: Which parameters are fitted.
-        rounds: Rounds of weighting and fitting.
-    """
+    """Fit the ``free`` of (7,) parameters; parts of bands that do not follow the gyroscope have no weight."""
     vectors, parameters = model.vectors, start
     residual = vectors.offsets - model.predicted(start)
     none = torch.zeros(3, dtype=torch.float64)

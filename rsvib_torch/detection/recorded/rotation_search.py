@@ -17,8 +17,6 @@ from torch import Tensor
 from rsvib_torch.detection.recorded.band_vectors import BandVectors
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
-__all__ = ["MIN_FOCAL_LENGTH", "ORIENTATIONS", "OrientationSearch", "orientation_matrix", "search_orientations"]
-
 MIN_FOCAL_LENGTH = 10.0  # px; the result is that of no motion, and refused
 
 
@@ -47,23 +45,15 @@ MIRRORED = tuple(name for name in _ALL if name not in ORIENTATIONS)
 
 @dataclass(frozen=True)
 class OrientationSearch:
-    """Least sums of squares of each orientation.
+    """Least sums of squares of each orientation."""
 
-    Attributes:
-        names: Orientations, best first.
-        costs: Their least weighted sums of squares.
-        offsets: Offset of the clock in s of each.
-        focal_lengths: Focal length in px of each.
-        other_offset: Another local minimum of the best orientation below twice its least; None if there is none.
-        mirrored: Whether a mirrored orientation has a sum below half of the least.
-    """
-
-    names: tuple[str, ...]
-    costs: tuple[float, ...]
-    offsets: tuple[float, ...]
-    focal_lengths: tuple[float, ...]
+    names: tuple[str, ...]  # orientations, best first
+    costs: tuple[float, ...]  # their least weighted sums of squares
+    offsets: tuple[float, ...]  # offset of the clock in s of each
+    focal_lengths: tuple[float, ...]  # focal length in px of each
+    # another local minimum of the best orientation below twice its least; None if there is none
     other_offset: float | None
-    mirrored: str | None
+    mirrored: str | None  # whether a mirrored orientation has a sum below half of the least
 
 
 def search_orientations(
@@ -75,16 +65,9 @@ def search_orientations(
     limits: tuple[float, float],
     focal_length: float | None,
 ) -> OrientationSearch:
-    """Least sums of squares of the components of all bands over offsets within ``limits``.
+    """Least sums of squares of the components of all bands, with weights (M,), over offsets within ``limits`` in s.
 
-    Args:
-        vectors: Displacements.
-        weight: (M,) their weights.
-        rates: The recording.
-        row_time: s.
-        exposure_time: s.
-        limits: Smallest and largest offset in s.
-        focal_length: px; None if it is not known.
+    The focal length in px may be unknown.
     """
     components, weights, first, last = _bands(vectors, weight, row_time, exposure_time)
     every = max(1, len(first) // 1500)  # 1500 bands are enough for a start

@@ -17,57 +17,36 @@ from rsvib_torch.core.splines import bspline_weights
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces
 from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
 
-__all__ = ["SplineRowTime", "row_time_of_splines"]
-
 DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
 GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wider for motions that are accepted
 
 
 @dataclass(frozen=True, eq=False)
 class SplineRowTime:
-    """Row time of a spline fit.
+    """Row time of a spline fit."""
 
-    Attributes:
-        row_time: Seconds, negative for a reverse readout.
-        std: Its standard deviation.
-        others: Other row times at which a spline with as few knots explains the displacements.
-        spacing: Seconds between knots.
-    """
-
-    row_time: float
-    std: float
-    others: tuple[Candidate, ...]
-    spacing: float
+    row_time: float  # seconds, negative for a reverse readout
+    std: float  # its standard deviation
+    others: tuple[Candidate, ...]  # other row times at which a spline with as few knots explains the displacements
+    spacing: float  # seconds between knots
 
 
 @dataclass(frozen=True, eq=False)
 class _Evaluation:
-    """Weighted least squares of a spline at one row time.
+    """Weighted least squares of a spline at one row time."""
 
-    Attributes:
-        chi_square: Weighted square of the residuals.
-        parameters: Number of coefficients of both axes.
-        step: Gauss-Newton step of the row time in s, with the coefficients fitted again.
-        information: Inverse variance of the row time, for measurements of unit variance.
-    """
-
-    chi_square: float
-    parameters: int
-    step: float
-    information: float
+    chi_square: float  # weighted square of the residuals
+    parameters: int  # number of coefficients of both axes
+    step: float  # Gauss-Newton step of the row time in s, with the coefficients fitted again
+    information: float  # inverse variance of the row time, for measurements of unit variance
 
 
 def row_time_of_splines(
     places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
 ) -> SplineRowTime | None:
-    """Row time at which the fewest knots explain the displacements; None if no smooth motion does.
+    """Row time from ``low`` to ``high`` s at which the fewest knots explain the displacements; None if no motion does.
 
-    Args:
-        places: Displacements of rows, from the top of the image, and their frames.
-        num_rows: Rows of a frame.
-        low: Shortest row time in s.
-        high: Longest row time in s.
-        directions: Possible readout directions, 1.0 and -1.0.
+    ``places`` are rows from the top of the image; readout directions are 1.0 and -1.0.
     """
     problem = _Problem.of(places, num_rows, high)
     count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
@@ -107,17 +86,11 @@ def row_time_of_splines(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Displacements of both axes.
+    """Displacements of both axes."""
 
-    Attributes:
-        records: Of x and y.
-        period: Frame period in s.
-        known: Number of independent measurements.
-    """
-
-    records: tuple[RowRecord, RowRecord]
-    period: float
-    known: float
+    records: tuple[RowRecord, RowRecord]  # of x and y
+    period: float  # frame period in s
+    known: float  # number of independent measurements
 
     @classmethod
     def of(cls, places: FramePlaces, num_rows: int, row_time: float) -> "_Problem":

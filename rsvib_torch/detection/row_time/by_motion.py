@@ -30,8 +30,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OffsetOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["RowTimeOptions", "calibrate_row_time_by_motion"]
-
 P = ParamSpec("P")
 
 MAX_RELATIVE_STD = 0.01  # of the row time; frequencies and the distortion of frames have the same relative error

@@ -16,8 +16,6 @@ from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.motion.spline import FreeMotion
 
-__all__ = ["row_time_of_recording"]
-
 
 def row_time_of_recording(
     places: FramePlaces,
@@ -28,18 +26,10 @@ def row_time_of_recording(
     offsets: tuple[float, float] | None,
     fit_gain: bool,
 ) -> RowTimeFit:
-    """Row time at which the recorded motion explains the displacements of the rows.
+    """Row time at which the recorded motion, its axes in row order, explains the displacements of the rows.
 
-    Offset and rate of the clock, drift and (on request) gain are fitted together with the row time, from starts at
-    many row times. Rows are counted from the middle one, whose time determines the offset whatever the row time is.
-
-    Args:
-        places: Displacements of rows, from the top of the image, and their frames.
-        recorded: The motion on its own clock, its axes in row order.
-        clock: What is known about the camera.
-        num_frames: Frames of the stack.
-        offsets: Smallest and largest offset in s, of the middle row of frame 0.
-        fit_gain: Whether to fit a factor of each axis.
+    Offset and rate of the clock, drift and (on request) gain are fitted together with the row time, from starts at many
+    row times. Rows are counted from the middle one, whose time determines the offset whatever the row time is.
     """
     half = 0.5 * (clock.num_rows - 1)
     places = replace(places, rows=places.rows - half)

@@ -34,30 +34,19 @@ from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["CameraClock", "RowTimeFit", "bands_of_frames", "row_time_of_tones"]
-
 MAX_STARTS = 5  # row times that are tried; of 8 random pairs of `benchmark.py --only row_time`, 2 need a second
 
 
 @dataclass(frozen=True)
 class CameraClock:
-    """What is known about the timing of a camera.
+    """What is known about the timing of a camera."""
 
-    Attributes:
-        period: Frame period in s.
-        num_rows: Rows of a frame.
-        low: Shortest possible row time in s.
-        high: Longest possible row time in s.
-        directions: Possible readout directions: 1.0 forward, -1.0 reverse.
-        exposure_time: In s; None if unknown.
-    """
-
-    period: float
-    num_rows: int
-    low: float
-    high: float
-    directions: tuple[float, ...]
-    exposure_time: float | None
+    period: float  # frame period in s
+    num_rows: int  # rows of a frame
+    low: float  # shortest possible row time in s
+    high: float  # longest possible row time in s
+    directions: tuple[float, ...]  # possible readout directions: 1.0 forward, -1.0 reverse
+    exposure_time: float | None  # in s; None if unknown
 
     def timing(self, row_time: float, exposure_time: float | None = None) -> RowTiming:
         """Timing in row order with a row time, whose sign is its direction."""
@@ -72,23 +61,14 @@ class CameraClock:
 
 @dataclass(frozen=True, eq=False)
 class RowTimeFit:
-    """Row time of the frames of one stack.
+    """Row time of the frames of one stack."""
 
-    Attributes:
-        row_time: Seconds, negative for a reverse readout.
-        std: Its standard deviation.
-        others: Other row times that explain the frames as well.
-        exposure_time: In s, measured from the blur; None if it was not.
-        exposure_std: Its standard deviation.
-        findings: Reasons why the row time is not certain.
-    """
-
-    row_time: float
-    std: float
-    others: tuple[Candidate, ...]
-    exposure_time: float | None
-    exposure_std: float | None
-    findings: tuple[Reason, ...]
+    row_time: float  # seconds, negative for a reverse readout
+    std: float  # its standard deviation
+    others: tuple[Candidate, ...]  # other row times that explain the frames as well
+    exposure_time: float | None  # in s, measured from the blur; None if it was not
+    exposure_std: float | None  # its standard deviation
+    findings: tuple[Reason, ...]  # reasons why the row time is not certain
 
 
 def turned(stack: GreyFrames, direction: float) -> GreyFrames:
@@ -115,17 +95,11 @@ def bands_of_frames(
 def row_time_of_tones(
     stack: GreyFrames, clock: CameraClock, options: RegistrationOptions, places: FramePlaces
 ) -> RowTimeFit | None:
-    """Row time from the tones in the motion; None if there is no tone.
+    """Row time from the tones in the motion of one stack in image order; None if there is no tone.
 
     The tones of the offsets of the bands, with independent frequencies per row and per frame, give the possible row
     times. With one of them, rows are measured directly, and the row time is fitted with all tones. The measured
     displacements then give the possible row times once more, with a hundred times smaller errors.
-
-    Args:
-        stack: One stack, its rows from the top of the image.
-        clock: What is known.
-        options: Registration of the bands.
-        places: The bands of ``bands_of_frames``.
     """
     highest = 0.5 / options.band_step
     tones = [find_row_tones(places.of_axis(axis, clock.num_rows, clock.high), highest) for axis in range(2)]

@@ -16,24 +16,15 @@ from rsvib_torch.detection.row_time.row_tones import RowRecord
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, fit_tones, motion_of_fit, residual_of
 from rsvib_torch.motion.motion import Motion
 
-__all__ = ["FramePlaces", "fit_row_time", "row_time_columns", "rows_of_frames"]
-
 
 @dataclass(frozen=True, eq=False)
 class FramePlaces:
-    """Frame rows and frames of measurements of one stack, from which their times follow for any row time.
+    """Frame rows and frames of measurements of one stack, from which their times follow for any row time."""
 
-    Attributes:
-        measurements: The displacements (B = 1); their times are replaced.
-        rows: (1, N, G) frame rows.
-        frames: (1, N, G) indices of the frames.
-        period: Frame period in s.
-    """
-
-    measurements: Measurements
-    rows: Array
-    frames: Array
-    period: float
+    measurements: Measurements  # the displacements (B = 1); their times are replaced
+    rows: Array  # (1, N, G) frame rows
+    frames: Array  # (1, N, G) indices of the frames
+    period: float  # frame period in s
 
     def timed(self, row_time: float) -> Measurements:
         """The measurements with the times of a row time in s."""
@@ -55,14 +46,7 @@ class FramePlaces:
 
 
 def rows_of_frames(measured: Measurements, period: float, row_time: float, num_rows: int) -> FramePlaces:
-    """Frame rows of measurements that were timed with a row time.
-
-    Args:
-        measured: Of one stack.
-        period: Frame period in s.
-        row_time: The row time in s of these times.
-        num_rows: Rows of a frame.
-    """
+    """Frame rows of measurements of one stack that were timed with a row time in s."""
     blank = 0.5 * (period - num_rows * row_time)  # rows up to half of the blanking outside of a frame are its rows
     frames = np.floor((measured.exposure_starts + blank) / period)
     return FramePlaces(measured, (measured.exposure_starts - frames * period) / row_time, frames, period)
@@ -80,14 +64,8 @@ def fit_row_time(
 ) -> tuple[float, float, ToneFit]:
     """Gauss-Newton on the row time, with all tones fitted again in every step.
 
-    Args:
-        places: The measurements, with the weights of a robust fit.
-        row_time: Start in s.
-        fit: Tones that were fitted with it.
-        iterations: At most.
-
-    Returns:
-        Row time in s, its standard deviation, and the tones.
+    The measurements have the weights of a robust fit. The result is the row time in s, its standard deviation, and the
+    tones.
     """
     std = 0.0
     for _ in range(iterations):

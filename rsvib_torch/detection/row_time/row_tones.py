@@ -14,8 +14,6 @@ from torch import Tensor
 
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 
-__all__ = ["MAX_CHI_SQUARE", "Candidate", "RowRecord", "RowTones", "candidates", "find_row_tones", "fit_row_tones"]
-
 F_THRESHOLD = 14.0  # decrease of chi-square per parameter, as for tones of known timing (tones/selection.py)
 MAX_CHI_SQUARE = 30.0  # above that of the best row time, for another one that explains the frames as well
 MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must explain
@@ -23,25 +21,15 @@ MIN_SHARE = 0.2  # of the residual sum of squares that a further tone must expla
 
 @dataclass(frozen=True, eq=False)
 class RowRecord:
-    """Displacements of scene rows along one axis, with the frames and the frame rows that they were measured in.
+    """Displacements of scene rows along one axis, with the frames and the frame rows that they were measured in."""
 
-    Attributes:
-        rows: (N, G) frame rows, from the middle row.
-        frames: (N, G) indices of the frames, from the middle frame.
-        values: (N, G) px, displacements less their mean over the frames that contain the scene row.
-        visible: (N, G) 1 where a frame contains the row, else 0.
-        weights: (N,) px^-2.
-        independent: Fraction of the measurements that are independent.
-        row_part: Assumed ratio of row time to frame period, for the drift of rows within a frame.
-    """
-
-    rows: Tensor
-    frames: Tensor
-    values: Tensor
-    visible: Tensor
-    weights: Tensor
-    independent: float
-    row_part: float
+    rows: Tensor  # (N, G) frame rows, from the middle row
+    frames: Tensor  # (N, G) indices of the frames, from the middle frame
+    values: Tensor  # (N, G) px, displacements less their mean over the frames that contain the scene row
+    visible: Tensor  # (N, G) 1 where a frame contains the row, else 0
+    weights: Tensor  # (N,) px^-2
+    independent: float  # fraction of the measurements that are independent
+    row_part: float  # assumed ratio of row time to frame period, for the drift of rows within a frame
 
     def relative(self, values: Tensor) -> Tensor:
         """Values (N, G, ...) less their mean over the frames that contain the row; 0 in other frames."""
@@ -58,19 +46,12 @@ class RowRecord:
 
 @dataclass(frozen=True, eq=False)
 class RowTones:
-    """Fitted tones of one axis.
+    """Fitted tones of one axis."""
 
-    Attributes:
-        values: (4 K + 1,) parameters: Re C, Im C in px, nu, phi of each tone, and the drift in px per frame.
-        covariance: (4 K + 1, 4 K + 1).
-        residual: (N, G) px.
-        cost: Weighted square of the residual.
-    """
-
-    values: Tensor
-    covariance: Tensor
-    residual: Tensor
-    cost: float
+    values: Tensor  # (4 K + 1,) parameters: Re C, Im C in px, nu, phi of each tone, and the drift in px per frame
+    covariance: Tensor  # (4 K + 1, 4 K + 1)
+    residual: Tensor  # (N, G) px
+    cost: float  # weighted square of the residual
 
     @property
     def tones(self) -> Tensor:
@@ -172,10 +153,7 @@ def _peaks(record: RowRecord, residual: Tensor, highest: float, count: int) -> l
 def find_row_tones(record: RowRecord, highest: float, *, max_tones: int = 4) -> RowTones:
     """Find and fit the tones of one axis, strongest first, until the next one is not significant.
 
-    Args:
-        record: The displacements.
-        highest: Cycles per row, the limit of the search.
-        max_tones: Largest number of tones.
+    The search ends at ``highest`` cycles per row.
     """
     found = fit_row_tones(record, record.values.new_zeros(1))
     for _ in range(max_tones):
@@ -202,17 +180,11 @@ def find_row_tones(record: RowRecord, highest: float, *, max_tones: int = 4) -> 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A row time that agrees with the tones.
+    """A row time that agrees with the tones."""
 
-    Attributes:
-        row_time: Seconds, negative for a reverse readout.
-        std: Its standard deviation.
-        chi_square: Sum over the tones of the squared distance of ``nu P / T_row - phi`` from a whole number, over its
-            variance.
-    """
-
-    row_time: float
-    std: float
+    row_time: float  # seconds, negative for a reverse readout
+    std: float  # its standard deviation
+    # sum over the tones of the squared distance of ``nu P / T_row - phi`` from a whole number, over its variance
     chi_square: float
 
 
@@ -221,13 +193,8 @@ def candidates(
 ) -> list[Candidate]:
     """All row times with ``low <= |T_row| <= high`` that are a local minimum of chi-square, the best first.
 
-    Args:
-        frequencies: (K, 2) cycles per row and per frame.
-        covariances: (K, 2, 2).
-        period: Frame period P in s.
-        low: Shortest row time in s.
-        high: Longest row time in s.
-        floor: Cycles; error of phi that is assumed in addition.
+    Frequencies (K, 2) are in cycles per row and per frame, with covariances (K, 2, 2); times are in s. ``floor`` is an
+    error of phi in cycles that is assumed in addition.
     """
     nu, phi = frequencies.unbind(-1)
 

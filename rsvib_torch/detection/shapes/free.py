@@ -46,17 +46,6 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = [
-    "MotionDetection",
-    "bands_reasons",
-    "detect_motion",
-    "measure_freely",
-    "residual_of_motion",
-    "rms_motion",
-    "start_curve",
-    "unexplained_reasons",
-]
-
 _MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
 
 
@@ -98,16 +87,11 @@ class MotionDetection(
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
-        >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px
-        >>> motion = rsv.FreeMotion.from_samples(times, path)
-        >>> frames = rsv.simulate_frames(city_and_fields(260, 220, seed=3), timing, motion, num_frames=3)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> found = rsv.detect_motion(frames, timing)
         >>> found.motion.displacement(torch.tensor(0.01, dtype=torch.float64)).shape  # px along x and y at 10 ms
         torch.Size([2])
-        >>> restored = rsv.restore(frames, timing, found.motion, check=False)
     """
 
     motion: FreeMotion
@@ -259,16 +243,7 @@ def _rounds(
 ) -> tuple[MeasuredRows, FreeMotion]:
     """Rounds of measuring the rows of one stack around a spline and fitting the spline to them.
 
-    Args:
-        rows: The frames.
-        motion: The first motion, a batch of one.
-        spacing: Seconds between knots.
-        record: Start and end of the record in seconds.
-        count: Number of rounds.
-        weighted: Whether objects that move by themselves get less weight in the first round; they do in the others.
-
-    Returns:
-        The measurements of the last round with their weights, and the motion.
+    ``weighted`` gives objects that move by themselves less weight in the first round already.
     """
     for number in range(count):
         measured = rows.measure(motion.to(rows.groups[0].starts.device))
@@ -291,17 +266,7 @@ def measure_freely(
 ) -> tuple[MeasuredRows, FreeMotion, float]:
     """Displacements of the rows of one stack, measured around a spline that is fitted to them again in every round.
 
-    Args:
-        stack: The frames.
-        timing: The sensor, in row order.
-        curve: Offsets of the row bands.
-        record: Start and end of the record in seconds.
-        bands: Registration of the bands.
-        knot_rows: As in ``detect_motion``.
-        iterations: Rounds of measuring and fitting.
-
-    Returns:
-        The measurements, the motion (a batch of one), and its knot spacing in seconds.
+    The result has the measurements, the motion (a batch of one), and its knot spacing in seconds.
     """
     spacing = max(knot_rows * timing.row_time, (record[1] - record[0]) / 3000)  # the cost grows with knots^3
     measured = measurements_of_curve(curve, timing, bands.band_step)
@@ -354,14 +319,10 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
 
 
 def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[list[Reason]]:
-    """Reasons against a motion of each axis in row order that the offsets of row bands contradict.
+    """Reasons against a motion of each axis in row order that the offsets of row bands of one stack contradict.
 
-    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
-
-    Args:
-        banded: Offsets of the bands of one stack, from ``measurements_of_curve``.
-        motion: The motion (not a batch).
-        counted: Fraction of the bands that count, the best ones: clouds may cover the others.
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it. The best
+    bands count, a fraction ``counted``: clouds may cover the others.
     """
     used = banded.weights[0].min(-1) > 0
     values, rest = (x[0, used, 1] - x[0, used, 0] for x in (banded.displacements, residual_of_motion(banded, motion)))
@@ -395,19 +356,12 @@ def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) 
 
 @dataclass(frozen=True, eq=False)
 class _SplineFit:
-    """Cubic spline ``sum_n c_n B((t - start) / spacing - n + 1)`` of each axis.
+    """Cubic spline ``sum_n c_n B((t - start) / spacing - n + 1)`` of each axis."""
 
-    Attributes:
-        coefficients: (A, N) float64 px.
-        covariance: (A, N, N) float64 px^2 of each axis.
-        start: Time of the first knot in seconds.
-        spacing: Seconds between knots.
-    """
-
-    coefficients: Tensor
-    covariance: Tensor
-    start: float
-    spacing: float
+    coefficients: Tensor  # (A, N) float64 px
+    covariance: Tensor  # (A, N, N) float64 px^2 of each axis
+    start: float  # time of the first knot in seconds
+    spacing: float  # seconds between knots
 
     @property
     def knots(self) -> Tensor:
@@ -429,15 +383,10 @@ class _SplineFit:
 def _fit_spline(
     measurements: Measurements, spacing: float, record: tuple[float, float], *, learn: bool = False
 ) -> _SplineFit:
-    """Fit a spline to the measurements of one stack, each axis by itself.
+    """Fit a spline with knots at a spacing in seconds to the measurements of one stack (B = 1), each axis by itself.
 
-    Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood.
-
-    Args:
-        measurements: Of one stack (B = 1).
-        spacing: Seconds between knots.
-        record: First and last time of the spline in seconds.
-        learn: Whether to estimate the power spectrum of the motion, for splines of up to 800 knots.
+    Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood. With ``learn``,
+    the power spectrum of the motion is estimated, for splines of up to 800 knots.
     """
     first, last = record
     axes = measurements.displacements.shape[-1]
@@ -521,11 +470,8 @@ def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: fl
     between a for given s, and s_j = mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the
     penalty.
 
-    Args:
-        gram: (N, N) normal matrix of the coefficients.
-        right: (N,) right-hand side.
-        noise: Variance of measurements of unit weight.
-        smoothness: Weight of the squares of second differences in the sum of squares, to start with.
+    ``gram`` (N, N) and ``right`` (N,) are the normal equations, ``noise`` is the variance of measurements of unit
+    weight, and ``smoothness`` the weight of squared second differences to start with.
     """
     count = len(right)
     margin = max(10, count // 16)  # knots beyond the record, as cosines have zero slope at their ends
@@ -568,15 +514,8 @@ def _report(
 ) -> MotionDetection:
     """The motion in image axes, and its uncertainty at up to 32 rows of every frame.
 
-    Args:
-        motion: The motion, all components in px.
-        fit: Its spline.
-        measured: The measurements of the fit.
-        timing: The sensor.
-        starts: (T,) s, exposure starts of the first rows.
-        scale: Components of the motion, and the size of the frames.
-        of_bands: Reasons of each axis from the row bands.
-        apart: (2,) px, rms difference of the displacements along a row that the motion does not explain.
+    ``of_bands`` are the reasons of each axis from the row bands, ``apart`` (2,) px the rms difference of the
+    displacements along a row that the motion does not explain.
     """
     num_rows = scale.height
     rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)

@@ -15,8 +15,6 @@ from rsvib_torch.core.text import measured_text
 from rsvib_torch.evaluation.mtf.edge import as_real, check_edge, check_roi, fit_edge, start_edge, straighten
 from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
 
-__all__ = ["MtfCurve", "slanted_edge_mtf"]
-
 
 @dataclass(frozen=True, repr=False)
 class MtfCurve(

@@ -8,21 +8,6 @@ from torch import Tensor
 
 from rsvib_torch.core.arrays import as_tensor
 
-__all__ = [
-    "EdgeFit",
-    "Scatter",
-    "as_real",
-    "check_edge",
-    "check_roi",
-    "edge_spread",
-    "fit_edge",
-    "linearised",
-    "moved",
-    "start_edge",
-    "straighten",
-    "uneven_patches",
-]
-
 
 def edge_spread(distance: Tensor, sigma: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Edge spread function of Gaussian optics and square pixels, with its derivatives.
@@ -62,19 +47,12 @@ def edge_spread(distance: Tensor, sigma: Tensor, slope: Tensor) -> tuple[Tensor,
 
 @dataclass(frozen=True)
 class Scatter:
-    """Pixels (N,) of a ROI turned so that the edge is near-vertical and brightens to the right.
+    """Pixels (N,) of a ROI turned so that the edge is near-vertical and brightens to the right."""
 
-    Attributes:
-        value: Grey values.
-        x: Columns from the middle of the ROI, px.
-        y: Rows from the middle of the ROI, px.
-        half: Half width and half height of the ROI in px.
-    """
-
-    value: Tensor
-    x: Tensor
-    y: Tensor
-    half: tuple[float, float]
+    value: Tensor  # grey values
+    x: Tensor  # columns from the middle of the ROI, px
+    y: Tensor  # rows from the middle of the ROI, px
+    half: tuple[float, float]  # half width and half height of the ROI in px
 
     def basis(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Legendre polynomials (..., 4) along the edge, and their slopes per px."""
@@ -86,17 +64,11 @@ class Scatter:
 
 @dataclass(frozen=True)
 class EdgeFit:
-    """Parameters of edge, blur and sides.
+    """Parameters of edge, blur and sides."""
 
-    Attributes:
-        line: (4,) coefficients of the edge's column as polynomial of the row, px.
-        sigma: () Gaussian blur of the optics, px.
-        sides: (2, 3) dark and bright side: value in the middle, slopes to the right and down per half ROI.
-    """
-
-    line: Tensor
-    sigma: Tensor
-    sides: Tensor
+    line: Tensor  # (4,) coefficients of the edge's column as polynomial of the row, px
+    sigma: Tensor  # () Gaussian blur of the optics, px
+    sides: Tensor  # (2, 3) dark and bright side: value in the middle, slopes to the right and down per half ROI
 
     @property
     def contrast(self) -> Tensor:
@@ -131,9 +103,8 @@ class EdgeFit:
 def straighten(roi: Tensor) -> tuple[Scatter, int, bool, bool]:
     """Turn a ROI so that its edge is near-vertical and brightens to the right.
 
-    Returns:
-        The pixels, the columns of the turned ROI, whether the edge of the ROI was near-vertical, and whether the
-        turned ROI was mirrored.
+    Also returned are the columns of the turned ROI, whether the edge was near-vertical, and whether the ROI was
+    mirrored.
     """
     soft = torch.nn.functional.avg_pool2d(roi[None, None], 5, stride=1)[0, 0]
     across, down = soft.diff(dim=1).square().mean(), soft.diff(dim=0).square().mean()
@@ -242,16 +213,9 @@ def check_roi(roi: Tensor) -> Tensor:
 
 
 def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float, float]) -> float:
-    """Raise if the ROI does not contain one measurable slanted edge.
+    """Raise if the ROI does not contain one measurable slanted edge, of values within ``limits``.
 
-    Args:
-        fit: Of the edge.
-        scatter: The pixels.
-        columns: Of the turned ROI.
-        limits: Lowest and highest value that a pixel can have.
-
-    Returns:
-        Smallest distance in px between the edge and a border of the ROI beside it.
+    The result is the smallest distance in px between the edge and a border of the turned ROI beside it.
     """
     model, _, distance = linearised(fit, scatter)
     residual = scatter.value - model

@@ -23,8 +23,6 @@ from rsvib_torch.evaluation.mtf.edge import (
     uneven_patches,
 )
 
-__all__ = ["SlantedEdge", "find_slanted_edges"]
-
 _Side = Literal["left", "right", "top", "bottom"]
 
 

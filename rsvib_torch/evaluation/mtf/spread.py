@@ -14,8 +14,6 @@ from torch import Tensor
 
 from rsvib_torch.evaluation.mtf.edge import EdgeFit, Scatter, edge_spread, linearised, moved
 
-__all__ = ["Spread", "Tail", "fit_spread"]
-
 # parameters of ``EdgeFit`` with a prior, the slopes of the two sides across the edge, and those without
 _RANDOM, _FIXED = [6, 9], [0, 1, 2, 3, 4, 5, 7, 8, 10]
 _SLOPES, _FREE = len(_RANDOM), len(_FIXED)
@@ -46,16 +44,9 @@ class Tail:
         return (squared - width**2) * width / (squared + width**2).square()
 
     def transfer(self, position: Tensor, lsf: Tensor, far: Tensor, frequency: Tensor) -> Tensor:
-        """Complex transfer of line spread functions, 1 at frequency 0.
+        """Complex transfer (..., F) of line spread functions (..., N) at evenly spaced positions, 1 at frequency 0.
 
-        Args:
-            position: (N,) px, evenly spaced.
-            lsf: (..., N), containing the tail times ``far``.
-            far: (...).
-            frequency: (F,) cycles/px.
-
-        Returns:
-            (..., F).
+        The functions contain the tail times ``far`` (...); positions are in px, frequencies (F,) in cycles/px.
         """
         angle = -2 * math.pi * frequency[:, None] * position
         ramps = torch.polar(torch.ones_like(angle), angle)
@@ -68,19 +59,12 @@ class Tail:
 
 @dataclass(frozen=True)
 class Knots:
-    """Tail and cubic B-splines, evenly spaced in ``u = stretch asinh(distance / stretch)``.
+    """Tail and cubic B-splines, evenly spaced in ``u = stretch asinh(distance / stretch)``."""
 
-    Attributes:
-        place: (K,) values of u.
-        step: Between them.
-        stretch: px.
-        tail: Departure beyond them.
-    """
-
-    place: Tensor
-    step: float
-    stretch: float
-    tail: Tail
+    place: Tensor  # (K,) values of u
+    step: float  # between them
+    stretch: float  # px
+    tail: Tail  # departure beyond them
 
     @property
     def distance(self) -> Tensor:
@@ -171,27 +155,16 @@ def normal_equations(dense: Tensor, index: Tensor, taps: Tensor, count: int, res
 
 @dataclass(frozen=True)
 class Posterior:
-    """Free parameters, and slopes and coefficients for every prior of at least 0.1 % of the best weight.
+    """Free parameters, and slopes and coefficients for every prior of at least 0.1 % of the best weight."""
 
-    Attributes:
-        weights: (A,) of the priors.
-        coefficients: (A, 2 + K) under each of them: slopes, tail and splines.
-        roots: (A, 2 + K, 2 + K) square roots of their covariances.
-        mean: (2 + K,) coefficients over all priors.
-        fixed: (F,) free parameters at the mean coefficients.
-        projection: (F, 2 + K) negative derivatives of the free parameters by the coefficients.
-        fixed_root: (F, F) square root of their covariance at given coefficients.
-        used: (P,) spline priors with weight.
-    """
-
-    weights: Tensor
-    coefficients: Tensor
-    roots: Tensor
-    mean: Tensor
-    fixed: Tensor
-    projection: Tensor
-    fixed_root: Tensor
-    used: Tensor
+    weights: Tensor  # (A,) of the priors
+    coefficients: Tensor  # (A, 2 + K) under each of them: slopes, tail and splines
+    roots: Tensor  # (A, 2 + K, 2 + K) square roots of their covariances
+    mean: Tensor  # (2 + K,) coefficients over all priors
+    fixed: Tensor  # (F,) free parameters at the mean coefficients
+    projection: Tensor  # (F, 2 + K) negative derivatives of the free parameters by the coefficients
+    fixed_root: Tensor  # (F, F) square root of their covariance at given coefficients
+    used: Tensor  # (P,) spline priors with weight
 
 
 def posterior(
@@ -199,12 +172,9 @@ def posterior(
 ) -> Posterior:
     """Average over priors, each weighted by its restricted likelihood, for noise of variance 1.
 
-    Args:
-        matrix: Of the normal equations of all parameters.
-        right: Their right side.
-        roots: (P, K, K) square roots of the prior covariances of the departure's coefficients at strength 1.
-        contrast: () of the edge.
-        shadings: Standard deviations of the slopes of the sides across the edge over the contrast, per half ROI.
+    ``matrix`` and ``right`` are the normal equations of all parameters, ``roots`` (P, K, K) square roots of the prior
+    covariances of the departure at strength 1. ``shadings`` are standard deviations of the slopes of the sides across
+    the edge over the contrast, per half ROI.
     """
     size = matrix.diagonal()[:_FREE].sqrt()
     size = size.clamp(min=1e-12 * float(size.max()))
@@ -278,35 +248,20 @@ def _under_shading(
 
 @dataclass(frozen=True)
 class Spread:
-    """Edge and line spread function with their uncertainty.
+    """Edge and line spread function with their uncertainty."""
 
-    Attributes:
-        fit: Edge, Gaussian blur and sides without the departure.
-        position: (N,) px.
-        esf: (N,) edge spread function.
-        lsf: (N,) its derivative.
-        tail: Shape of the tail beyond ``position``.
-        far: () amplitude of the tail in ``esf`` and ``lsf``.
-        alternatives: (A, N) line spread functions by prior.
-        alternative_far: (A,) amplitude of the tail in each.
-        weights: (A,) of the alternatives.
-        basis: (N, R) derivatives of the line spread function by the uncertain parameters.
-        roots: (A, R, S) square roots of the covariance of these parameters, by prior.
-        noise: () standard deviation of the noise of a pixel.
-    """
-
-    fit: EdgeFit
-    position: Tensor
-    esf: Tensor
-    lsf: Tensor
-    tail: Tail
-    far: Tensor
-    alternatives: Tensor
-    alternative_far: Tensor
-    weights: Tensor
-    basis: Tensor
-    roots: Tensor
-    noise: Tensor
+    fit: EdgeFit  # edge, Gaussian blur and sides without the departure
+    position: Tensor  # (N,) px
+    esf: Tensor  # (N,) edge spread function
+    lsf: Tensor  # (N,) its derivative
+    tail: Tail  # shape of the tail beyond ``position``
+    far: Tensor  # () amplitude of the tail in ``esf`` and ``lsf``
+    alternatives: Tensor  # (A, N) line spread functions by prior
+    alternative_far: Tensor  # (A,) amplitude of the tail in each
+    weights: Tensor  # (A,) of the alternatives
+    basis: Tensor  # (N, R) derivatives of the line spread function by the uncertain parameters
+    roots: Tensor  # (A, R, S) square roots of the covariance of these parameters, by prior
+    noise: Tensor  # () standard deviation of the noise of a pixel
 
     def mtf(self, frequency: Tensor) -> Tensor:
         """MTF at frequencies (F,)."""
@@ -338,10 +293,7 @@ def _quantisation(values: Tensor) -> float:
 def fit_spread(fit: EdgeFit, scatter: Scatter, room: float) -> Spread:
     """Fit the edge spread function without assuming a shape.
 
-    Args:
-        fit: Edge and blur from ``fit_edge``.
-        scatter: The pixels.
-        room: px from the edge to the nearer of the ROI's borders alongside it.
+    ``room`` is the distance in px from the edge to the nearer of the ROI's borders alongside it.
     """
     knots = lay_knots(room, float(fit.width), scatter.x)
     roots = prior_roots(knots, float(fit.width))

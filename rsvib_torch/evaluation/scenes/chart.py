@@ -18,8 +18,6 @@ from rsvib_torch.evaluation.scenes.drawing import (
     sectors,
 )
 
-__all__ = ["resolution_chart"]
-
 _INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture of either stay within 0 ... 1
 _Centre = tuple[float, float]
 

@@ -10,8 +10,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["Canvas", "bars", "disc", "edge", "fractal_texture", "rectangle", "rotated", "sectors", "smoothed"]
-
 
 def edge(distance: Tensor, sigma: float) -> Tensor:
     """Coverage at a signed distance (px, positive inside) from a straight edge."""
@@ -37,13 +35,9 @@ def disc(x: Tensor, y: Tensor, radius: float, sigma: float) -> Tensor:
 
 
 def bars(cycles: Tensor, frequency: Tensor | float, count: int, sigma: float) -> Tensor:
-    """Coverage of ``count`` bars, half a cycle wide each, from 0 to ``count - 1/2`` cycles.
+    """Coverage of ``count`` bars, half a cycle wide each, from 0 to ``count - 1/2`` cycles, with a blur in px.
 
-    Args:
-        cycles: Position across the bars, in cycles.
-        frequency: Local frequency in cycles/px: constant for a bar group, varying along the bars for a wedge.
-        count: Bars.
-        sigma: Blur in px.
+    The frequency in cycles/px is constant for a bar group and varies along the bars for a wedge.
     """
     coverage = torch.zeros_like(cycles)
     for index in range(2 * count):
@@ -74,16 +68,8 @@ def fractal_texture(
 ) -> Tensor:
     """Random texture of zero mean and unit variance whose amplitude spectrum falls as ``frequency^-exponent``.
 
-    Args:
-        height: Rows.
-        width: Columns.
-        generator: Source of randomness.
-        exponent: 0 for white noise, 1 for natural scenes.
-        longest: Wavelength in px beyond which the spectrum is flat.
-        sigma: Blur of the optics in px.
-
-    Returns:
-        float32 tensor (height, width).
+    The exponent is 0 for white noise and 1 for natural scenes. The spectrum is flat beyond the wavelength ``longest``
+    in px, and the optics blur by ``sigma`` px.
     """
     white = torch.randn(height, width, generator=generator, dtype=torch.float32, device="cpu")
     v = torch.fft.fftfreq(height, dtype=torch.float32, device="cpu")[:, None]
@@ -120,11 +106,8 @@ class Canvas:
     ) -> None:
         """Paint a tone over the image.
 
-        Args:
-            centre: Column and row of the origin of the shape's coordinates.
-            reach: Half size (x, y) of the window in px, or one number for both.
-            tone: Value to paint.
-            coverage: Function of the coordinates x (1, w) and y (h, 1) in px from the centre.
+        The window has the half size ``reach`` (x, y) in px around the centre (column, row). ``coverage`` is a function
+        of the coordinates x (1, w) and y (h, 1) in px from the centre.
         """
         places = []
         for middle, half, size in zip(

@@ -11,8 +11,6 @@ from torch.nn import functional
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.evaluation.scenes.drawing import edge, fractal_texture, rectangle, rotated, smoothed
 
-__all__ = ["city_and_fields"]
-
 _FIELDS, _TOWN, _WORKS, _WOOD = range(4)
 # points of the ground per px along each axis, against aliasing; rms difference from 8 points: 1.0 % of full scale with
 # 1 point, 0.4 % with 2, 0.1 % with 4 in four times the time

@@ -22,8 +22,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.export.exported import check_exportable, num_rows_of
 
-__all__ = ["write_gcsv"]
-
 _RATE_STEP = 1e-9  # rad/s, of the integers in the file; 1000 s of equal rounding errors add up to 5e-7 rad
 _LOWEST_RATE = 1000.0  # Hz; from here the rate is doubled, so that 1 / rate is a short decimal number
 _LARGEST_ERROR = 2e-7  # rad, of the attitude that the trapezoidal rule gives

@@ -40,8 +40,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import IsdModel
 from rsvib_torch.report.export.exported import check_exportable, num_rows_of
 
-__all__ = ["camera_isd", "write_isd"]
-
 _FRAME, _LINE_SCAN = "USGS_ASTRO_FRAME_SENSOR_MODEL", "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 _MAX_DEGREE = 12  # 8e-7 px for 5 px and 0.8 periods per frame; rounding of float64 stays below 1e-8 px up to 14
 _COLUMNS = 17  # columns at which the displacement is evaluated; it changes smoothly along a row

@@ -4,8 +4,6 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = ["check_exportable", "num_rows_of"]
-
 
 def check_exportable(motion: Motion) -> None:
     """Raise a ``ValueError`` for a batch of motions: a file holds one."""

@@ -23,8 +23,6 @@ from rsvib_torch.options import StmapConvention
 from rsvib_torch.report.export.exported import check_exportable, num_rows_of
 from rsvib_torch.restoration.frame_motion import frame_motion
 
-__all__ = ["sampling_map", "write_stmap"]
-
 # Columns at which positions are computed; a polynomial interpolates them. Error for 2048 columns, 60 degrees and strong
 # distortion: 1e-9 px with 5 px and 5 mrad of roll at 400 Hz, 1e-7 px with a random free motion of 3 px and 2 mrad.
 _NODES = 17

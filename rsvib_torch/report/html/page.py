@@ -32,8 +32,6 @@ from rsvib_torch.report.html.template import (
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 from rsvib_torch.stacks import StackManifest
 
-__all__ = ["Box", "Edge", "Report", "frames_in_turn", "measure_edges", "whole_frame", "write_report_page"]
-
 Box = tuple[int, int, int, int]  # top, left, height, width in px
 
 
@@ -79,19 +77,12 @@ class Report:
 
 @dataclass(frozen=True)
 class Edge:
-    """A slanted edge, measured in the input and in the restored frame.
+    """A slanted edge, measured in the input and in the restored frame."""
 
-    Attributes:
-        box: Its position.
-        before: Measurement in the input; None if it failed.
-        after: Measurement in the restored frame; its frequencies are in cycles per point.
-        points: Points of the restored frame per px.
-    """
-
-    box: Box
-    before: MtfCurve | None
-    after: MtfCurve
-    points: int = 1
+    box: Box  # its position
+    before: MtfCurve | None  # measurement in the input; None if it failed
+    after: MtfCurve  # measurement in the restored frame; its frequencies are in cycles per point
+    points: int = 1  # points of the restored frame per px
 
     @property
     def direction(self) -> str:
@@ -119,18 +110,10 @@ def _find_edges(image: Tensor, per_direction: int = 3, searched: int = 2048) -> 
 
 
 def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = None) -> tuple[list[Edge], list[str]]:
-    """Measure slanted edges in an input frame and in the restored frame.
+    """Measure slanted edges in an input frame (H, W) and in the restored frame, which may have several points per px.
 
-    Args:
-        before: (H, W) grey.
-        after: Same shape, or with a whole number of points per px.
-        boxes: Positions of the edges; None searches for edges in the restored frame.
-
-    Returns:
-        The edges that were measured in the restored frame, and a sentence for each failed measurement.
-
-    Raises:
-        ValueError: If a given box is not inside the frame.
+    Without ``boxes``, edges are searched for in the restored frame. Returns the edges that were measured there, and a
+    sentence for each failed measurement.
     """
     rows, columns = before.shape
     points = after.shape[-1] // columns
@@ -236,12 +219,6 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
 
     Uniform motion along the image is compensated by whole px, the same for input and restored frames, so that the
     displacement by the vibration remains.
-
-    Args:
-        report: The content of the page.
-        index: Frame on the page.
-        removed: The vibration that was removed.
-        size: Largest side of the part in px.
     """
     count = len(report.frames)
     if count < 2:

@@ -19,18 +19,6 @@ from torch import Tensor
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.report.plots import picture
 
-__all__ = [
-    "BeforeAfter",
-    "Blink",
-    "Drawing",
-    "GreyLevels",
-    "before_after",
-    "blink",
-    "data_uri",
-    "drawing",
-    "write_page",
-]
-
 GreyLevels = tuple[float, float]  # values that are drawn black and white, full scale 1
 PERCENTILES = (0.2, 99.8)  # of the values of the images; few saturated or dead pixels do not reduce the contrast
 # Compression of the images that can be magnified. Size of a frame of 2048² px (noise 0.003) on the page, rms error in
@@ -41,21 +29,13 @@ _FULL_PIXELS = 2048 * 2048  # a larger frame is reduced, and its part of this si
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure of a page.
+    """A figure of a page."""
 
-    Attributes:
-        name: File name of the image without its ending.
-        title: Heading.
-        caption: Description.
-        png: The image.
-        width: Largest width on the page in px.
-    """
-
-    name: str
-    title: str
-    caption: str
-    png: bytes
-    width: int
+    name: str  # file name of the image without its ending
+    title: str  # heading
+    caption: str  # description
+    png: bytes  # the image
+    width: int  # largest width on the page in px
 
     @property
     def uri(self) -> str:
@@ -65,32 +45,19 @@ class Drawing:
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """Two images of the same part of a frame, or one.
+    """Two images of the same part of a frame, or one."""
 
-    Attributes:
-        images: Data URIs of the image before, and after if there is one.
-        names: Their titles.
-        caption: Description.
-        width: Width of either image in px.
-        height: Height of either image in px.
-        levels: Values that are drawn black and white.
-        left: Column of the frame at the left edge.
-        top: Row of the frame at the upper edge.
-        scale: Pixels of the image per pixel of the frame, 1 or less.
-        full: A part of the frame at full resolution; None where ``scale`` is 1.
-        place: Row and column of the frame that the magnifier shows first; None for its centre.
-    """
-
-    images: tuple[str, ...]
-    names: tuple[str, ...]
-    caption: str
-    width: int
-    height: int
-    levels: GreyLevels
-    left: int = 0
-    top: int = 0
-    scale: float = 1.0
-    full: "BeforeAfter | None" = None
+    images: tuple[str, ...]  # data URIs of the image before, and after if there is one
+    names: tuple[str, ...]  # their titles
+    caption: str  # description
+    width: int  # width of either image in px
+    height: int  # height of either image in px
+    levels: GreyLevels  # values that are drawn black and white
+    left: int = 0  # column of the frame at the left edge
+    top: int = 0  # row of the frame at the upper edge
+    scale: float = 1.0  # pixels of the image per pixel of the frame, 1 or less
+    full: "BeforeAfter | None" = None  # a part of the frame at full resolution; None where ``scale`` is 1
+    # row and column of the frame that the magnifier shows first; None for its centre
     place: tuple[int, int] | None = None
 
     @property
@@ -106,21 +73,13 @@ class BeforeAfter:
 
 @dataclass(frozen=True)
 class Blink:
-    """Two consecutive frames for each of several panels, which a page shows in turn.
+    """Two consecutive frames for each of several panels, which a page shows in turn."""
 
-    Attributes:
-        panels: Title of each panel, and data URIs of its two images.
-        frames: Numbers of the two frames.
-        caption: Description.
-        width: Width of the images in px.
-        height: Height of the images in px.
-    """
-
-    panels: tuple[tuple[str, tuple[str, str]], ...]
-    frames: tuple[int, int]
-    caption: str
-    width: int
-    height: int
+    panels: tuple[tuple[str, tuple[str, str]], ...]  # title of each panel, and data URIs of its two images
+    frames: tuple[int, int]  # numbers of the two frames
+    caption: str  # description
+    width: int  # width of the images in px
+    height: int  # height of the images in px
 
 
 def data_uri(content: bytes, kind: str) -> str:
@@ -172,18 +131,12 @@ def before_after(
     exact: bool = False,
     full_at: tuple[int, int] | None = None,
 ) -> BeforeAfter:
-    """Encode two images, or one, with the same grey scale.
+    """Encode two images (H, W) or (C, H, W) of one shape, or one, with the same grey scale.
 
-    The grey scale covers all but the darkest and the brightest 0.2 % of the values of both images.
-
-    Args:
-        images: (H, W) or (C, H, W), floating point; a second one has the shape of the first.
-        names: Titles of the images.
-        caption: Description.
-        longest: Largest side in px; larger images are reduced by averaging.
-        exact: Encode without loss (PNG) instead of as JPEG.
-        full_at: Row and column around which larger images are kept at full resolution, beside the reduced ones.
-            Images of at most 2048² pixels are then not reduced at all.
+    The grey scale covers all but the darkest and the brightest 0.2 % of the values of both images. Images with a side
+    above ``longest`` px are reduced by averaging; around the row and column ``full_at`` they are kept at full
+    resolution beside the reduced ones, and not reduced at all up to 2048² px. ``exact`` encodes as PNG instead of as
+    JPEG.
     """
     height, width = images[0].shape[-2:]
     if full_at is not None and height * width <= _FULL_PIXELS:
@@ -210,14 +163,7 @@ def before_after(
 def blink(
     stacks: Sequence[tuple[Tensor, Tensor]], *, names: Sequence[str], frames: tuple[int, int], caption: str
 ) -> Blink:
-    """Encode pairs of consecutive frames with the same grey scale.
-
-    Args:
-        stacks: Two images (H, W) or (C, H, W) for each panel, all of one shape.
-        names: Title of each panel.
-        frames: Numbers of the two frames.
-        caption: Description.
-    """
+    """Encode two consecutive frames (H, W) or (C, H, W) for each panel with the same grey scale."""
     pixels = [[_pixels(image) for image in pair] for pair in stacks]
     levels = _grey_levels([image for pair in pixels for image in pair])
     encoded = [(_encoded(first, levels, False), _encoded(second, levels, False)) for first, second in pixels]
@@ -241,17 +187,7 @@ def _explained(text: str, terms: Mapping[str, str]) -> Markup:
 def write_page(
     path: str | os.PathLike[str], template: str, content: dict[str, Any], *folders: str | os.PathLike[str]
 ) -> None:
-    """Write a page atomically.
-
-    Args:
-        path: The file to write.
-        template: Name of the template.
-        content: Values of its variables; text is escaped.
-        folders: Folders that are searched for templates, besides that of the package.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write a page from a template of the package or of further folders; text is escaped."""
     loaders = [jinja2.PackageLoader("rsvib_torch.report.html"), *(jinja2.FileSystemLoader(f) for f in folders)]
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader(loaders),

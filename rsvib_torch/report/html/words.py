@@ -14,18 +14,6 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies, tone_head
 from rsvib_torch.report.plots import motion_blur, tones_text
 from rsvib_torch.restoration import RestorationVerdict
 
-__all__ = [
-    "TERMS",
-    "Mark",
-    "about_rows",
-    "camera_rows",
-    "detected_tones",
-    "detected_tones_head",
-    "mark_of",
-    "tried_sentences",
-    "verdict_sentences",
-]
-
 Mark = Literal["good", "doubt", "bad"]
 _QUANTITIES = ("amplitude", "frequency", "period", "phase")
 # Terms that the page explains, in the order of its list; a head or first cell of a table with this text, up to a
@@ -136,14 +124,7 @@ def verdict_sentences(
 ) -> list[str]:
     """The verdict: one sentence for the overall result, followed by the details.
 
-    Args:
-        result: A detection (not a batch).
-        removed: The part of its vibration that was removed.
-        timing: The sensor.
-        num_rows: Rows of a frame.
-        restored: Whether the frames were restored, or are unchanged.
-        left_alone: A reason for each axis that was not restored.
-        verdict: Comparison of pairs of frames; None if they could not be compared.
+    ``removed`` is the part of the detected vibration that was removed; ``left_alone`` has a reason for each other axis.
     """
     sentences = [_first_sentence(mark_of(result, verdict, restored), restored, verdict)]
     for axis in range(result.vibration.num_axes):
@@ -169,14 +150,7 @@ def verdict_sentences(
 def tried_sentences(
     result: DetectionResult, options: dict[str, Any], verdict: RestorationVerdict | None, found: Sequence[str]
 ) -> list[str]:
-    """What was tried where no frame was restored: the detection, its findings, and the restoration.
-
-    Args:
-        result: A detection (not a batch).
-        options: Options of the restoration.
-        verdict: The verdict on the restored frames that were not kept; None if there were none.
-        found: Sentences about the detected vibration and the verdict.
-    """
+    """What was tried where no frame was restored: the detection, its findings ``found``, and the restoration."""
     curve = result.offsets
     pairs, rows = curve.offsets.shape[-3:-1]
     measured = f"{100 * float(curve.good.double().mean()):.0f} %"
@@ -214,7 +188,7 @@ def detected_tones(result: DetectionResult) -> list[list[str]]:
     """Lines of the table of tones, in the order of ``detected_tones_head``."""
     return [
         [*cells, f"{float(result.gain[at]):+.2f}", "reliable" if bool(result.reliable[at[0]]) else "not reliable"]
-        for at, cells in tone_rows(result.vibration, result.std, _QUANTITIES)
+        for at, cells in tone_rows(result.vibration, result.std, _QUANTITIES, result.std_if_hidden_tone)
         if float(result.vibration.amplitude[at]) > 0
     ]
 

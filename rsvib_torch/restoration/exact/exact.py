@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
 from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.core.progress import steps
@@ -38,11 +38,8 @@ from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrio
 from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
-__all__ = ["FrameModel", "Scenes", "given_level", "model_frames", "restore_exact", "scene_period", "solve_scenes"]
-
 _MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
-# values of frames of scenes that are treated at a time, beside the systems: 64 MB and 1 GB
-_VALUES_AT_A_TIME = {"cpu": 1 << 24, "cuda": 1 << 28}
+_FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
 
 def restore_exact(
@@ -120,54 +117,31 @@ def scene_period(motion: FrameMotion, width: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """N scenes, each restored from M frames of a stack.
+    """N scenes, each restored from M frames of a stack."""
 
-    Attributes:
-        stack: (N,) number of the stack.
-        members: (N, M) numbers of the frames.
-        reference: (N,) the frame in whose coordinates a scene is restored.
-        contributes: (N, M) whether the frame has enough measured pixels.
-        strength: (N,) factor on the prior.
-    """
-
-    stack: NDArray[np.int64]
-    members: NDArray[np.int64]
-    reference: NDArray[np.int64]
-    contributes: NDArray[np.bool_]
-    strength: NDArray[np.float64]
+    stack: NDArray[np.int64]  # (N,) number of the stack
+    members: NDArray[np.int64]  # (N, M) numbers of the frames
+    reference: NDArray[np.int64]  # (N,) the frame in whose coordinates a scene is restored
+    contributes: NDArray[np.bool_]  # (N, M) whether the frame has enough measured pixels
+    strength: NDArray[np.float64]  # (N,) factor on the prior
 
 
 @dataclass(frozen=True, eq=False)
 class FrameModel:
-    """The frames of B stacks, and the quantities that the scenes restored from them have in common.
+    """The frames of B stacks, and the quantities that the scenes restored from them have in common."""
 
-    Attributes:
-        frames: (B, T, C, H, W).
-        motion: Motion of the frames.
-        weights: (B, T) weights of the frames.
-        level: (B,) standard deviation of the noise of a frame of weight 1.
-        level_is_certain: Whether it is given or estimated from several frames.
-        mean: (B, C, 1, 1) brightness; the prior is for deviations from it.
-        prior: Of all frames; on the finer grid, one for each stack.
-        period: L, the period of the restored scenes in px.
-        scale: Points of the restored scenes per px.
-        unknown: (B, T, C, H, W) bool, pixels without data and saturated ones; None for none.
-        clipped: (B, T, C, H, W) bool, the saturated ones.
-        strips: Number of neighbouring stacks that are strips of columns of the same frames.
-    """
-
-    frames: Tensor
-    motion: FrameMotion
-    weights: Tensor
-    level: Tensor
-    level_is_certain: bool
-    mean: Tensor
-    prior: RowPrior | list[PolynomialPrior]
-    period: int
-    scale: int
-    unknown: Tensor | None
-    clipped: Tensor | None
-    strips: int
+    frames: Tensor  # (B, T, C, H, W)
+    motion: FrameMotion  # motion of the frames
+    weights: Tensor  # (B, T) weights of the frames
+    level: Tensor  # (B,) standard deviation of the noise of a frame of weight 1
+    level_is_certain: bool  # whether it is given or estimated from several frames
+    mean: Tensor  # (B, C, 1, 1) brightness; the prior is for deviations from it
+    prior: RowPrior | list[PolynomialPrior]  # of all frames; on the finer grid, one for each stack
+    period: int  # L, the period of the restored scenes in px
+    scale: int  # points of the restored scenes per px
+    unknown: Tensor | None  # (B, T, C, H, W) bool, pixels without data and saturated ones; None for none
+    clipped: Tensor | None  # (B, T, C, H, W) bool, the saturated ones
+    strips: int  # number of neighbouring stacks that are strips of columns of the same frames
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
@@ -242,9 +216,9 @@ class FrameModel:
             chosen += [found] if found == number else []
             representative.append(found)
         # cross-validation of as many scenes at a time as the memory allows
-        values = self.frames[0, 0].numel() * scenes.members.shape[1]
+        scene_bytes = 4 * self.frames[0, 0].numel() * scenes.members.shape[1]
         strengths = np.ones(len(scenes.stack))
-        for part in runs(len(chosen), max(1, _VALUES_AT_A_TIME.get(self.frames.device.type, 1 << 24) // values)):
+        for part in runs(len(chosen), at_once(scene_bytes, self.frames.device, cpu_bytes=_FRAME_BYTES)):
             some = take_stacks([scenes], np.array(chosen[part]))
             stack_of, member_of = self._indices(some)
             strengths[chosen[part]] = prior_strengths(
@@ -372,18 +346,7 @@ def model_frames(
 def solve_scenes(
     model: FrameModel, scenes: Scenes, prior: Prior, regularisation: float, partition: Partition
 ) -> tuple[Tensor, list[FrameDifference]]:
-    """Images of scenes.
-
-    Args:
-        model: The frames.
-        scenes: The scenes.
-        prior: Prior of all scenes.
-        regularisation: Factor on the strength of the prior.
-        partition: Parts solved at a time.
-
-    Returns:
-        Images (N, C, S H, S W), and, on the finer grid, the differences of the frames of each scene.
-    """
+    """Images (N, C, S H, S W) of scenes, and, on the finer grid, the differences of the frames of each scene."""
     frames, width = model.frames, model.frames.shape[-1]
     blocks = _blocks(model, scenes)
     threads = min(Partition.threads(frames.device), len(blocks))
@@ -433,8 +396,8 @@ def _blocks(model: FrameModel, scenes: Scenes) -> list[tuple[str, list[int]]]:
     across = math.ceil(float(model.motion.blur_lengths[..., 1].max()))
     systems = rows * (2 * (TAPS - 1 + across) + 1) * frequencies
     most = Partition.most_values(rows, frequencies, device, blurred=False, single=False) // systems
-    data = scenes.members.shape[1] * model.frames.shape[2] * height * model.period
-    most = max(1, min(most, _VALUES_AT_A_TIME.get(device.type, 1 << 24) // data))
+    scene_bytes = 4 * scenes.members.shape[1] * model.frames.shape[2] * height * model.period
+    most = max(1, min(most, at_once(scene_bytes, device, cpu_bytes=_FRAME_BYTES)))
     threads = Partition.threads(device)
     return [
         (kind, numbers[part])

@@ -12,8 +12,6 @@ from torch import Tensor
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 
-__all__ = ["FILLED_BLUR_REACH", "measured_values", "with_extension", "with_missing_values"]
-
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame
 FILLED_BLUR_REACH = 1.0
 # px beyond four times the reach. With 64, frames behind exposures of 200 and 400 rows gain up to 0.03 dB with 3 px and
@@ -24,13 +22,9 @@ _NEAR = 24
 def measured_values(along: Tensor, unknown: Tensor | None, shape: torch.Size, width: int, *, ends: bool) -> Tensor:
     """Mask of the measured values (N, M, C, R, L) of the frames of N scenes.
 
-    Args:
-        along: (N, M) px by which the frames are moved relative to the restored one. The boundary extension of rows
-            counts as measured if those of a scene are 0, as it is right only for frames with the same columns.
-        unknown: (N, M, C, R, W) bool, pixels without data and saturated ones, or None.
-        shape: (N, M, C, R, L) of the data.
-        width: W.
-        ends: The boundary extension counts as missing in any case.
+    Frames are moved by ``along`` (N, M) px relative to the restored one. The boundary extension of rows counts as
+    measured if those of a scene are 0, as it is right only for frames with the same columns, and never with ``ends``.
+    Pixels without data and saturated ones are ``unknown``, (N, M, C, R, W).
     """
     columns = torch.arange(shape[-1], device=along.device)
     scene_columns = columns - along[..., None]

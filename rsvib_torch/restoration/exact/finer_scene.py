@@ -14,8 +14,6 @@ from rsvib_torch.core.fourier import squared_modulus
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 
-__all__ = ["FrameDifference", "finer_scene", "phase_spread", "warn_of_frames"]
-
 _BLOCK = 16  # rows of a frame whose displacement error is measured together
 _SOLUTIONS = 10  # at most; one in general
 # Residual power at a horizontal frequency, in units of the noise power, above which the prior excludes a pattern there:
@@ -30,21 +28,13 @@ _MAX_EFFECT, _MAX_RESIDUAL = 0.1, 1.5
 
 @dataclass(frozen=True)
 class FrameDifference:
-    """Differences of frames from the prediction of their scene.
+    """Differences of frames from the prediction of their scene."""
 
-    Attributes:
-        residual: Standard deviation in units of the noise.
-        error: Displacement error in px, rms over the blocks of rows of all frames and both axes.
-        effect: Standard deviation of the difference that the displacement error causes, in units of the noise.
-        expected: The same of displacements that the problem neglects.
-        noticed: Whether the motion is inaccurate, or the scene changes.
-    """
-
-    residual: float
-    error: float
-    effect: float
-    expected: float
-    noticed: bool = False
+    residual: float  # standard deviation in units of the noise
+    error: float  # displacement error in px, rms over the blocks of rows of all frames and both axes
+    effect: float  # standard deviation of the difference that the displacement error causes, in units of the noise
+    expected: float  # the same of displacements that the problem neglects
+    noticed: bool = False  # whether the motion is inaccurate, or the scene changes
 
     @property
     def power(self) -> float:
@@ -58,16 +48,10 @@ class FrameDifference:
 
 @torch.no_grad()
 def _difference(problem: SceneProblem, predicted: Tensor, width: int, neglected: float) -> FrameDifference:
-    """Differences of frames of ``width`` px, without the ends of rows and columns.
+    """Differences of the data of one scene from a prediction (M, C, R, L), without the ends of rows and columns.
 
     The displacement error of a block of rows is the least-squares factor of the gradient of the prediction in the
     residual. The variance that noise of the residual causes in it is subtracted.
-
-    Args:
-        problem: One scene.
-        predicted: (M, C, R, L) prediction of the data.
-        width: Columns of the frames.
-        neglected: As in ``finer_scene``.
     """
     # 1. The residual and the gradients of the prediction, by the noise of each row, in blocks of rows.
     data, level = problem.data[0], problem.level[0]
@@ -151,12 +135,7 @@ def finer_scene(problem: SceneProblem, width: int, neglected: float) -> tuple[Te
 
 
 def phase_spread(places: Tensor, frequency: float) -> Tensor:
-    """``1 - |mean exp(2 pi i f x)|^2`` over the frames: 0 if all sample a wave at the same phase.
-
-    Args:
-        places: (M, ...) displacements x in px.
-        frequency: f in cycles per px.
-    """
+    """``1 - |mean exp(2 pi i f x)|^2`` over displacements x (M, ...): 0 if frames sample a wave at the same phase."""
     mean = torch.polar(torch.ones_like(places), 2 * math.pi * frequency * places).mean(0).abs()
     return 1 - mean.square()
 
@@ -164,11 +143,8 @@ def phase_spread(places: Tensor, frequency: float) -> Tensor:
 def warn_of_frames(differences: list[FrameDifference], places: Iterable[Tensor], *, least: float = 0.1) -> None:
     """Warn if frames on a finer grid do not fit their model, or do not sample between each other's pixels.
 
-    Args:
-        differences: Of each scene.
-        places: Mean displacements (M, R, 2) of the rows of the frames of each scene.
-        least: Of ``phase_spread`` at 1 cycle per px, the factor on the information on aliased detail. 0.5 on average
-            for two frames, more for several.
+    ``places`` are the mean displacements (M, R, 2) of the rows of the frames of each scene. ``least`` is a limit of
+    ``phase_spread`` at 1 cycle per px, the factor on the information on aliased detail: 0.5 on average for two frames.
     """
     noticed = [difference for difference in differences if difference.noticed]
     if noticed:

@@ -29,8 +29,6 @@ from rsvib_torch.restoration.scene_model.finer_grid import (
     fit_polynomial_prior,
 )
 
-__all__ = ["MosaicSolver", "restore_mosaic"]
-
 # Luminance, red - blue, and magenta - green. Orthonormal, so that white noise stays white; the three components of a
 # scene are nearly independent, those of the colours are not.
 _COMPONENTS = ((3**-0.5,) * 3, (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
@@ -113,13 +111,9 @@ class MosaicSolver:
         return products.sum((0, 1), dtype=torch.float64) @ count
 
     def fit(self, data: Tensor, start: Tensor | None = None, *, iterations: int, tolerance: float = 1e-2) -> Tensor:
-        """Coefficients (K, 3, U) for data (M, 3, R, L).
+        """Coefficients (K, 3, U) for measured or assumed colours (M, 3, R, L), from the solution with the mean weights.
 
-        Args:
-            data: Measured or assumed colours.
-            start: Coefficients to start from; None for the solution with the mean weights.
-            iterations: Largest number of iterations.
-            tolerance: Residual, relative to that of the start, at which they stop.
+        Iterations stop at a residual of ``tolerance`` times that of the start.
         """
         if start is None:
             start = self._preconditioned(self._adjoint(self._inside * data) * self._density[:, None])
@@ -222,30 +216,19 @@ def restore_mosaic(
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """Frames of one scene.
+    """Frames of one scene."""
 
-    Attributes:
-        images: (M, 3, H, W) colours, measured or interpolated.
-        measured: (M, 3, H, W) bool.
-        floor: (M, 3, H, W) lower bounds of saturated colours, else -inf; None for none.
-        level: Standard deviation of the noise.
-        motion: Motion of these frames, a batch of one.
-        length: L, the period of the rows in px.
-    """
-
-    images: Tensor
-    measured: Tensor
-    floor: Tensor | None
-    level: Tensor
-    motion: FrameMotion
-    length: int
+    images: Tensor  # (M, 3, H, W) colours, measured or interpolated
+    measured: Tensor  # (M, 3, H, W) bool
+    floor: Tensor | None  # (M, 3, H, W) lower bounds of saturated colours, else -inf; None for none
+    level: Tensor  # standard deviation of the noise
+    motion: FrameMotion  # motion of these frames, a batch of one
+    length: int  # L, the period of the rows in px
 
     def demosaiced(self, mosaic: Tensor, pattern: Tensor) -> "_Frames":
         """Frames whose colours are all interpolated, and count as measured; their noise is halved.
 
-        Args:
-            mosaic: (M, 1, H, W) measured values.
-            pattern: (3, H, W) bool, the colour that each pixel measures.
+        ``pattern`` (3, H, W) is the colour that each pixel of the mosaic (M, 1, H, W) measures.
         """
         values = mosaic.expand_as(self.images)
         images = similar_patches(self.images, values, pattern, self.level, rounds=8, steps=6)
@@ -262,14 +245,8 @@ class _Frames:
     ) -> Tensor:
         """Colours (3, scale H, scale W) of the scene.
 
-        Args:
-            observation: Observation operator of the frames.
-            along: (M,) px by which the frames are moved along the rows relative to the restored one.
-            unknown_level: Whether the noise is estimated from the residual of the first fit, if there are several
-                frames.
-            regularisation: Factor on the priors.
-            partition: Parts solved at a time.
-            scale: Points of the result per pixel.
+        ``along`` (M,) are px by which the frames are moved along the rows relative to the restored one. An unknown
+        noise level is estimated from the residual of the first fit, if there are several frames.
         """
         # 1. Deviations from the mean, extended to the period, and the weights of the measured and of the filled values.
         count, width, level = len(self.images), self.images.shape[-1], self.level
@@ -339,12 +316,10 @@ class _Frames:
 
 
 def _same_colours(displacement: Tensor, node_weights: Tensor, *, least: float = 0.1) -> bool:
-    """Whether the frames of a scene measure the same colour at the same points along both axes; with a warning.
+    """Whether frames measure the same colour at the same points along both axes; with a warning.
 
-    Args:
-        displacement: (M, R, N, 2) px during the exposures.
-        node_weights: (N,).
-        least: Of ``phase_spread`` at 1/2 cycle per px, the pattern of the colours.
+    Displacements are (M, R, N, 2) px; ``least`` is a limit of ``phase_spread`` at 1/2 cycle per px, the pattern of
+    colours.
     """
     place = (displacement * node_weights[:, None]).sum(-2)
     same = bool((phase_spread(place, 0.5).median(0).values < least).all())

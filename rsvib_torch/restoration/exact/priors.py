@@ -15,8 +15,6 @@ from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.scene_model.observation import KERNEL_REACH, kernel_samples
 
-__all__ = ["PRIORS", "Prior", "check_prior", "shrink_patches"]
-
 _PATCH, _STEP = 8, 2  # px, size and distance of patches; chosen together with the stages of the prior
 _NEIGHBOURS = _PATCH // _STEP  # patches that begin before the next one that shares no pixel
 _LINES = 4  # of patches, each of neighbours, at a time
@@ -24,19 +22,13 @@ _LINES = 4  # of patches, each of neighbours, at a time
 
 @dataclass(frozen=True)
 class Prior:
-    """An entry of ``PRIORS``.
+    """An entry of ``PRIORS``."""
 
-    Attributes:
-        function: The prior, see the contract above ``PRIORS``.
-        finer_grid: Whether it exists with ``scale=2``, whose solution does not call the function.
-        mosaic: Whether it exists for colour mosaics, whose solution does not call the function.
-        pixel_bytes: Memory in bytes per pixel and channel of the frames beyond that of the Gaussian prior; measured by
-            scripts/benchmark.py --only memory.
-    """
-
-    function: Callable[[SceneProblem, float], Tensor]
-    finer_grid: bool = False
-    mosaic: bool = False
+    function: Callable[[SceneProblem, float], Tensor]  # the prior, see the contract above ``PRIORS``
+    finer_grid: bool = False  # whether it exists with ``scale=2``, whose solution does not call the function
+    mosaic: bool = False  # whether it exists for colour mosaics, whose solution does not call the function
+    # memory in bytes per pixel and channel of the frames beyond that of the Gaussian prior; measured by
+    # scripts/benchmark.py --only memory
     pixel_bytes: int = 12
 
 
@@ -123,13 +115,9 @@ def _cosines_of_neighbours(like: Tensor) -> Tensor:
 def shrink_patches(images: Tensor, level: float | Tensor, offset: tuple[int, int] = (0, 0)) -> Tensor:
     """Images (N, H, W) without the weak cosines of their overlapping patches of 8 x 8 px.
 
-    Cosines of at most two standard deviations are set to zero. Every pixel is the mean of the patches that contain it,
-    weighted by the inverse of their numbers of remaining cosines. Patches begin at every second row and column.
-
-    Args:
-        images: The images.
-        level: Standard deviation of white noise in them, one number or (N, 1, 1).
-        offset: Row and column at which patches begin, 0 or 1.
+    Cosines of at most two standard deviations of white noise of a level are set to zero. Every pixel is the mean of the
+    patches that contain it, weighted by the inverse of their numbers of remaining cosines. Patches begin at every
+    second row and column, from an offset of 0 or 1.
     """
     cosines, shared = _cosines_of_neighbours(images), _PATCH - _STEP
     before = [shared + begin for begin in offset]

@@ -31,8 +31,6 @@ from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import allowed_threads, in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
-__all__ = ["Partition", "SceneProblem", "SceneSolver", "join_windows", "row_windows"]
-
 
 def row_windows(rows: int, count: int, overlap: int = 96) -> list[slice]:
     """Windows of one size that cover all rows, neighbours overlapping by at least twice ``overlap`` rows.
@@ -104,17 +102,10 @@ class Partition:
         keep: bool,
         num_scenes: int = 1,
     ) -> tuple[list[slice], list[slice]]:
-        """Chunks of the frequencies, and windows of the rows of scenes.
+        """Chunks of the frequencies, and windows of the rows of scenes with a band of half-width ``width``.
 
-        Args:
-            rows: Rows of a scene.
-            width: Half-width of the band.
-            frequencies: Number of frequencies.
-            device: Device of the data.
-            blurred: Whether exposures blur: frequencies that many neighbouring rows do not observe then depend on
-                distant rows, and the rows are not divided.
-            keep: Whether the factors of all frequencies are kept.
-            num_scenes: Scenes solved together.
+        Where exposures blur, frequencies that many neighbouring rows do not observe depend on distant rows, and the
+        rows are not divided. ``keep`` states that the factors of all frequencies are kept.
         """
         values = self.most_values(rows, frequencies, device, blurred=blurred, single=num_scenes == 1)
         most = frequencies if keep else max(1, values // (num_scenes * rows * (2 * width + 1)))
@@ -268,21 +259,13 @@ class SceneSolver:
 
 @dataclass(frozen=True, eq=False)
 class SceneProblem:
-    """N scenes, each observed by M frames.
+    """N scenes, each observed by M frames."""
 
-    Attributes:
-        data: (N, M, C, R, L), rows of period L, mean brightness 0.
-        observation: Observation operator of the frames.
-        precision: Precision of the row prior, products as from ``RowPrior.precision``.
-        level: (N,) standard deviation of the noise of data of weight 1.
-        partition: Parts solved at a time.
-    """
-
-    data: Tensor
-    observation: Observation
-    precision: Tensor
-    level: Tensor
-    partition: Partition
+    data: Tensor  # (N, M, C, R, L), rows of period L, mean brightness 0
+    observation: Observation  # observation operator of the frames
+    precision: Tensor  # precision of the row prior, products as from ``RowPrior.precision``
+    level: Tensor  # (N,) standard deviation of the noise of data of weight 1
+    partition: Partition  # parts solved at a time
 
     def solver(self, *, keep: bool = False) -> SceneSolver:
         """The solver for complete data; ``keep`` its factors, for solving several times."""

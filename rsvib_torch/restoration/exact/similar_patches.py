@@ -16,8 +16,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["similar_patches"]
-
 _PATCH = 4  # px; 3 px: -0.6 to -1.2 dB, 5 px: -0.3 to +0.1 dB in three times the time
 _REACH = 7  # px to the patches that are compared; 10 px: -0.1 to +0.1 dB
 _GROUP = 64  # patches; 48 or 96: -0.3 to +0.1 dB
@@ -90,13 +88,9 @@ def _references(size: int, device: torch.device) -> Tensor:
 
 
 def _similar(images: Tensor, starts: Tensor, places: Tensor, period: int) -> Tensor:
-    """Numbers (N, references, period^2, patches) of the patches nearest to those at rows ``starts``.
+    """Numbers (N, references, period^2, patches) of the patches nearest to those at rows and columns of references.
 
-    Args:
-        images: (N, C, H, W).
-        starts: First rows of the references.
-        places: Their first columns.
-        period: Of the pattern; patches of each place in it are chosen separately.
+    Patches of each place in a pattern of a period are chosen separately.
     """
     # 1. The rows that contain the references, and the same with their surroundings, infinite outside of the image.
     height, width = images.shape[-2:]

@@ -20,8 +20,6 @@ from torch import Tensor
 from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 
-__all__ = ["Explained", "SampledRows", "prior_strengths", "sample_rows", "select_strengths", "smoothness"]
-
 Array = NDArray[Any]
 
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
@@ -29,17 +27,12 @@ _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for th
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """Residuals of fits with n priors to S scenes, frequency by frequency.
+    """Residuals of fits with n priors to S scenes, frequency by frequency."""
 
-    Attributes:
-        power: (n, S, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel.
-        freedom: (n, S, F) degrees of freedom of the fit.
-        count: (S,) rows with a weight above 0.
-    """
-
+    # (n, S, F) squared residuals of all rows, mean over channels, in units of the noise of one pixel
     power: NDArray[np.float64]
-    freedom: NDArray[np.float64]
-    count: NDArray[np.int64]
+    freedom: NDArray[np.float64]  # (n, S, F) degrees of freedom of the fit
+    count: NDArray[np.int64]  # (S,) rows with a weight above 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,26 +40,16 @@ class SampledRows:
     """Rows of S scenes of M images at F frequencies, in G = S n slabs of rows with K coefficients of the scene each.
 
     Slabs are fitted independently and together, which takes little longer than one slab.
-
-    Attributes:
-        u: (F,) frequencies in cycles per px.
-        spectra: (G, M R, C, F), the phase of each row's middle taken off.
-        taps: Kernels (G, M R, J, F).
-        base: (G, M R) first coefficient of each row's kernel, of the K of its slab.
-        weight: (G, M R) weight of each row, in the precision of the spectra.
-        count: K.
-        slabs: n.
-        energy: Squared norm of the taper, times the number of channels; powers are divided by it.
     """
 
-    u: NDArray[np.float64]
-    spectra: Array
-    taps: Array
-    base: NDArray[np.int64]
-    weight: Array
-    count: int
-    slabs: int
-    energy: float
+    u: NDArray[np.float64]  # (F,) frequencies in cycles per px
+    spectra: Array  # (G, M R, C, F), the phase of each row's middle taken off
+    taps: Array  # kernels (G, M R, J, F)
+    base: NDArray[np.int64]  # (G, M R) first coefficient of each row's kernel, of the K of its slab
+    weight: Array  # (G, M R) weight of each row, in the precision of the spectra
+    count: int  # K
+    slabs: int  # n
+    energy: float  # squared norm of the taper, times the number of channels; powers are divided by it
 
     @cached_property
     def _selection(self) -> Any:
@@ -130,13 +113,9 @@ class SampledRows:
 
 
 def _add_row_prior(bands: Array, precision: Array, rows: int, width: int) -> None:
-    """Add the precision of an autoregressive prior to skewed bands, in their memory.
+    """Add the precision (p + 1, p + 1, N, U) of a prior to skewed bands in their memory.
 
-    Args:
-        bands: (rows + width, 2 width + 1, N, U), of N scenes.
-        precision: Products (p + 1, p + 1, N, U) as from ``RowPrior.precision``.
-        rows: Rows of a scene.
-        width: Half-width of the band.
+    The bands are (rows + width, 2 width + 1, N, U), of N scenes.
     """
     for d in range(len(precision)):
         for side in {d, -d}:
@@ -187,13 +166,10 @@ def _solved(upper: Array, pivots: Array, right: Array) -> Array:
 def sample_rows(
     images: Tensor, kernels: RowKernels, chosen: NDArray[np.int64], slab_rows: int = _SLAB_ROWS
 ) -> SampledRows:
-    """Spectra of tapered rows at a few frequencies, in slabs of rows.
+    """Spectra of tapered rows of images (S, M, C, R, W) at frequencies (F,), cycles in W px, in slabs of equal height.
 
-    Args:
-        images: (S, M, C, R, W); of up to n - 1 rows more than n slabs of equal height have, none is used.
-        kernels: Kernels of the rows of S M images, those of a scene one after the other.
-        chosen: (F,) whole numbers of cycles in W px.
-        slab_rows: Rows of a slab.
+    ``kernels`` are those of the rows of S M images, of a scene one after the other. Rows beyond the last slab are not
+    used.
     """
     scenes, members, channels = images.shape[:3]
     slabs = max(1, images.shape[-2] // slab_rows)
@@ -315,12 +291,10 @@ def prior_strengths(
 def select_strengths(
     products: Array, certain: NDArray[np.bool_], explain: Callable[[list[Array]], Explained]
 ) -> NDArray[np.float64]:
-    """The strengths (S,) that cross-validation selects.
+    """The strengths (S,) that cross-validation selects of precisions (n, p + 1, p + 1, S, F) from strong to weak.
 
-    Args:
-        products: (n, p + 1, p + 1, S, F) precision of the prior with each of the strengths from strong to weak.
-        certain: (S,) whether the noise level is certain, so that the prior may be stronger than it states.
-        explain: Residual power and degrees of freedom of the data for some of the precisions.
+    The prior may be stronger than it states where the noise level is ``certain`` (S,). ``explain`` returns residual
+    power and degrees of freedom of the data for some of the precisions.
     """
     # a stronger prior is allowed only if the noise level is certain; of those allowed, the three strongest are tried
     # first, and all others only if the weakest of them is selected, which is rare

@@ -36,8 +36,6 @@ from rsvib_torch.restoration.scene_model.observation import (
 )
 from rsvib_torch.restoration.scene_model.scene_prior import observed_spectrum, smeared
 
-__all__ = ["GRIDS", "SCALE", "FinerObservation", "PolynomialPrior", "finer_kernels", "fit_polynomial_prior"]
-
 SCALE = 2  # points per px of the finer grid, and unknowns per frequency
 _FINER_DEGREE = 3
 _FINER_SCENE_REACH = 5  # half rows on either side; support of the weights of a scene row on the finer grid
@@ -195,22 +193,15 @@ class PolynomialPrior:
 
     lambda is the discrete Laplacian on the grid, sinc the transfer function of a pixel and b that of the cubic
     B-spline: without b it is the spectrum of the coefficients of the scene.
-
-    Attributes:
-        coefficients: (p + 1, p + 1) a_mn, in px^-2 over squared units of the frames, float64.
-        period: L, period of the rows in px.
     """
 
-    coefficients: Tensor
-    period: int
+    coefficients: Tensor  # (p + 1, p + 1) a_mn, in px^-2 over squared units of the frames, float64
+    period: int  # L, period of the rows in px
 
     def precision(self, noise_power: Tensor, strength: float = 1.0, blur_reach: float = 0.0) -> Tensor:
         """Factors q_m of ``sum_m q_m(u - a) T^m`` in units of the data's noise, (p + 1, 2, U), float64.
 
-        Args:
-            noise_power: Variance of the noise of data of weight 1.
-            strength: Factor on the precision.
-            blur_reach: Of ``RowKernels``.
+        Arguments as in ``RowPrior.precision``.
         """
         u = torch.fft.rfftfreq(self.period, dtype=torch.float64, device=noise_power.device)
         u = torch.stack([u, u - 1])

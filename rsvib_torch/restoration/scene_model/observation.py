@@ -25,26 +25,6 @@ from rsvib_torch.core.fourier import shift_phases
 from rsvib_torch.core.splines import correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 
-__all__ = [
-    "KERNEL_REACH",
-    "MARGIN",
-    "SCENE_REACH",
-    "TAPS",
-    "Observation",
-    "RowKernels",
-    "SmoothBand",
-    "about_middle",
-    "interpolation_error",
-    "interpolation_matrix",
-    "kernel_samples",
-    "kernel_spectrum",
-    "kernel_weights",
-    "normal_matrices",
-    "row_kernels",
-    "scene_weights",
-    "smooth_kernels",
-]
-
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH
 SCENE_REACH = 5  # rows on either side; support of the weights of a scene row
@@ -73,14 +53,7 @@ def _kernel(distance: Tensor) -> Tensor:
 
 
 def kernel_weights(fraction: Tensor) -> Tensor:
-    """Weights of the six rows ``n - 2 ... n + 3`` at position ``n + fraction``.
-
-    Args:
-        fraction: Fractional positions in [0, 1], any shape S.
-
-    Returns:
-        Weights (S, 6); their sum is 1 to 5e-4.
-    """
+    """Weights (S, 6) of the six rows ``n - 2 ... n + 3`` at positions ``n + fraction`` (S); their sum is 1 to 5e-4."""
     taps = torch.arange(TAPS, dtype=fraction.dtype, device=fraction.device) - (KERNEL_REACH - 1)
     return _kernel(fraction[..., None] - taps)
 
@@ -117,36 +90,20 @@ def scene_weights() -> tuple[float, ...]:
 
 
 def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1, 1, 2, 3)) -> Tensor:
-    """Power of the aliases that a wave of unit coefficients has between the rows.
-
-    Args:
-        frequencies: Cycles per row within -0.5 ... 0.5, any shape.
-        cycles: Offsets of the aliases in cycles per row.
-
-    Returns:
-        Power of the same shape.
-    """
+    """Power of the aliases, at offsets of ``cycles`` per row, that a wave of unit coefficients has between the rows."""
     aliases = frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
     return kernel_spectrum(aliases).square().sum(-1)
 
 
 @dataclass(frozen=True, eq=False)
 class RowKernels:
-    """Kernels of the rows of M frames, which act on the coefficients of their scene.
+    """Kernels of the rows of M frames, which act on the coefficients of their scene."""
 
-    Attributes:
-        first: (M, R) first scene row of the kernel of each row.
-        taps: (M, R, J, N) weights of J scene rows at N nodes of the exposure, float64.
-        middle: (M, R) displacement along the row in px that the phase of the data is corrected by, float64.
-        along: (M, R, N) displacement along the row relative to the middle, float64.
-        weight: (M, R) weight of each row, float64.
-    """
-
-    first: Tensor
-    taps: Tensor
-    middle: Tensor
-    along: Tensor
-    weight: Tensor
+    first: Tensor  # (M, R) first scene row of the kernel of each row
+    taps: Tensor  # (M, R, J, N) weights of J scene rows at N nodes of the exposure, float64
+    middle: Tensor  # (M, R) displacement along the row in px that the phase of the data is corrected by, float64
+    along: Tensor  # (M, R, N) displacement along the row relative to the middle, float64
+    weight: Tensor  # (M, R) weight of each row, float64
 
     @cached_property
     def blur_reach(self) -> float:
@@ -240,17 +197,11 @@ def _stacked(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SmoothKernels:
-    """Kernels at any frequencies by one matrix product.
+    """Kernels at any frequencies by one matrix product."""
 
-    Attributes:
-        left: (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row.
-        reach: Largest distance along the rows in px from their middles.
-        symmetric: Whether kernels at -u are the conjugates of those at u.
-    """
-
-    left: Tensor
-    reach: float
-    symmetric: bool = True
+    left: Tensor  # (J, M R, 2 Q) real and imaginary parts at Q nodes of every tap of every row
+    reach: float  # largest distance along the rows in px from their middles
+    symmetric: bool = True  # whether kernels at -u are the conjugates of those at u
 
     def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[Tensor]:
         """Kernels (M R, U), or their conjugates, without the phase of their middles, one tap after the other."""
@@ -271,20 +222,14 @@ def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
 
 @dataclass(frozen=True, eq=False)
 class SmoothBand:
-    """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added.
+    """Normal matrices of N scenes at any frequencies by one matrix product, to which the prior is added."""
 
-    Attributes:
-        left: (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows; the last b rows are 0.
-            In windows the halves (H + b, 2 b + 1, 2, N W, 2 Q) as from ``from_both_ends`` of W windows of each scene.
-        reach: Largest distance along the rows in px of the products of kernels.
-        windows: W.
-        rows: R, in windows.
-    """
-
+    # (R + b, 2 b + 1, N, 2 Q) real and imaginary parts at Q nodes of systems of R rows; the last b rows are 0. In
+    # windows the halves (H + b, 2 b + 1, 2, N W, 2 Q) as from ``from_both_ends`` of W windows of each scene
     left: Tensor
-    reach: float
-    windows: int = 1
-    rows: int = 0
+    reach: float  # largest distance along the rows in px of the products of kernels
+    windows: int = 1  # W
+    rows: int = 0  # R, in windows
 
     @property
     def width(self) -> int:

@@ -13,25 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, runs
 from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.core.splines import mirrored
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
-
-__all__ = [
-    "ORDER",
-    "ObservedSpectrum",
-    "RowPrior",
-    "autoregressive_prior",
-    "bounded_ratio",
-    "brightness",
-    "cut_pieces",
-    "fit_prior",
-    "observed_spectrum",
-    "smeared",
-    "spread_starts",
-]
 
 ORDER = 2  # rows that a row is predicted from
 _TINY = float(np.finfo(np.float32).tiny)  # smallest power
@@ -43,16 +29,11 @@ class RowPrior:
 
     ``c(s) = - a_1 c(s - 1) - ... - a_p c(s - p) + e(s)`` with white ``e``: a stationary process, whose precision
     matrix is banded.
-
-    Attributes:
-        power: (N, U) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1.
-        reflections: (p, N, U) partial correlations, within -1 ... 1.
-        interpolation_power: (N, T, U) power of the interpolation error between rows, which counts as noise, of each
-            frame.
     """
 
-    power: Tensor
-    reflections: Tensor
+    power: Tensor  # (N, U) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1
+    reflections: Tensor  # (p, N, U) partial correlations, within -1 ... 1
+    # (N, T, U) power of the interpolation error between rows, which counts as noise, of each frame
     interpolation_power: Tensor
 
     def of(self, stacks: Tensor, members: Tensor) -> "RowPrior":
@@ -89,12 +70,10 @@ class RowPrior:
     def precision(
         self, noise_power: Tensor, strength: Tensor | float = 1.0, blur_reach: Tensor | float = 0.0
     ) -> Tensor:
-        """``products`` in units of the data's noise.
+        """``products`` in units of the data's noise, (N, 1) the variance for data of weight 1.
 
-        Args:
-            noise_power: (N, 1) variance of the noise of data of weight 1.
-            strength: Factor on the precision, a number or (N, 1).
-            blur_reach: Largest distance along the row in px during an exposure from its middle, a number or (N, 1).
+        ``blur_reach`` is the largest distance along the row in px during an exposure from its middle; it and
+        ``strength``, a factor on the precision, are numbers or (N, 1).
         """
         precision: Tensor = self.products() * bounded_ratio(self.ratio(noise_power) * strength, blur_reach)
         return precision
@@ -230,25 +209,15 @@ def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ObservedSpectrum:
-    """Power spectra of pieces of the frames of N stacks, whose rows were moved back by their displacement.
+    """Power spectra of pieces of the frames of N stacks, whose rows were moved back by their displacement."""
 
-    Attributes:
-        u: (U,) horizontal frequencies, cycles per px.
-        v: (V,) vertical frequencies.
-        power: (N, T, pieces, U, V) power per pixel: white noise of variance 1 has power 1.
-        whole: (N, U, V) of whole rows with their boundary extension.
-        displacement: (N, T, pieces, nodes, 2) px during the exposure of the middle row of each piece.
-        node_weights: (nodes,).
-        levels: (N, T) standard deviation of the noise of each frame.
-    """
-
-    u: Tensor
-    v: Tensor
-    power: Tensor
-    whole: Tensor
-    displacement: Tensor
-    node_weights: Tensor
-    levels: Tensor
+    u: Tensor  # (U,) horizontal frequencies, cycles per px
+    v: Tensor  # (V,) vertical frequencies
+    power: Tensor  # (N, T, pieces, U, V) power per pixel: white noise of variance 1 has power 1
+    whole: Tensor  # (N, U, V) of whole rows with their boundary extension
+    displacement: Tensor  # (N, T, pieces, nodes, 2) px during the exposure of the middle row of each piece
+    node_weights: Tensor  # (nodes,)
+    levels: Tensor  # (N, T) standard deviation of the noise of each frame
 
     def blur(self, u: Tensor, v: Tensor) -> Tensor:
         """Squared transfer functions (N, T, pieces, U, V) of the exposures at frequencies u and v."""
@@ -271,19 +240,13 @@ class ObservedSpectrum:
 
 _PIECE = (64, 256)  # px, rows and columns of the pieces
 _PIECES = 128  # of a frame, at most
-_VALUES = {"cpu": 1 << 21, "cuda": 1 << 27}  # of the pieces that are transformed at a time; bounds the memory
 
 
 def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) -> ObservedSpectrum:
-    """Power spectra of pieces of 64 x 256 px of the frames of N stacks.
+    """Power spectra of pieces of 64 x 256 px of frames (N, T, C, H, W) with noise levels (N, T).
 
-    Rows are moved back by their displacement, so that neighbours correlate as in the scene.
-
-    Args:
-        frames: (N, T, C, H, W) in row order.
-        motion: Motion of the frames.
-        levels: (N, T) standard deviation of the noise of each frame.
-        length: Length of the Fourier transform along rows.
+    Rows are moved back by their displacement, so that neighbours correlate as in the scene. ``length`` is that of the
+    Fourier transform along rows.
     """
     # places of the pieces, which overlap by half if possible, their tapers and frequencies
     shape = frames.shape[-2:]
@@ -308,8 +271,8 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
     back = waves(mean, -u).to(frames.dtype.to_complex()) * tapers[0][:, None]  # (N, T, n, rows, U)
     # power of the pieces, mean over channels and columns of pieces, some rows of pieces at a time
     bright = brightness(frames)[..., None, None, None]
-    values = frames[..., 0, 0].numel() * len(lefts) * size[0] * size[1]
-    step = max(1, _VALUES.get(frames.device.type, 1 << 21) // values)
+    piece_bytes = 8 * frames[..., 0, 0].numel() * len(lefts) * size[0] * size[1]
+    step = at_once(piece_bytes, frames.device, cpu_bytes=2**24)
     powers = []
     for chosen in runs(len(tops), step):
         pieces = cut_pieces(frames, tops[chosen], lefts, size)  # (N, T, C, n, m, rows, columns)
@@ -357,12 +320,8 @@ def smeared(transfer: Tensor) -> Tensor:
 def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
     """Power (N, U, V) of whole rows with their boundary extension, pooled to U frequencies along them.
 
-    Rows are not moved back by their displacement: it does not matter at the low frequencies of the extension.
-
-    Args:
-        strips: (N, T, C, n, R, W), tapered across their rows.
-        length: Period of the rows.
-        count: U.
+    The strips (N, T, C, n, R, W) are tapered across their rows. Rows are not moved back by their displacement: it does
+    not matter at the low frequencies of the extension.
     """
     power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2)).mean((1, 2, 3))
     return torch.nn.functional.adaptive_avg_pool1d(power, count).mT.to(torch.float64)

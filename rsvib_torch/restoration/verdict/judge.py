@@ -19,7 +19,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
 from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, runs
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.progress import steps
 from rsvib_torch.core.reason import Reason
@@ -71,7 +71,6 @@ _DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
 
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
-_PIXELS = {"cpu": 1 << 22, "cuda": 1 << 26}  # judged at a time; bounds the memory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -106,10 +105,8 @@ class RestorationVerdict(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> restored = rsv.restore(frames, timing, vibration, check=False)
         >>> verdict = rsv.judge_restoration(frames, restored, timing, vibration)
         >>> verdict.outcome, bool(verdict.misfit_after.max() < 0.01)  # px
@@ -245,29 +242,18 @@ def _mean_square(difference: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _PairVerdicts:
-    """Verdicts on one pair of frames of each of B stacks, in row order; the fields of ``RestorationVerdict``.
+    """Verdicts on one pair of frames of each of B stacks, in row order; the fields of ``RestorationVerdict``."""
 
-    Attributes:
-        levels: (5, B) before, after, noise, chi_square, predicted_gain.
-        displacements: (3, B, 2) misfit_before, misfit_after, resolution.
-        outcomes: Outcome of each stack.
-        reasons: Reasons for each outcome.
-    """
-
-    levels: Tensor
-    displacements: Tensor
-    outcomes: list[Outcome]
-    reasons: list[tuple[Reason, ...]]
+    levels: Tensor  # (5, B) before, after, noise, chi_square, predicted_gain
+    displacements: Tensor  # (3, B, 2) misfit_before, misfit_after, resolution
+    outcomes: list[Outcome]  # outcome of each stack
+    reasons: list[tuple[Reason, ...]]  # reasons for each outcome
 
 
 def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_missing: float = 0.5) -> _PairVerdicts:
     """Verdict on one pair of each stack; not judged if more than ``max_missing`` is missing.
 
-    Args:
-        pair: The pairs of B stacks.
-        moves: For each stack, the axes with motion in the vibration.
-        shared: Frames from which one image is restored.
-        max_missing: Largest share of missing pixels.
+    ``moves`` are the axes with motion of each stack, ``shared`` the frames from which one image is restored.
     """
     # Noise of the raw frames; frames that differ in brightness are made equal.
     raw = torch.stack([pair.earlier, pair.later], 1)
@@ -364,10 +350,8 @@ def judge_restoration(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
+        >>> from rsvib_torch.evaluation import example_frames
+        >>> frames, timing, vibration = example_frames()
         >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
         >>> for candidate in (vibration, wrong):
         ...     restored = rsv.restore(frames, timing, candidate, check=False)
@@ -469,19 +453,11 @@ def judge_stacks(
     most_pairs: int | None = None,
     columns: int | None = None,
 ) -> list[RestorationVerdict | TooLittleInCommonError]:
-    """Verdicts on stacks of a batch, which are judged together.
+    """Verdicts on stacks of a batch, which are judged together, or errors if two frames have too little in common.
 
-    Args:
-        frames: The raw frames.
-        restored: (B, T, C, H, W), or (B, 1, C, H, W), in row order.
-        motion: The motion that was undone, batch shape (B,), in row order.
-        moves: Indices of the stacks to judge, and for each the axes with motion in row order.
-        joint: As in ``judge_restoration``.
-        most_pairs: As in ``judge_restoration``.
-        columns: Judge on so many columns only, those with the most detail; None for all.
-
-    Returns:
-        For each of these stacks its verdict in image axes, or an error if two frames have too little in common.
+    Restored frames (B, T, C, H, W), or (B, 1, C, H, W), and the motion that was undone are in row order, verdicts in
+    image axes. ``moves`` has the stacks to judge with their axes with motion. Only the ``columns`` with the most detail
+    are used.
     """
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
@@ -494,7 +470,7 @@ def judge_stacks(
 
     # as many stacks at a time as the memory allows
     pixels = raw.shape[2] * raw.shape[3] * min(columns or raw.shape[4], raw.shape[4])
-    together = max(1, _PIXELS.get(raw.device.type, 1 << 22) // pixels)
+    together = at_once(16 * pixels, raw.device, cpu_bytes=2**26)
     verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
     for chosen in (list(moves)[part] for part in runs(len(moves), together)):
         taken, images = _of_stacks(raw, chosen), _of_stacks(still, chosen)
@@ -512,36 +488,19 @@ def _of_stacks(values: Tensor, chosen: list[int]) -> Tensor:
 
 @dataclass(frozen=True)
 class _Task:
-    """What the verdicts on the stacks of a batch have in common.
+    """What the verdicts on the stacks of a batch have in common."""
 
-    Attributes:
-        pairs: Indices of the frames to compare.
-        shared: Frames from which one image is restored.
-        columns: Judge on so many columns only, those with the most detail; None for all.
-        timing: The sensor in image orientation.
-        advance: To be called with the number of stacks that were judged.
-    """
-
-    pairs: list[tuple[int, int]]
-    shared: int
-    columns: int | None
-    timing: SensorTiming
-    advance: Callable[[int], None]
+    pairs: list[tuple[int, int]]  # indices of the frames to compare
+    shared: int  # frames from which one image is restored
+    columns: int | None  # judge on so many columns only, those with the most detail; None for all
+    timing: SensorTiming  # the sensor in image orientation
+    advance: Callable[[int], None]  # to be called with the number of stacks that were judged
 
 
 def _judge_batch(
     raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: FrameMotion, moves: list[list[bool]], task: _Task
 ) -> list[RestorationVerdict | TooLittleInCommonError]:
-    """Verdicts on all stacks of a batch, whose displacement depends on the row only.
-
-    Args:
-        raw: As in ``shared_part``, and likewise the next three.
-        restored: Restored frames.
-        ignore: Pixels that were not measured.
-        motion: Motion of the frames.
-        moves: For each stack, the axes with motion in the vibration.
-        task: What the verdicts have in common.
-    """
+    """Verdicts on all stacks of a batch, whose displacement depends on the row only, see ``shared_part``."""
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.
     size = raw.shape[-2], raw.shape[-1]

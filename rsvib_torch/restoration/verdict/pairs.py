@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.chunking import at_once, runs
 from rsvib_torch.core.fourier import extended_length, spline_spectra
 from rsvib_torch.core.splines import correlated
 from rsvib_torch.frames.pixels import cut_parts, detailed_parts
@@ -21,23 +21,9 @@ from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
-__all__ = [
-    "FramePairs",
-    "Overlap",
-    "TooLittleInCommonError",
-    "equally_bright",
-    "misfit",
-    "overlaps",
-    "pairs_to_judge",
-    "reblur",
-    "shared_part",
-]
-
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
 _RIM = math.ceil(3 * _SMOOTHING) + 1  # px; half width of the kernels of ``misfit``
 _MARGIN = 4  # px between the compared pixels and those outside the frame
-# values of the kernels in ``reblur`` at a time, which bounds the memory: 16 MB on a CPU
-_ELEMENTS = {"cpu": 1 << 21, "cuda": 1 << 26}
 
 
 class TooLittleInCommonError(ValueError):
@@ -73,27 +59,17 @@ class Overlap:
 
 @dataclass(frozen=True, eq=False)
 class FramePairs:
-    """The common parts of two raw frames and of their restored frames, of each of B stacks, (B, C, h, w) each.
+    """The common parts of two raw frames and of their restored frames, of each of B stacks, (B, C, h, w) each."""
 
-    Attributes:
-        earlier: Raw.
-        later: Raw.
-        restored: Restored from the earlier frame, or the one image of all frames.
-        restored_later: Restored from the later frame; None where there is one image.
-        predicted: The later raw frame, formed from ``restored``.
-        changed_later: Change of the restored later frame by the motion of that frame.
-        offset: (B, 2) px, root-mean-square displacement between the two frames by the motion, axes (x, y).
-        ignore: (B, 2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored
-            frames predict. None for none.
-    """
-
-    earlier: Tensor
-    later: Tensor
-    restored: Tensor
-    restored_later: Tensor | None
-    predicted: Tensor
-    changed_later: Tensor
-    offset: Tensor
+    earlier: Tensor  # raw
+    later: Tensor  # raw
+    restored: Tensor  # restored from the earlier frame, or the one image of all frames
+    restored_later: Tensor | None  # restored from the later frame; None where there is one image
+    predicted: Tensor  # the later raw frame, formed from ``restored``
+    changed_later: Tensor  # change of the restored later frame by the motion of that frame
+    offset: Tensor  # (B, 2) px, root-mean-square displacement between the two frames by the motion, axes (x, y)
+    # (B, 2, C, h, w) bool, pixels of the raw frames without data; they hold the values that the restored frames
+    # predict. None for none
     ignore: Tensor | None = None
 
 
@@ -112,10 +88,7 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
 def overlaps(motion: FrameMotion, moved: Tensor, pairs: list[tuple[int, int]]) -> list[list[Overlap]]:
     """What the frames of each pair have in common, for each of B stacks.
 
-    Args:
-        motion: Motion of the frames.
-        moved: (B, T, R, 2) mean displacement of their rows beyond the shift, in px.
-        pairs: Indices of the two frames of each pair.
+    ``moved`` (B, T, R, 2) is the mean displacement of their rows beyond the shift, in px.
     """
     # one transfer for all stacks and pairs
     shifts, reaches = torch.stack([motion.shift, moved.abs().amax(-2)]).flip(-1).tolist()
@@ -317,8 +290,8 @@ def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int
     u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
     spectra = spline_spectra(scenes, degree, length).transpose(0, 1).flatten(1, 2)
     # a few rows of all scenes at a time
-    values = count * (degree + 1 + math.ceil(blur)) * len(u)
-    step = max(1, _ELEMENTS.get(scenes.device.type, 1 << 21) // values)
+    kernel_bytes = 16 * count * (degree + 1 + math.ceil(blur)) * len(u)
+    step = at_once(kernel_bytes, scenes.device, cpu_bytes=2**25)
     along = along.to(scenes.dtype)
     formed = [
         form_rows(spectra, place[:, part], along[:, part], node_weights, u, degree, num_scenes=count)

@@ -15,8 +15,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["displacement_uncertainty", "trusted_vibration", "vibration_to_undo"]
-
 
 def displacement_uncertainty(
     vibration: Vibration, std: Any, timing: SensorTiming, num_frames: int, num_rows: int

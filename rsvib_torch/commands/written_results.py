@@ -1,0 +1,73 @@
+"""Results that commands write into a folder: files of detections and windows, and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rsvib_torch import io, stacks
+from rsvib_torch import report as reports
+from rsvib_torch.commands.shared_options import check_new
+from rsvib_torch.commands.terminal import error_line, note, working
+from rsvib_torch.core.atomic import check_writable, write_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.motion.timing import SensorTiming
+
+OF_DETECTION = ("vibration.json", "offsets.csv", "offsets.png")
+OF_WINDOWS = ("manifest.json", "windows.json", "windows.csv", "windows.png")
+
+
+def check_folder(
+    folder: Path, names: Iterable[str], overwrite: bool, inputs: Iterable[Path | None], output: Path | None = None
+) -> None:
+    """Raise an error if results, among them a stack ``output``, exist in a folder or would replace an input."""
+    stack = [] if output is None else io.stack_files(output)
+    check_new([*(folder / name for name in names), *stack], overwrite, inputs, folder=folder)
+    check_writable(folder, folder=True)
+
+
+def remove_old(folder: Path, results: Iterable[str], names: Iterable[str]) -> None:
+    """Remove results of an earlier run from a folder that this run did not replace."""
+    for name in set(results) - set(names):
+        (folder / name).unlink(missing_ok=True)
+
+
+def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
+    """Draw a figure and return its name; a warning if that fails, because the results do not depend on figures."""
+    try:
+        reports.save_figure(draw(), path)
+    except Exception as error:
+        error_line(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}", "warning")
+        return []
+    return [path.name]
+
+
+def write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
+    """Write a detection as JSON, CSV and figure, and return the names of the files."""
+    with working("drawing the offset curve"):
+        reports.write_vibration(folder / "vibration.json", result, timing)
+        reports.write_offsets(folder / "offsets.csv", result)
+        drawn = draw_safely(folder / "offsets.png", lambda: reports.offset_figure(result))
+    return [*drawn, "vibration.json", "offsets.csv"]
+
+
+def write_windows(folder: Path, path: Path) -> list[str]:
+    """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
+    manifest = stacks.read_manifest(path)
+    with working("drawing the windows"):
+        write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
+        reports.write_windows(folder / "windows.csv", manifest)
+        starts = [record.start_time for record in manifest.windows]
+        drawn = draw_safely(folder / "windows.png", lambda: reports.windows_figure(starts, manifest.detections()))
+    return [*drawn, "windows.json", "windows.csv"]
+
+
+def note_lost(path: Path, names: Sequence[str]) -> None:
+    """Print which metadata of the input a file does not contain."""
+    if names:
+        note(f"{path}: not kept from the input: {', '.join(names)}")
