@@ -6,15 +6,12 @@ amplitudes and frequencies, and random phases.
 """
 
 import argparse
-import inspect
 import json
 import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -46,35 +43,6 @@ SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
 }
 
 
-@dataclass
-class Trial:
-    """One scene with its options and the times of its steps."""
-
-    name: str
-    seed: int
-    methods: dict[str, dict[str, str]]  # options of detection and restoration
-    arguments: Sequence[str]  # of the command line
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def step(self, what: str) -> Iterator[None]:
-        """Show the progress of a step and record its time."""
-        begin = time.perf_counter()
-        with working(f"{self.name}: {what}"):
-            yield
-        self.seconds[what] = round(time.perf_counter() - begin, 3)
-
-
-def method_used(function: Callable[..., Any], options: dict[str, str]) -> str:
-    """Method of a function with these options."""
-    return options.get("method", inspect.signature(function).parameters["method"].default)
-
-
-def wrapped(angle: float) -> float:
-    """Angle in -pi ... pi."""
-    return math.remainder(angle, 2 * math.pi)
-
-
 def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any]]:
     """True and detected values of each axis, with the relative error, or the error of the phase in π."""
     lines = []
@@ -82,7 +50,7 @@ def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any
         for quantity, unit, scale in (("period", "ms", 1e3), ("amplitude", "px", 1.0), ("phase", "π", 1 / math.pi)):
             true, found = (scale * float(getattr(v, quantity)[axis, 0]) for v in (truth, detected))
             if quantity == "phase":
-                error = f"{wrapped(math.pi * (found - true)) / math.pi:+.4f} π"
+                error = f"{math.remainder(found - true, 2):+.4f} π"
             else:
                 error = f"{100 * (found / true - 1):+.4f} %"
             value = float(error.split()[0])
@@ -93,10 +61,10 @@ def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any
     return lines
 
 
-def show(console: Console, trial: Trial, lines: list[dict[str, Any]], quality: dict[str, Any]) -> None:
+def show(console: Console, name: str, lines: list[dict[str, Any]], quality: dict[str, Any]) -> None:
     """Print both tables of a scene."""
     heads = ("axis", "quantity", "true", "detected", "error")
-    table = Table(*heads, title=f"{trial.name}: vibration", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(*heads, title=f"{name}: vibration", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for line in lines:
         digits = 4 if line["unit"] == "px" else 3
         table.add_row(
@@ -108,7 +76,7 @@ def show(console: Console, trial: Trial, lines: list[dict[str, Any]], quality: d
         )
     console.print(table)
     heads = ("frame", "PSNR before (dB)", "PSNR after", "SSIM before", "SSIM after")
-    table = Table(*heads, title=f"{trial.name}: frames", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(*heads, title=f"{name}: frames", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for frame, (psnr_before, psnr_after, ssim_before, ssim_after) in enumerate(
         zip(*(quality[f"{what}_{when}"] for what in ("psnr", "ssim") for when in ("before", "after")), strict=True)
     ):
@@ -140,32 +108,31 @@ def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:
     return figure
 
 
-def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> None:
-    """Simulate, detect, restore and evaluate one scene, and write all results to ``out``."""
-    generator = torch.Generator().manual_seed(trial.seed)
+def run(name: str, options: argparse.Namespace, arguments: Sequence[str], console: Console) -> None:
+    """Simulate, detect, restore and evaluate one scene, and write all results to a folder of its name."""
+    size, out = (2048, 320 if options.quick else 2048), options.out / name
+    chosen = {"method": options.restoration} if options.restoration else {}
+    generator = torch.Generator().manual_seed(options.seed)
     phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
     truth = rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
-    with trial.step("drawing the scene"):
-        scene = SCENES[trial.name](size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, trial.seed)
-    with trial.step("simulating two frames"):
+    with working(f"{name}: simulating two frames"):
+        scene = SCENES[name](size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, options.seed)
         noise = rsv.SensorNoise(read_noise=NOISE, bits=12)
         frames = rsv.simulate_frames(scene, TIMING, truth, 2, frame_size=size, noise=noise, generator=generator)
-    with trial.step("detecting the vibration"):
-        detection = rsv.detect_vibration(frames, TIMING, **trial.methods["detection"])
-    with trial.step("restoring both frames"):
-        restored = rsv.restore(frames, TIMING, detection.vibration, **trial.methods["restoration"])
-    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
-    with trial.step("judging the restored frames"):
+    with working(f"{name}: detecting the vibration"):
+        detection = rsv.detect_vibration(frames, TIMING, method=options.detection)
+    with working(f"{name}: restoring both frames"):
+        restored = rsv.restore(frames, TIMING, detection.vibration, **chosen)
         verdict = rsv.judge_restoration(frames, restored, TIMING, detection.vibration)
-    with trial.step("comparing with the still scene"):
-        quality = {
-            f"{what}_{when}": [round(value, 4) for value in measure(images, still, 1.0, rim=RIM).tolist()]
-            for what, measure in (("psnr", rsv.psnr), ("ssim", rsv.ssim))
-            for when, images in (("before", frames), ("after", restored))
-        }
+    still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    quality = {
+        f"{what}_{when}": [round(value, 4) for value in measure(images, still, 1.0, rim=RIM).tolist()]
+        for what, measure in (("psnr", rsv.psnr), ("ssim", rsv.ssim))
+        for when, images in (("before", frames), ("after", restored))
+    }
     lines = compare(truth, detection.vibration)
-    show(console, trial, lines, quality)
-    with trial.step("writing files and figures"), whole_folder(out) as folder:
+    show(console, name, lines, quality)
+    with working(f"{name}: writing files and figures"), whole_folder(out) as folder:
         rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=FULL_SCALE)
         rsv.write_stack(folder / "restored.tif", restored, dtype="uint16", full_scale=FULL_SCALE)
         write_vibration(folder / "vibration.json", detection, TIMING)
@@ -174,7 +141,7 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
         save_figure(before_after(frames[0], restored[0], still), folder / "before_after.png", dpi=80)
         (folder / "report").mkdir()
         report = Report(
-            title=f"Demonstration: {trial.name}",
+            title=f"Demonstration: {name}",
             subtitle=f"2 simulated frames of {size[0]} x {size[1]} px with the camera of Liu et al. 2023",
             frames=frames,
             restored=restored,
@@ -183,30 +150,13 @@ def run(trial: Trial, size: tuple[int, int], out: Path, console: Console) -> Non
             detection=detection,
             verdict=verdict,
             left_alone=(),
-            options=trial.methods["restoration"],
+            options=chosen,
             version=rsv.__version__,
-            command=shlex.join(["python", "scripts/demo.py", *trial.arguments]),
+            command=shlex.join(["python", "scripts/demo.py", *arguments]),
         )
         write_report_page(folder / "report", report)
-        summary = {
-            "scene": trial.name,
-            "seed": trial.seed,
-            "frame_size": list(size),
-            "methods": {
-                "detection": method_used(rsv.detect_vibration, trial.methods["detection"]),
-                "restoration": method_used(rsv.restore, trial.methods["restoration"]),
-            },
-            "noise_of_full_scale": NOISE,
-            "vibration": lines,
-            "reliable": detection.reliable.tolist(),
-            "rows_not_measured": round(1.0 - detection.offsets.good.double().mean().item(), 4),
-            "residual_px": [round(value, 4) for value in detection.residual.tolist()],
-            **quality,
-            "rim": RIM,
-            "seconds": trial.seconds,
-            "threads": torch.get_num_threads(),
-            "versions": {"rsvib_torch": rsv.__version__, "torch": torch.__version__},
-        }
+        summary = {"scene": name, "seed": options.seed, "frame_size": size, "rim": RIM, "vibration": lines}
+        summary |= {"reliable": detection.reliable.tolist(), **quality}
         (folder / "summary.json").write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     console.print(f"report with all figures: {out / 'report' / 'report.html'}\n")
 
@@ -216,20 +166,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write to (default: out/demo)")
     parser.add_argument("--seed", type=int, default=2023, help="seed of scene, phases and noise (default: 2023)")
     parser.add_argument("--quick", action="store_true", help="narrow frames: 2048 rows of 320 px")
-    parser.add_argument("--detection", choices=get_args(DetectionMethod), help="method of detection")
+    parser.add_argument("--detection", choices=get_args(DetectionMethod), default="direct", help="default: direct")
     parser.add_argument("--restoration", choices=tuple(METHODS), help="method of restoration")
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(arguments)
-    methods = {
-        name: {"method": chosen} if chosen else {}
-        for name, chosen in (("detection", options.detection), ("restoration", options.restoration))
-    }
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 100)
     begin = time.perf_counter()
     for name in SCENES:
         with warnings_in_one_line():
-            trial = Trial(name, options.seed, methods, arguments)
-            run(trial, (2048, 320 if options.quick else 2048), options.out / name, console)
+            run(name, options, arguments, console)
     console.print(f"{time.perf_counter() - begin:.0f} s; results are in {options.out}")
 
 

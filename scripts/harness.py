@@ -49,8 +49,6 @@ _LIBRARIES = {
     "scikit-image": ("scikit-image",),
     "Kornia": ("kornia",),
     "NumPy": ("numpy",),
-    "PyLops": ("pylops",),
-    "deepinv": ("deepinv",),
     "vidstab": ("vidstab",),
 }
 _NOT_FINITE = ("nan", "inf", "-inf")  # JSON has no such numbers, they are stored as text

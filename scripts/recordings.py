@@ -35,7 +35,7 @@ import rsvib_torch as rsv
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from motion_truth import common_warp, offset_error, rms
-from truth import Motion, crop, decibel, draw_scene, take_frames
+from truth import Curve, crop, decibel, draw_scene, take_frames
 
 Array = NDArray[np.float64]
 PHONE_EXPOSURE, DRONE_EXPOSURE = 5.248e-3, 4.870e-3  # s; published, and stated in the GPMF track
@@ -355,16 +355,10 @@ JITTER_SETTINGS = (  # compression, frames, rows, row time in s
 )
 
 
-class Jitter(Motion):
+def compressed(times: Array, path: Array, squeeze: float) -> Curve:
     """A measured displacement (N, 2) with a compressed time axis, constant after its end."""
-
-    def __init__(self, times: Array, path: Array, squeeze: float) -> None:
-        object.__setattr__(self, "curve", CubicSpline(times / squeeze, path))
-        object.__setattr__(self, "end", times[-1] / squeeze)
-
-    def displacement(self, moments: Array) -> Array:
-        """Displacement in px at times in seconds."""
-        return np.asarray(self.curve(np.clip(moments, 0, self.end)))  # type: ignore[attr-defined]
+    spline = CubicSpline(times / squeeze, path)
+    return Curve(lambda moments: np.asarray(spline(np.clip(moments, 0, times[-1] / squeeze))))
 
 
 def jitter(folder: Path) -> None:
@@ -389,7 +383,7 @@ def jitter(folder: Path) -> None:
     for seed in (3, 11):
         for squeeze, count, rows, row_time in JITTER_SETTINGS:
             timing = rsv.SensorTiming(row_time=row_time, exposure_rows=JITTER_EXPOSURE, frame_rows=rows)
-            moving = Jitter(times, path, squeeze)
+            moving = compressed(times, path, squeeze)
             scene = draw_scene(rows + 2 * JITTER_MARGIN, JITTER_WIDTH + 2 * JITTER_MARGIN, seed)
             frames = take_frames(scene, timing, moving, count, JITTER_NOISE, margin=JITTER_MARGIN)
             taken = torch.from_numpy(frames).float()

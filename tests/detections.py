@@ -2,8 +2,9 @@
 
 import torch
 
-from rsvib_torch import VibrationStd
+from rsvib_torch import DetectionResult, OffsetCurve, VibrationStd
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 
 
@@ -32,4 +33,30 @@ def detection_of(vibration, relative=1e-3, *, phase=1e-3, reliable=(True, True),
         reliable=torch.tensor(reliable),
         findings=findings_of(reasons),
         assumptions=((),) * len(vibration.amplitude) if vibration.batch_shape else (),
+    )
+
+
+def result_of(
+    vibration, timing, std, *, last_row, num_pairs=1, reliable=(True, True), reasons=((), ()), assumptions=()
+):
+    """The result of ``detect_vibration`` with offsets without errors, every 16 rows; ``std`` of all parameters."""
+    rows = torch.arange(16, last_row, 16).double()
+    times = torch.arange(num_pairs)[:, None] * timing.frame_period + rows * timing.row_time
+    later = times + timing.frame_period
+    fitted = vibration.offset(times, later, timing.exposure_time)
+    pairs = torch.tensor([[pair, pair + 1] for pair in range(num_pairs)])
+    curve = OffsetCurve(pairs, rows, times, later, fitted.clone(), torch.full_like(times, 0.9), (32, 32))
+    tones, axes = torch.full_like(vibration.amplitude, std), torch.full_like(vibration.image_motion, std)
+    gain = vibration.gain(timing.frame_period)
+    return DetectionResult(
+        vibration,
+        VibrationStd(tones, tones, tones.clone(), tones, axes, axes),
+        gain,
+        torch.zeros(2).double(),
+        torch.tensor(reliable),
+        findings_of(reasons),
+        (),
+        curve,
+        fitted,
+        TimingSensitivity(*[gain] * 6),
     )

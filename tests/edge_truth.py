@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
-from scipy.special import ndtr
+from scipy.special import j1, ndtr
 
 
 def draw_edge(angle, sigma, size=(120, 80), levels=(0.1, 0.9), offset=(0.3, -0.2)):
@@ -26,6 +26,33 @@ def draw_edge(angle, sigma, size=(120, 80), levels=(0.1, 0.9), offset=(0.3, -0.2
 
 def gaussian(sigma):
     return lambda f: np.exp(-2 * (np.pi * sigma * np.asarray(f)) ** 2)
+
+
+def diffraction(cutoff):
+    def transfer(f):
+        s = np.clip(np.abs(f) / cutoff, 0, 1)
+        return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
+
+    return transfer
+
+
+def defocus(radius):
+    def transfer(f):
+        z = 2 * np.pi * radius * np.asarray(f) + 1e-12
+        return 2 * j1(z) / z * gaussian(0.3)(f)
+
+    return transfer
+
+
+OPTICS = {  # transfer functions of the frequency in cycles/px
+    "motion of 3 px": lambda f: np.sinc(3 * f) * gaussian(0.4)(f),
+    "disc of confusion, radius 1.2 px": defocus(1.2),
+    "sharpened, overshoot 0.12": lambda f: gaussian(0.6)(f) * (2 - gaussian(1.2)(f)),
+    "one-sided blur": lambda f: gaussian(0.5)(f) / (1 + 2j * np.pi * f * 0.6),
+    "15 % halo, sigma = 3 px": lambda f: 0.85 * gaussian(0.5)(f) + 0.15 * gaussian(3.0)(f),
+    "diffraction, cut-off 1.2 cycles/px": diffraction(1.2),
+    "diffraction, cut-off 0.6 cycles/px": diffraction(0.6),
+}
 
 
 def through_pixels(optics, angle):

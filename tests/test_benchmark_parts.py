@@ -8,7 +8,7 @@ import benchmark
 import benchmark_page
 import pytest
 import torch
-from benchmarks import gpu, live, pipeline, roll, video
+from benchmarks import detection, gpu, live, pipeline, video
 from benchmarks.sections import SECTIONS, module_of
 from harness import Timed, defaults, in_turns, read_result, shown_seconds, table, write_result
 
@@ -88,8 +88,8 @@ def test_sections_have_quick_options_of_the_same_names(name):
     assert callable(section.lines)
 
 
-def test_roll():
-    (row,) = roll.rows(defaults(roll, roll_cases=["none"], roll_size=160, roll_seeds=1))
+def test_detection():
+    (row,) = detection.rows(defaults(detection, detection_motions=["none"], detection_size=160, detection_seeds=1))
     assert {p["axis"] for p in row["parameters"]} == {"x", "y"}
     assert max(p["rms"] for p in row["parameters"]) < 8
     assert row["wrong_tones"] == 0
@@ -97,7 +97,7 @@ def test_roll():
 
 def test_results_are_stored_and_read_back(tmp_path):
     rows = [{"name": "a", "values": [1.5, -math.inf, None], "error": math.nan, "pair": (2, "x")}]
-    chosen = defaults(pipeline, out=tmp_path, images=[Path("scene.png")])
+    chosen = defaults(pipeline, out=tmp_path, scenes=[Path("scene.png")])
     path = write_result("pipeline", rows, chosen, 12.34, tmp_path)
     text = path.read_text()
     assert "NaN" not in text
@@ -106,7 +106,7 @@ def test_results_are_stored_and_read_back(tmp_path):
     assert back.rows[0].pop("error") != back.rows[0].get("error")
     assert back.rows == [{"name": "a", "values": [1.5, -math.inf, None], "pair": [2, "x"]}]
     assert (back.section, back.version, back.seconds) == ("pipeline", rsv.__version__, 12.3)
-    assert (back.options.size, back.options.images) == (256, ["scene.png"])
+    assert (back.options.size, back.options.scenes) == (256, ["scene.png"])
     assert not hasattr(back.options, "out")
     assert back.machine["torch"] == torch.__version__
     assert {"processor", "cores", "threads"} < set(back.machine)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from benchmarks.library_chain import by_match_template, fit_axis, kernel_of_row
-from benchmarks.restoration_peers import LOOPS, loop_rows, remap_lanczos, slab_kernels
+from benchmarks.restoration_peers import remap_lanczos, wiener_rows
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -60,16 +60,16 @@ def with_noise(frames):
 
 
 def test_kernels_of_rows_are_those_of_the_package():
-    motion, rows = Motion().vibration(), torch.tensor([3, 40, 700])
-    middles, kernels = slab_kernels(rows, TIMING, motion)
-    shown_by = rows.double()
-    for _ in range(30):  # scene row s appears at row r = s + displacement of r
-        shown_by = rows + motion.mean_displacement(shown_by * TIMING.row_time, TIMING.exposure_time)[:, 1]
-    for row, shown, middle, kernel in zip(rows.tolist(), shown_by.tolist(), middles, kernels, strict=True):
-        found = kernel_of_row(motion, shown * TIMING.row_time, TIMING, middle - row)
-        rim = [(large - small) // 2 for large, small in zip(found.shape, kernel.shape, strict=True)]
-        padded = np.pad(kernel, [(n, n) for n in rim])
-        np.testing.assert_allclose(found, padded, rtol=0, atol=1e-6)
+    motion, moved, middle = Motion().vibration(), 2, 20
+    starts = torch.tensor([3, 40, 700]) * TIMING.row_time
+    kernels, (left, top) = rsv.row_psf(motion, starts.double(), TIMING).dense()
+    for start, kernel in zip(starts.tolist(), kernels.numpy(), strict=True):
+        expected = np.zeros((2 * middle + 1, 2 * middle + 1))
+        row, column = middle + top - moved, middle + left
+        expected[row : row + kernel.shape[0], column : column + kernel.shape[1]] = kernel
+        found = kernel_of_row(motion, start, TIMING, moved)
+        rim = [middle - size // 2 for size in found.shape]
+        np.testing.assert_allclose(np.pad(found, [(n, n) for n in rim]), expected, rtol=0, atol=1e-6)
         assert found.sum() == pytest.approx(1)
 
 
@@ -79,29 +79,8 @@ def test_row_loops_and_unwarping_restore_either_frame(scene_and_frames, index):
     frame, motion = with_noise(frames)[index], Motion().vibration()
     unwarped = remap_lanczos(frame, TIMING, motion, index).restored.numpy()
     assert decibel(unwarped, scene, 24) > decibel(frame, scene, 24) + 8
-    for name in LOOPS:
-        figure = loop_rows(name, frame, TIMING, motion, torch.from_numpy(scene), 24, index)
-        errors = [
-            image[:, 24:-24] - scene[figure.rows, 24:-24] for image in (frame[figure.rows], figure.restored.numpy())
-        ]
-        before, after = (float(np.square(error).mean()) for error in errors)
-        assert after < before / 6, name
-        assert figure.seconds > 0
-        assert figure.setting
-
-
-def test_deepinv_forms_the_frame_and_restores_it(scene_and_frames):
-    try:
-        from benchmarks.deepinv_peer import frame_physics, tiled_restore
-    except (ImportError, RuntimeError) as missing:
-        pytest.skip(f"deepinv cannot be imported: {missing}")
-    scene, frames = scene_and_frames
-    motion = Motion().vibration()
-    physics = frame_physics(scene.shape, TIMING, motion)
-    top, left = ((size - 1) // 2 for size in physics.filters.shape[-2:])
-    wide = draw_scene(160 + 2 * MARGIN, 144 + 2 * MARGIN, seed=61)
-    seen = wide[MARGIN - top : len(wide) - MARGIN + top, MARGIN - left : wide.shape[1] - MARGIN + left]
-    formed = physics.A(torch.from_numpy(seen).float()[None, None])[0, 0].numpy()
-    assert decibel(formed, frames[0], 16) > 55
-    figure = tiled_restore(torch.from_numpy(with_noise(frames)[0]), TIMING, motion, torch.from_numpy(scene), 24)
-    assert decibel(figure.restored.numpy(), scene, 24) > decibel(with_noise(frames)[0], scene, 24) + 12
+    figure = wiener_rows(frame, TIMING, motion, torch.from_numpy(scene), 24, index)
+    errors = [image[:, 24:-24] - scene[figure.rows, 24:-24] for image in (frame[figure.rows], figure.restored.numpy())]
+    before, after = (float(np.square(error).mean()) for error in errors)
+    assert after < before / 6
+    assert figure.seconds > 0

@@ -10,7 +10,6 @@ from typing import get_args
 import pytest
 
 import rsvib_torch as rsv
-from rsvib_torch.config import read_config
 from rsvib_torch.detection import pipeline
 from rsvib_torch.motion import recorded
 from rsvib_torch.options import (
@@ -79,18 +78,6 @@ def test_libraries_are_imported_when_they_are_used(tmp_path, code, names):
     (tmp_path / "bad.toml").write_text(BAD_CONFIG)
     (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 2e-5\nexposure_rows = 20\nframe_rows = 512\n")
     assert loaded(code, names, tmp_path) == []
-
-
-def test_errors_of_all_sections_are_listed_together(tmp_path):
-    (tmp_path / "bad.toml").write_text(BAD_CONFIG)
-    with pytest.raises(ValueError) as caught:
-        read_config(tmp_path / "bad.toml")
-    assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == [
-        "sensor.frame_row",
-        "detection.search",
-        "restoration.prior",
-        "stack.window",
-    ]
 
 
 def test_names_of_options_are_those_of_the_tables():

@@ -4,6 +4,7 @@ Displacement along rows is a Fourier shift of a scene larger than the frame, dis
 with the prefilter of SciPy, and the exposure a midpoint sum.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,16 @@ class Motion:
 
     def vibration(self) -> Vibration:
         return Vibration(self.amplitude, self.frequency, self.phase, self.image_motion)
+
+
+class Curve(Motion):
+    """A motion that is any function of the time in s, with values (..., 2) in px."""
+
+    def __init__(self, curve: Callable[[Array], Array]) -> None:
+        object.__setattr__(self, "curve", curve)
+
+    def displacement(self, times: Array) -> Array:
+        return np.asarray(self.curve(times))  # type: ignore[attr-defined]
 
 
 def draw_scene(height: int, width: int, seed: int, blur: float = 0.8) -> Array:

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from attacks.files import BANDS, DETECTION
 from attacks.trial import Trial
-from attacks.warm import in_warm_child, place_of
+from attacks.warm import in_warm_child, tried
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -29,7 +30,6 @@ import rsvib_torch as rsv
 __all__ = ["calls", "trials"]
 
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
-_REFUSED = (ValueError, TypeError, OSError)
 _NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
 _OF_THE_PACKAGE = {"mapped"}  # methods that only the package calls
 
@@ -74,10 +74,9 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     noise = torch.randn(1, 1, 160, 128, generator=generator, dtype=torch.float64)
     scene = 0.5 + 0.2 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0, 0].to(torch.float32)
     frames = rsv.simulate_frames(scene, timing, vibration, 3, frame_size=(96, 64))
-    bands: dict[str, Any] = {"band_rows": 16, "band_step": 8, "search": 6}
-    detected = rsv.detect_vibration(frames, timing, method="bands", tones=1, **bands)
-    free = rsv.detect_motion(frames, timing, **bands)
-    swept = rsv.detect_swept_tone(frames, timing, **bands)
+    detected = rsv.detect_vibration(frames, timing, **DETECTION)
+    free = rsv.detect_motion(frames, timing, **BANDS)
+    swept = rsv.detect_swept_tone(frames, timing, **BANDS)
     restored = rsv.restore(frames, timing, vibration, method="dewarp", check=False)
     rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(48.0), indexing="ij")
     edge = torch.sigmoid((columns - 24 - 0.1 * (rows - 32)) / 0.7) * 0.6 + 0.2
@@ -100,29 +99,11 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     rates = rsv.read_gyroscope(rates_file, unit="rad/s")
     unit = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     pairs = torch.zeros(2, 3, dtype=torch.float64)
-    values = (
-        0.0,
-        1e-4,
-        1.0,
-        1e-4,
-        unit,
-        unit,
-        500.0,
-        1.0,
-        1e-4,
-        1e-6,
-        unit,
-        0.01,
-        unit,
-        unit[:2],
-        unit[:2],
-        pairs,
-        pairs,
-    )
-    rotation = rsv.RotationAlignment(recorded, "YxZ", *values, True, ())
+    values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, unit, 0.01, unit, unit[:2], unit[:2])
+    rotation = rsv.RotationAlignment(recorded, "YxZ", *values, pairs, pairs, True, ())
     rsv.write_vibration(folder / "vibration.json", detected)
     options: dict[str, Any] = {
-        "detection": {"method": "bands", "tones": 1, **bands},
+        "detection": DETECTION,
         "restoration": {"method": "dewarp"},
     }
     options |= {"full_scale": None, "force": False, "device": "cpu"}
@@ -132,10 +113,10 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     psf = rsv.row_psf(vibration, timing.row_starts(1, 96)[0], timing)
     blur = rsv.RowVaryingBlur(psf, frame_width=64)
     augmentation = rsv.RollingShutterVibration(timing, amplitude=(0.5, 2.0), frequency=(40.0, 200.0))
-    detector = rsv.VibrationDetector(timing, method="bands", tones=1, **bands)
+    detector = rsv.VibrationDetector(timing, **DETECTION)
     restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
-    check = rsv.check_motion(frames, timing, recorded, **bands)
-    alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **bands)
+    check = rsv.check_motion(frames, timing, recorded, **BANDS)
+    alignment = rsv.align_motion(frames, timing, recorded, offsets=(-0.001, 0.001), **BANDS)
     verdict = rsv.judge_restoration(frames, restored, timing, vibration)
     optics, sensor_noise = rsv.Optics(0.5, 0.4, 1.0), rsv.SensorNoise(5000.0, 0.01, 12, 0.01, 0.01, 0.01, 3)
     calibration = rsv.RowTimeCalibration(1e-4, 1e-6, 12.0, 0.3, 1000.0, 104.0, "forward", 1e-3, 1e-5, ())
@@ -148,7 +129,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
     components = torch.zeros(2, 3, dtype=torch.float64)
     # values of the parameters of all functions and methods, by name
-    pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **bands}
+    pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **BANDS}
     pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info, "manifest": manifest}
     pool |= {
         "detected": detected,
@@ -246,6 +227,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         result[f"restore {method}"] = call(rsv.restore, method=method, check=method == "exact", **chosen)
     augmentation(frames[:, None])
     constructed: dict[str, Call] = {
+        "FixedDewarp": call(rsv.FixedDewarp, num_frames=3),
         "FreeMotion": call(rsv.FreeMotion, coefficients=recorded.coefficients, start=0.0, tones=vibration),
         "RollingShutterVibration": call(
             rsv.RollingShutterVibration,
@@ -268,6 +250,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
     for name, module in modules.items():
         result[f"{name}.forward"] = call(module.forward)
+    result["FixedDewarp.forward"] = Call(rsv.FixedDewarp(timing, vibration, (96, 64), 3).forward, {"frames": frames})
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
@@ -421,7 +404,7 @@ def _name(item: Item) -> str:
     return f"{item[0]}({', '.join(f'{argument}={hostile}' for argument, hostile in item[1])})"
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
+def attempt(folder: Path, item: Item | None) -> Trial:
     """One call with hostile arguments."""
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)  # hostile relative paths must not reach the working directory of the program
@@ -445,27 +428,22 @@ def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one fo
         return Trial(_name(item), "refused", f"not made: {error}")
     torch.manual_seed(0)
     before = {key: copy.deepcopy(value) for key, value in arguments.items() if isinstance(value, np.ndarray)}
-    try:
+
+    def work() -> str:
         result = call.of(**arguments)
         str(result) if type(result).__module__.startswith("rsvib_torch") else None
-    except _REFUSED as error:
-        text = str(error)
-        if not text.strip():
-            return Trial(_name(item), "wrong", f"{type(error).__name__} without a message")
-        return Trial(_name(item), "refused", text[:300])
-    except MemoryError as error:
-        return Trial(_name(item), "memory", str(error)[:300])
-    except BaseException as error:
-        where = place_of(error)
-        if "allocate" in str(error):
-            return Trial(_name(item), "memory", f"{where}: {error}"[:300])
-        return Trial(_name(item), "traceback", f"{where}: {type(error).__name__}: {error}"[:300])
-    if _nan_without_reason(result):
-        return Trial(_name(item), "wrong", "reliable, but not finite")
-    for key, value in before.items():
-        if value.dtype.kind in "biuf" and not np.array_equal(value, arguments[key], equal_nan=value.dtype.kind == "f"):
-            return Trial(_name(item), "wrong", f"{key} was changed")
-    return Trial(_name(item), "completed")
+        if _nan_without_reason(result):
+            return "reliable, but not finite"
+        changed = (key for key, value in before.items() if not _equal(value, arguments[key]))
+        return next((f"{key} was changed" for key in changed), "")
+
+    return tried(_name(item), work, lambda text: "" if text.strip() else "no message")
+
+
+def _equal(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether an array of numbers is unchanged; other arrays are not compared."""
+    kind = before.dtype.kind
+    return kind not in "biuf" or np.array_equal(before, after, equal_nan=kind == "f")
 
 
 def items(known: Mapping[str, Call], count: int, seed: int) -> list[Item]:

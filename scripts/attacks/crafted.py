@@ -1,16 +1,11 @@
 """Files that were crafted to exhaust memory or time: each is opened in a child process with limits for both."""
 
-import gc
 import io
 import json
-import multiprocessing
 import os
-import resource
 import struct
-import time
-import traceback
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,10 +13,10 @@ from pathlib import Path
 import av
 import h5py
 import numpy as np
-import psutil
-import tifffile
 import zarr
-from attacks.trial import Outcome, Trial
+from attacks.files import TIMING, write_tiff
+from attacks.trial import Trial
+from attacks.warm import in_warm_child, tried
 from PIL import Image
 
 import rsvib_torch as rsv
@@ -31,15 +26,16 @@ from rsvib_torch.stacks import read_manifest
 
 __all__ = ["CASES", "crafted", "trials"]
 
-_CPU_SECONDS, _SECONDS, _BYTES = 20.0, 90.0, 2 * 10**9  # limits of one file; others may use the processor
-_TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
+_SECONDS, _BYTES = 20.0, 2 * 10**9  # limits of one file: processor time, and memory for data
 _CAMERA = "[sensor]\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 104\nfull_scale = 4095\n"
 _DEEP = 20_000
 
 # A case writes a file into a folder and returns its path. The reader follows from the ending: a stack, a configuration,
 # a recorded motion, a vibration or a manifest.
 Case = Callable[[Path], Path]
+Item = tuple[str, Path]  # name and file
 CASES: dict[str, Case] = {}
+_FILES = {"npy": "a.npy", "PNG": "a.png", "JPEG": "a.jpg", "TIFF": "a.tif"}
 
 
 def case(name: str) -> Callable[[Case], Case]:
@@ -62,6 +58,11 @@ def _data(name: str, data: bytes, folder: Path) -> Path:
     path = folder / name
     path.write_bytes(data)
     return path
+
+
+def _case_of(name: str, data: bytes) -> None:
+    """Add a case whose name begins with the format of its data."""
+    CASES[name] = partial(_data, _FILES[name.partition(":")[0]], data)
 
 
 def _sparse(name: str, head: bytes, size: int, folder: Path) -> Path:
@@ -87,11 +88,11 @@ for _order, _shape in product(
         *(f"({'2, ' * 60})", "(True, 8, 8)"),
     ),
 ):
-    CASES[f"npy: shape {_shape[:30]}, Fortran order {_order}"] = partial(_data, "a.npy", _npy(_shape, order=_order))
+    _case_of(f"npy: shape {_shape[:30]}, Fortran order {_order}", _npy(_shape, order=_order))
 for _dtype in ("'O'", "'<U1000000000'", "('<f4', (100000, 100000))", "'|S0'"):
-    CASES[f"npy: type {_dtype}"] = partial(_data, "a.npy", _npy("(2, 64, 64)", _dtype))
-CASES["npy: nested header"] = partial(_data, "a.npy", _npy("(" * 5000 + ")" * 5000))
-CASES["npy: header of 4 GB"] = partial(_data, "a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
+    _case_of(f"npy: type {_dtype}", _npy("(2, 64, 64)", _dtype))
+_case_of("npy: nested header", _npy("(" * 5000 + ")" * 5000))
+_case_of("npy: header of 4 GB", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
 CASES["npy: sparse file of 64 GB"] = partial(_sparse, "a.npy", _npy("(8, 65536, 65536)"), 2**36 + 1000)
 CASES["npy: 10^8 frames of one pixel"] = partial(_sparse, "a.npy", _npy("(100000000, 1, 1)"), 2 * 10**8 + 1000)
 
@@ -131,8 +132,8 @@ def _png(width: int, height: int, bits: int = 8, colour: int = 0, pixels: int = 
 
 for _width, _height in ((2**31 - 1, 2**31 - 1), (1, 2**31 - 1), (10**6, 10**6), (0, 0)):
     for _bits, _colour in ((8, 0), (16, 6)):
-        CASES[f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}"] = partial(
-            _data, "a.png", _png(_width, _height, _bits, _colour)
+        _case_of(
+            f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}", _png(_width, _height, _bits, _colour)
         )
 
 
@@ -150,13 +151,13 @@ def _png_folder(folder: Path) -> Path:
     return folder / "frames"
 
 
-CASES["PNG: text that expands to 1 GB"] = partial(
-    _data, "a.png", _png(16, 16, more=_chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(10**7), 9) * 100))
+_case_of(
+    "PNG: text that expands to 1 GB",
+    _png(16, 16, more=_chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(10**7), 9) * 100)),
 )
-CASES["PNG: chunk of 4 GB"] = partial(_data, "a.png", _png(16, 16, more=_chunk(b"tEXt", b"a", 2**32 - 1)))
-CASES["PNG: Exif that refers to itself"] = partial(
-    _data,
-    "a.png",
+_case_of("PNG: chunk of 4 GB", _png(16, 16, more=_chunk(b"tEXt", b"a", 2**32 - 1)))
+_case_of(
+    "PNG: Exif that refers to itself",
     _png(16, 16, more=_chunk(b"eXIf", b"MM\0*\0\0\0\x08" + struct.pack(">HHHII", 1, 0x8769, 4, 1, 8) + bytes(4))),
 )
 
@@ -170,7 +171,7 @@ def _jpeg(width: int, height: int) -> bytes:
 
 
 for _size in ((65500, 65500), (0, 0)):
-    CASES[f"JPEG: {_size[0]} x {_size[1]} px"] = partial(_data, "a.jpg", _jpeg(*_size))
+    _case_of(f"JPEG: {_size[0]} x {_size[1]} px", _jpeg(*_size))
 
 # --- TIFF ---------------------------------------------------------------------------------------------------------
 
@@ -194,49 +195,51 @@ for _code, _name in (
     *((322, "tile width"), (32997, "depth")),
 ):
     for _value in (0, 2**32 - 1):
-        CASES[f"TIFF: {_name} {_value}"] = partial(_data, "a.tif", _tiff({_code: (4, 1, _value)}))
+        _case_of(f"TIFF: {_name} {_value}", _tiff({_code: (4, 1, _value)}))
 for _code, _name in (
     *((273, "strip offsets"), (279, "strip sizes"), (270, "description"), (330, "SubIFDs"), (34735, "GeoKeys")),
 ):
     for _kind, _count in ((3, 2**31 - 1), (12, 2**29)):
-        CASES[f"TIFF: {_name}, type {_kind}, {_count} values"] = partial(
-            _data, "a.tif", _tiff({_code: (_kind, _count, 64)})
-        )
-CASES["TIFF: the next page is the same"] = partial(_data, "a.tif", _tiff({}, 8))
-CASES["TIFF: SubIFD is the page itself"] = partial(_data, "a.tif", _tiff({330: (4, 1, 8)}))
-CASES["TIFF: the next page lies beyond the end"] = partial(_data, "a.tif", _tiff({}, 2**32 - 2))
-CASES["TIFF: strips of one byte"] = partial(
-    _data,
-    "a.tif",
+        _case_of(f"TIFF: {_name}, type {_kind}, {_count} values", _tiff({_code: (_kind, _count, 64)}))
+_case_of("TIFF: the next page is the same", _tiff({}, 8))
+_case_of("TIFF: SubIFD is the page itself", _tiff({330: (4, 1, 8)}))
+_case_of("TIFF: the next page lies beyond the end", _tiff({}, 2**32 - 2))
+_case_of(
+    "TIFF: strips of one byte",
     _tiff({257: (4, 1, 10**6), 278: (4, 1, 1), 273: (4, 10**6, 512), 279: (4, 10**6, 512)}, 0, bytes(5 * 10**6)),
 )
-CASES["TIFF: 60000 x 60000 px in tiles of 16"] = partial(
-    _data, "a.tif", _tiff({256: (4, 1, 60000), 257: (4, 1, 60000), 322: (3, 1, 16), 323: (3, 1, 16), 273: (4, 0, 0)})
+_case_of(
+    "TIFF: 60000 x 60000 px in tiles of 16",
+    _tiff({256: (4, 1, 60000), 257: (4, 1, 60000), 322: (3, 1, 16), 323: (3, 1, 16), 273: (4, 0, 0)}),
 )
+
+
+def _described(text: str) -> bytes:
+    """A page with a description."""
+    return _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(4096))
+
+
 for _words in ('{"shape": [1000000000, 16, 16]}', "[" * _DEEP, "ImageJ=1.53\nimages=1000000000\nframes=1000000000\n"):
-    CASES[f"TIFF: description {_words[:30]}"] = partial(
-        _data, "a.tif", _tiff({270: (2, len(_words) + 1, 600)}, tail=bytes(474) + _words.encode() + bytes(4096))
-    )
+    _case_of(f"TIFF: description {_words[:30]}", _described(_words))
 
 
-@case("TIFF: OME-XML with entities")
-def _tiff_ome(folder: Path) -> Path:
-    entities = "".join(f'<!ENTITY e{i + 1} "{f"&e{i};" * 10}">' for i in range(9))
-    kind = f'<!DOCTYPE OME [<!ENTITY e0 "a">{entities}]>'
-    text = f'<?xml version="1.0"?>{kind}<OME><Image><Pixels>&e9;</Pixels></Image></OME>'
-    return _data("a.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(4096)), folder)
-
-
-@case("TIFF: OME-XML with 10^9 planes")
-def _tiff_ome_planes(folder: Path) -> Path:
-    text = (
+_ENTITIES = "".join(f'<!ENTITY e{i + 1} "{f"&e{i};" * 10}">' for i in range(9))
+_case_of(
+    "TIFF: OME-XML with entities",
+    _described(
+        f'<?xml version="1.0"?><!DOCTYPE OME [<!ENTITY e0 "a">{_ENTITIES}]>'
+        "<OME><Image><Pixels>&e9;</Pixels></Image></OME>"
+    ),
+)
+CASES["TIFF: OME-XML with 10^9 planes"] = partial(
+    _data,
+    "a.ome.tif",
+    _described(
         '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image ID="Image:0">'
         '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="16" SizeY="16" SizeZ="1" SizeC="1" '
         'SizeT="1000000000"><TiffData/></Pixels></Image></OME>'
-    )
-    return _data(
-        "a.ome.tif", _tiff({270: (2, len(text) + 1, 600)}, tail=bytes(474) + text.encode() + bytes(900)), folder
-    )
+    ),
+)
 
 
 def _tiff_pages(folder: Path, count: int, alternating: bool = False) -> Path:
@@ -272,17 +275,10 @@ def _tiff_bomb(folder: Path) -> Path:
     return _data("a.tif", b"".join(data).ljust(512, b"\0") + packed, folder)
 
 
-@case("TIFF: axes YXT, zlib, expands to 1.2 GB")
+@case("TIFF: axes YXT, zlib, expands to 2.4 GB")
 def _tiff_yxt(folder: Path) -> Path:
-    path = folder / "a.tif"
-    tifffile.imwrite(
-        path,
-        np.zeros((3000, 2000, 200), np.uint8),
-        metadata={"axes": "YXT"},
-        compression="zlib",
-        photometric="minisblack",
-    )
-    return path
+    write_tiff(folder / "a.tif", np.zeros((3000, 2000, 200), np.uint16), metadata={"axes": "YXT"}, compression="zlib")
+    return folder / "a.tif"
 
 
 # --- HDF5 ---------------------------------------------------------------------------------------------------------
@@ -548,74 +544,49 @@ def _read(path: Path) -> None:
     elif name.endswith(".csv"):
         rsv.read_motion(path, unit="px")
     elif name.endswith(".vibration.json"):
-        read_vibration(path, _TIMING)
+        read_vibration(path, TIMING)
     elif name.endswith(".manifest.json"):
         read_manifest(path).detections()
     else:
         frames = rsv.read_stack(path, full_scale=None if name.endswith(("png", "jpg", "mp4", "avi")) else 65535)
-        rsv.detect_vibration(frames[:3, ..., :256, :256], _TIMING, method="bands", tones=1)
+        rsv.detect_vibration(frames[:3, ..., :256, :256], TIMING, method="bands", tones=1)
 
 
-def _try(path: Path, read: Callable[[Path], None]) -> tuple[Outcome, str]:
-    try:
-        read(path)
-    except (ValueError, TypeError, OSError) as error:
-        lines = str(error).splitlines()
-        if len(lines) > 25 or max(map(len, lines), default=0) > 5000:
-            return "traceback", f"message of {len(lines)} lines, {len(str(error))} characters"
-        return "refused", lines[0][:150] if lines else ""
-    except BaseException as error:  # every other error would be a traceback for the user
-        return "traceback", f"{type(error).__name__}: {error} {traceback.format_exc()[-300:]}"
-    return "completed", ""
+def _unclear(text: str) -> str:
+    lines = text.splitlines()
+    if len(lines) > 25 or max(map(len, lines), default=0) > 5000:
+        return f"message of {len(lines)} lines, {len(text)} characters"
+    return ""
 
 
-def _child(path: Path, read: Callable[[Path], None], sender: multiprocessing.connection.Connection) -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
+def attempt(folder: Path, item: Item | None) -> Trial:
+    """Read one crafted file."""
+    if item is None:
+        return Trial("", "completed")
+    name, path = item
     os.chdir(path.parent)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # lines of libpng and ffmpeg
-    limit = psutil.Process().memory_info().vms + _BYTES  # free_memory() respects it
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    sender.send(psutil.Process().memory_info().rss)
-    sender.send(_try(path, read))
-    sender.close()
+
+    def work() -> str:
+        _read(path)
+        return ""
+
+    return tried(name, work, _unclear)
 
 
-def crafted(name: str, folder: Path, *, read: Callable[[Path], None] = _read, seconds: float = _SECONDS) -> Trial:
-    """Write one file, and read it in a child process that is forked from this one, for at most ``seconds``."""
-    path = CASES[name](folder)
-    context = multiprocessing.get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_child, args=(path, read, sender))
-    gc.freeze()  # a collection in the child must not finalise objects of this process, which may wait for its threads
-    child.start()
-    gc.unfreeze()
-    sender.close()
-    begin, inherited = time.monotonic(), receiver.recv()
-    watched, peak, cpu = psutil.Process(child.pid), 0, 0.0
-    outcome: tuple[Outcome, str] | None = None
-    while outcome is None and cpu < _CPU_SECONDS and time.monotonic() - begin < seconds:
-        try:
-            peak = max(peak, watched.memory_info().rss - inherited)
-            cpu = sum(watched.cpu_times()[:2])
-            if receiver.poll(0.01):
-                outcome = receiver.recv()
-        except (EOFError, psutil.NoSuchProcess):
-            outcome = ("traceback", "the process ended")
-    child.kill()
-    child.join()
-    if outcome is None:
-        outcome = ("hang", "")
-    elif peak > _BYTES:
-        outcome = ("memory", outcome[1])
-    return Trial(name, outcome[0], f"{outcome[1]} ({cpu:.1f} s, {peak / 1e6:.0f} MB)")
+def crafted(names: Sequence[str], folder: Path) -> Iterator[Trial]:
+    """Write files one by one, and read them in a child process with limits of memory and processor time."""
+
+    def items() -> Iterator[Item]:
+        for index, name in enumerate(names):
+            place = folder / f"{index}"
+            place.mkdir()
+            yield name, CASES[name](place)
+
+    yield from in_warm_child(attempt, items(), lambda item: item[0], folder, limit=_SECONDS, memory=_BYTES)
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Read up to ``count`` crafted files; all of them are read if there are no more, otherwise a random choice."""
+    order = np.random.default_rng(seed).permutation(len(CASES))
     names = list(CASES)
-    if count < len(names):
-        names = [names[index] for index in np.random.default_rng(seed).permutation(len(names))[:count]]
-    for index, name in enumerate(names):
-        place = folder / f"{index}"
-        place.mkdir()
-        yield crafted(name, place)
+    yield from crafted(names if count >= len(names) else [names[index] for index in order[:count]], folder)

@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from attacks.small_runs import FORMATS, Reference, fork, kill_run, resume
+from attacks.small_runs import FORMATS, Reference, kill_run, resumed_trial
 from attacks.trial import Trial
 
 __all__ = ["trials"]
@@ -49,20 +49,13 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     for number in range(count):
         kind = list(FORMATS)[number % len(FORMATS)]
         damage = _DAMAGES[number // len(FORMATS) % len(_DAMAGES)]
-        name, options = FORMATS[kind]
         place = folder / "trial"
-        work = place / f".{name}.rsvib"
+        work = place / f".{FORMATS[kind][0]}.rsvib"
         files: list[Path] = []
         while not files:
             kill_run(reference, place, kind, choice, windows=2)
             files = sorted(file for file in work.iterdir() if file.suffix not in (".json", ".done", ".part"))
         file = choice.choice(files)
         where = _damage(file, [other for other in files if other != file], damage, choice)
-        title = f"{kind}: {file.relative_to(work)} {damage}{where}"
-        code, result = fork(resume, reference.source, place / name, options)
-        if code != 0:
-            yield Trial(title, "hang" if code is None else "traceback" if code == 1 else "lost", str(result))
-        else:
-            difference = reference.difference(place, name)
-            yield Trial(title, "wrong" if difference else "completed", difference)
+        yield resumed_trial(reference, place, kind, f"{kind}: {file.relative_to(work)} {damage}{where}")
         shutil.rmtree(place)

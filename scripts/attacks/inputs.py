@@ -7,8 +7,13 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import tifffile
+from attacks.files import write_stack
 from attacks.small_runs import Reference, content, fork, process
 from attacks.trial import Trial
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
 
 __all__ = ["trials"]
 
@@ -29,17 +34,11 @@ frequency = [100.0, 120.0]
 
 def _write_originals(folder: Path, source: Path) -> None:
     """Inputs of all kinds."""
-    import tifffile  # noqa: PLC0415
-    import torch  # noqa: PLC0415
-
-    from rsvib_torch import write_stack  # noqa: PLC0415
-
     folder.mkdir()
     counts = tifffile.imread(source)[:4]
-    frames = torch.from_numpy(counts / 4095.0).float()
     for name in ("frames.tif", "pngs", "frames.zarr", "frames.raw", "frames.npy", "frames.h5", "frames.mkv"):
-        write_stack(folder / name, frames, dtype="uint16", full_scale=4095)
-    write_stack(folder / "scene.png", frames[:1], dtype="uint16", full_scale=4095)
+        write_stack(folder / name, counts)
+    write_stack(folder / "scene.png", counts[:1])
     (folder / "camera.toml").write_text(_CAMERA)
     times = "\n".join(f"{0.001 * index},0.1,0.2" for index in range(100))
     (folder / "motion.csv").write_text(f"time,x,y\n{times}\n")
@@ -70,8 +69,6 @@ def _aliases(original: Path, *, ending: str = "") -> dict[str, Path]:
 
 
 def _command(arguments: list[str]) -> str:
-    from rsvib_torch.commands.main import run_command  # noqa: PLC0415
-
     shown = io.StringIO()
     with contextlib.redirect_stderr(shown):
         code = run_command(arguments)
@@ -80,8 +77,6 @@ def _command(arguments: list[str]) -> str:
 
 def _written(place: str, output: str) -> str:
     """``write_stack`` with the metadata of an input, onto it."""
-    import rsvib_torch as rsv  # noqa: PLC0415
-
     frames = rsv.read_stack(place, full_scale=4095)
     rsv.write_stack(output, frames, dtype="uint16", full_scale=4095, like=rsv.read_stack_info(place))
     return "0\n"

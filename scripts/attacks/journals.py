@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import FORMATS, Reference, content, fork, kill_run, resume
+from attacks.small_runs import FORMATS, Reference, completed_or_refused, content, fork, kill_run, resume
 from attacks.trial import Trial
 
 __all__ = ["trials"]
@@ -115,16 +115,10 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         attack(work)
         before = _listing(place)
         code, result = fork(resume, reference.source, place / name, options)
-        if code is None:
-            yield Trial(title, "hang")
-        elif code == 0:
-            difference = reference.difference(place, name)
-            yield Trial(title, "wrong" if difference else "completed", difference)
-        elif code != 2 or "\n" in str(result):
-            yield Trial(title, "traceback", str(result))
-        else:
-            changed = _listing(place) != before
-            yield Trial(title, "lost" if changed else "refused", str(result))
+        trial = completed_or_refused(title, code, result, reference.difference(place, name) if code == 0 else "")
+        if trial.outcome == "refused" and _listing(place) != before:
+            trial = Trial(title, "lost", str(result))
+        yield trial
         shutil.rmtree(place)
 
 

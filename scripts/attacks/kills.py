@@ -13,7 +13,7 @@ from attacks.small_runs import (
     counted_run,
     finished_windows,
     fork,
-    resume,
+    resumed_trial,
 )
 from attacks.trial import Trial
 
@@ -45,18 +45,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 
 
 def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
-    name, options = FORMATS[kind]
+    name = FORMATS[kind][0]
     if kind != "PNG folder" and (place / name).exists() and content(place / name) != content(reference.whole / name):
         return Trial(title, "wrong", "an incomplete output has its name")
-    entered = finished_windows(place, name)
-    code, result = fork(resume, reference.source, place / name, options)
-    if code is None:
-        return Trial(title, "hang")
-    if code != 0:
-        return Trial(title, "traceback" if code == 1 else "lost", str(result))
-    difference = reference.difference(place, name)
-    if difference:
-        return Trial(title, "wrong", difference)
-    if result < entered:
-        return Trial(title, "lost", f"{entered} windows were complete, {result} were resumed")
-    return Trial(title, "completed")
+    return resumed_trial(reference, place, kind, title, finished_windows(place, name))

@@ -8,7 +8,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import FORMATS, Reference, content, counted_run, fork, kill_run, process, resume, server
+from attacks.small_runs import (
+    FORMATS,
+    Reference,
+    completed_or_refused,
+    content,
+    counted_run,
+    fork,
+    kill_run,
+    process,
+    resume,
+    server,
+)
 from attacks.trial import Trial
 
 __all__ = ["trials"]
@@ -45,13 +56,7 @@ def _linked(path: Path, victim: Path, kind: str) -> None:
 def _judged(title: str, victim: Path, before: dict[str, bytes], code: Any, result: Any, difference: str) -> Trial:
     if content(victim) != before:
         return Trial(title, "lost", "files of the user were changed")
-    if code is None:
-        return Trial(title, "hang")
-    if code == 0:
-        return Trial(title, "wrong" if difference else "completed", difference)
-    if code != 2 or "\n" in str(result):
-        return Trial(title, "traceback", str(result))
-    return Trial(title, "refused", str(result))
+    return completed_or_refused(title, code, result, difference)
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:

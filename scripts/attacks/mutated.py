@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import random
 import shutil
 from collections.abc import Callable, Iterator
@@ -12,13 +11,22 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import h5py
 import numpy as np
-import tifffile
 import torch
-import zarr
+from attacks.files import (
+    BANDS,
+    DETECTION,
+    FULL_SCALE,
+    TIMING,
+    vibrating_counts,
+    write_hdf5,
+    write_raw,
+    write_stack,
+    write_tiff,
+    write_zarr,
+)
 from attacks.trial import Trial
-from attacks.warm import in_warm_child, place_of
+from attacks.warm import in_warm_child, tried
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -29,7 +37,6 @@ from rsvib_torch.report.results import read_vibration
 __all__ = ["ORIGINALS", "attempt", "damage", "trials", "write_originals"]
 
 SECONDS, MEMORY = 10.0, 1 << 30  # limits of one trial
-TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
 CONFIG = """
 [sensor]
 row_time = 1e-4
@@ -147,50 +154,32 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     """Write the undamaged files, and return their content."""
     shutil.rmtree(folder, ignore_errors=True)  # of a child process that ended
     folder.mkdir(parents=True)
-    noise = torch.randn(1, 1, 160, 128, generator=torch.Generator("cpu").manual_seed(0))
-    scene = 0.5 + 0.3 * torch.nn.functional.avg_pool2d(noise, 3, 1, 1)[0, 0]
-    vibration = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
-    frames = rsv.simulate_frames(scene, TIMING, vibration, 4, frame_size=(96, 64)).clamp(0, 1)
-    counts = (frames * 4095).round().numpy().astype(np.uint16)
-    tifffile.imwrite(folder / "pages.tif", counts, photometric="minisblack", metadata=None)
-    tifffile.imwrite(folder / "packed.tif", counts, photometric="minisblack", compression="zlib", bigtiff=True)
-    tifffile.imwrite(folder / "tiles.tif", counts, photometric="minisblack", tile=(32, 32), compression="lzw")
+    counts = vibrating_counts(TIMING, 4, (96, 64))
+    frames = torch.from_numpy(counts / np.float32(FULL_SCALE))
+    write_tiff(folder / "pages.tif", counts)
+    write_tiff(folder / "packed.tif", counts, metadata={}, compression="zlib", bigtiff=True)
+    write_tiff(folder / "tiles.tif", counts, metadata={}, tile=(32, 32), compression="lzw")
     for name in ("own.tif", "frames.npy", "pngs"):
-        rsv.write_stack(folder / name, frames, dtype="uint16", full_scale=4095)
+        write_stack(folder / name, counts)
     for name in ("frames.mkv", "frames.mp4"):
-        info = rsv.StackInfo(tuple(frames.shape), "uint8", 255.0, frame_rate=96.0)
+        info = rsv.StackInfo(counts.shape, "uint8", 255.0, frame_rate=96.0)
         rsv.write_stack(folder / name, frames, dtype="uint8", like=info)
-    rsv.write_stack(folder / "frames.png", frames[:1], dtype="uint16", full_scale=4095)
+    write_stack(folder / "frames.png", counts[:1])
     colour = np.repeat((counts[0] >> 4).astype(np.uint8)[..., None], 3, axis=-1)
     cv2.imwrite(str(folder / "colour.png"), colour)
     cv2.imwrite(str(folder / "frames.jpg"), colour)
-    for name, options in (("plain.h5", {}), ("packed.h5", {"chunks": (1, 96, 64), "compression": "gzip"})):
-        with h5py.File(folder / name, "w") as file:
-            file.create_dataset("frames", data=counts, **options)
-            file["frames"].attrs["full_scale"] = 4095.0
-    counts.tofile(folder / "frames.raw")
-    content = {"format": "rsvib raw", "version": 1, "shape": list(counts.shape), "axes": "THW", "dtype": "uint16"}
-    content |= {"offset": 0, "full_scale": 4095, "frame_times": [0.0, 0.1, 0.2, 0.3]}
-    (folder / "frames.raw.json").write_text(json.dumps(content))
-    array = zarr.create_array(folder / "frames.zarr", shape=counts.shape, chunks=(1, 96, 64), dtype="u2")
-    array.attrs["full_scale"] = 4095.0
-    array[:] = counts
+    write_hdf5(folder / "plain.h5", counts)
+    write_hdf5(folder / "packed.h5", counts, chunks=(1, 96, 64), compression="gzip")
+    write_raw(folder / "frames.raw", counts, offset=0, full_scale=FULL_SCALE, frame_times=[0.0, 0.1, 0.2, 0.3])
+    write_zarr(folder / "frames.zarr", counts, chunks=(1, 96, 64))
     (folder / "camera.toml").write_text(CONFIG)
-    bands: dict[str, Any] = {"band_rows": 16, "band_step": 8, "search": 6}
-    rsv.process_stack(
-        folder / "own.tif",
-        folder / "out.npy",
-        TIMING,
-        window=3,
-        detection={"method": "bands", "tones": 1, **bands},
-        restoration={"method": "dewarp"},
-        workers=1,
-    )
-    detected = rsv.detect_vibration(frames, TIMING, method="bands", tones=1, **bands)
+    options: dict[str, Any] = {"window": 3, "detection": DETECTION, "restoration": {"method": "dewarp"}, "workers": 1}
+    rsv.process_stack(folder / "own.tif", folder / "out.npy", TIMING, **options)
+    detected = rsv.detect_vibration(frames, TIMING, **DETECTION)
     rsv.write_vibration(folder / "vibration.json", detected)
     detected.save(folder / "detection.json")
-    rsv.detect_motion(frames, TIMING, **bands).motion.save(folder / "free.json")
-    rsv.detect_swept_tone(frames, TIMING, **bands).save(folder / "swept.json")
+    rsv.detect_motion(frames, TIMING, **BANDS).motion.save(folder / "free.json")
+    rsv.detect_swept_tone(frames, TIMING, **BANDS).save(folder / "swept.json")
     lines = [f"{0.001 * i:.3f},{0.1 * i:.2f},{-0.1 * i:.2f}" for i in range(40)]
     (folder / "motion.csv").write_text("\n".join(["time,x,y", *lines]))
     head = ["GYROFLOW IMU LOG", "version,1.3", "orientation,YxZ", "tscale,1", "gscale,1", "t,gx,gy,gz"]
@@ -230,8 +219,8 @@ def damage(content: bytes, seed: int, text: bool) -> bytes:
     return bytes(data)
 
 
-def _run(folder: Path, target: Path) -> str | None:
-    """Run the program on a damaged stack; returns why that is a failure, None if it is not."""
+def _run(folder: Path, target: Path) -> str:
+    """Run the program on a damaged stack; returns why that is a failure, an empty text if it is not."""
     (folder / "good.toml").write_text(CONFIG.replace("frame_start_times = [0.0, 0.0104, 0.0208]", ""))
     out = folder / "results"
     errors = io.StringIO()
@@ -245,8 +234,7 @@ def _run(folder: Path, target: Path) -> str | None:
         return f"{len(lines)} lines of errors, results {'exist' if out.exists() else 'do not exist'}: {shown[:300]}"
     if code == 0 and not all((out / name).is_file() for name in ("restored.tif", "manifest.json")):
         return "exit code 0 without results"
-    shutil.rmtree(out, ignore_errors=True)
-    return None
+    return ""
 
 
 Item = tuple[int, str, bool]  # seed, name of the file, whether the program is run on it
@@ -256,7 +244,7 @@ def _name(item: Item) -> str:
     return f"{item[1]}, seed {item[0]}{', rsvib run' if item[2] else ''}"
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one for each outcome
+def attempt(folder: Path, item: Item | None) -> Trial:
     """Read one damaged file, or run the program on it."""
     contents = write_originals(folder)
     if item is None:
@@ -264,25 +252,23 @@ def attempt(folder: Path, item: Item | None) -> Trial:  # noqa: PLR0911 - one fo
     seed, name, runs = item
     original, path = ORIGINALS[name], folder / name
     path.write_bytes(damage(contents[name], seed, original.text))
-    try:
+
+    def work() -> str:
         if runs:
-            failure = _run(folder, folder / original.target)
-            return Trial(_name(item), "completed" if failure is None else "wrong", failure or "")
+            return _run(folder, folder / original.target)
         original.read(folder / original.target)
-    except (ValueError, TypeError, OSError) as error:
-        lines = str(error).splitlines()
-        # a configuration has one line per mistake
-        if not lines or (len(lines) > 1 and not all(str(folder) in line for line in lines)):
-            return Trial(_name(item), "wrong", f"message {error!s}")
-        return Trial(_name(item), "refused", lines[0])
-    except MemoryError as error:
-        return Trial(_name(item), "memory", str(error))
-    except Exception as error:
-        return Trial(_name(item), "traceback", f"{place_of(error)}: {type(error).__name__}: {error}")
+        return ""
+
+    def unclear(text: str) -> str:
+        lines = text.splitlines()  # a configuration has one line per mistake
+        clear = len(lines) == 1 or (lines and all(str(folder) in line for line in lines))
+        return "" if clear else f"message {text}"
+
+    try:
+        return tried(_name(item), work, unclear)
     finally:
         shutil.rmtree(folder / "results", ignore_errors=True)
         path.write_bytes(contents[name])
-    return Trial(_name(item), "completed")
 
 
 def trials(folder: Path, count: int, seed: int, run_every: int = 12) -> Iterator[Trial]:

@@ -25,7 +25,7 @@ from attacks.small_runs import (
     finished_windows,
     fork,
     process,
-    resume,
+    resumed_trial,
 )
 from attacks.trial import Trial
 
@@ -132,22 +132,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
             yield Trial(title, "traceback", str(result))
         else:
             _PowerLoss(root, records, choice if mixed else None).build(root.stat().st_ino, root, after)
-            yield _resumed(reference, after / "new", kind, title)
+            finished = min(finished_windows(after / "new", name), WINDOWS)
+            yield resumed_trial(reference, after / "new", kind, title, finished)
         for path in (root, records, after):
             shutil.rmtree(path, ignore_errors=True)
-
-
-def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
-    name, options = FORMATS[kind]
-    entered = finished_windows(place, name)
-    code, result = fork(resume, reference.source, place / name, options)
-    if code is None:
-        return Trial(title, "hang")
-    if code != 0:
-        return Trial(title, "traceback" if code == 1 else "lost", str(result))
-    difference = reference.difference(place, name)
-    if difference:
-        return Trial(title, "wrong", difference)
-    if result < min(entered, WINDOWS):
-        return Trial(title, "lost", f"{entered} windows were complete, {result} were resumed")
-    return Trial(title, "completed")

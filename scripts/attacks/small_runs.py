@@ -17,22 +17,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import tifffile
+import torch
+from attacks.files import DETECTION, FULL_SCALE, vibrating_counts, write_tiff
+from attacks.trial import Trial
 
-__all__ = [
-    "FORMATS",
-    "Reference",
-    "content",
-    "count_file_calls",
-    "finished_windows",
-    "fork",
-    "kill_run",
-    "process",
-    "server",
-]
+import rsvib_torch as rsv
+from rsvib_torch.stacks import detect_stack, read_manifest
 
 FRAMES, SIZE, WINDOW = 13, 64, 3
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=72)
 WINDOWS = 6
 FORMATS: dict[str, tuple[str, dict[str, Any]]] = {
     "TIFF": ("out.tif", {}),
@@ -70,46 +63,23 @@ def server() -> Any:
     return context
 
 
-def _timing() -> Any:
-    from rsvib_torch import SensorTiming  # noqa: PLC0415
-
-    return SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=72)
-
-
 def process(source: Path, sink: Path, **options: Any) -> Any:
     """Restore the small stack with known vibrations, so that a run takes a fraction of a second."""
-    import torch  # noqa: PLC0415
-
-    from rsvib_torch import process_stack  # noqa: PLC0415
-    from rsvib_torch.stacks import read_manifest  # noqa: PLC0415
-
     torch.set_num_threads(1)
     given = read_manifest(source.with_name("vibrations.json")).detections()
-    common = {"window": WINDOW, "restoration": {"method": "dewarp"}, "full_scale": 4095, "workers": 1, "given": given}
-    return process_stack(source, sink, _timing(), **{**common, **options})
+    common = {"window": WINDOW, "restoration": {"method": "dewarp"}, "full_scale": FULL_SCALE, "workers": 1}
+    return rsv.process_stack(source, sink, TIMING, **common | {"given": given} | options)
 
 
 def _prepare(folder: Path) -> None:
     """Write the stack, the vibrations of its windows, and the results of uninterrupted runs in all formats."""
-    import torch  # noqa: PLC0415
-    from scipy import ndimage  # noqa: PLC0415
-
-    import rsvib_torch as rsv  # noqa: PLC0415
-    from rsvib_torch.stacks import detect_stack  # noqa: PLC0415
-
     torch.set_num_threads(1)
-    texture = ndimage.gaussian_filter(np.random.default_rng(2).standard_normal((SIZE + 40, SIZE + 40)), 1.2)
-    scene = torch.from_numpy(np.clip(0.5 + 0.15 * texture / texture.std(), 0, 1)).float()
-    vibration = rsv.Vibration(amplitude=[1.3, 0.9], frequency=[130.0, 170.0], phase=[0.3, 0.9])
-    frames = rsv.simulate_frames(scene, _timing(), vibration, num_frames=FRAMES, frame_size=(SIZE, SIZE))
-    counts = np.round(4095 * frames.numpy()).clip(0, 4095).astype(np.uint16)
-    tifffile.imwrite(folder / "frames.tif", counts, photometric="minisblack", metadata=None)
-    options = {"method": "bands", "band_rows": 16, "band_step": 8, "search": 6, "tones": 1}
-    detect_stack(
-        folder / "frames.tif", folder / "vibrations.json", _timing(), window=WINDOW, detection=options, full_scale=4095
-    )
+    source = folder / "frames.tif"
+    write_tiff(source, vibrating_counts(TIMING, FRAMES, (SIZE, SIZE), seed=2))
+    detection = {"window": WINDOW, "detection": DETECTION, "full_scale": FULL_SCALE}
+    detect_stack(source, folder / "vibrations.json", TIMING, **detection)
     for name, options in FORMATS.values():
-        report = process(folder / "frames.tif", folder / "whole" / name, **options)
+        report = process(source, folder / "whole" / name, **options)
         assert (report.frames, report.windows) == (FRAMES, WINDOWS)
         assert report.restored > 0
 
@@ -256,3 +226,26 @@ def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Rando
         fork(counted_run, reference.source, folder / name, options, die_at)
         if finished_windows(folder, name) >= windows:
             return
+
+
+def resumed_trial(reference: Reference, folder: Path, kind: str, title: str, finished: int = 0) -> Trial:
+    """Resume a run, which must use the finished windows and give the result of an uninterrupted run."""
+    name, options = FORMATS[kind]
+    code, result = fork(resume, reference.source, folder / name, options)
+    if code != 0:
+        return Trial(title, "hang" if code is None else "traceback" if code == 1 else "lost", str(result))
+    difference = reference.difference(folder, name)
+    if difference:
+        return Trial(title, "wrong", difference)
+    if result < finished:
+        return Trial(title, "lost", f"{finished} windows were complete, {result} were resumed")
+    return Trial(title, "completed")
+
+
+def completed_or_refused(title: str, code: int | None, result: Any, difference: str) -> Trial:
+    """Trial of a process that may refuse in one line; ``difference`` of its result if it is complete."""
+    if code is None:
+        return Trial(title, "hang")
+    if code == 0:
+        return Trial(title, "wrong" if difference else "completed", difference)
+    return Trial(title, "traceback" if code != 2 or "\n" in str(result) else "refused", str(result))

@@ -17,15 +17,31 @@ import psutil
 import torch
 from attacks.trial import Trial
 
-__all__ = ["in_warm_child", "place_of"]
+__all__ = ["in_warm_child", "tried"]
 
 Attempt = Callable[[Path, Any], Trial]
 
 
-def place_of(error: BaseException) -> str:
-    """File and line where an exception was raised."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(last.filename).name}:{last.lineno}"
+def tried(name: str, work: Callable[[], str], unclear: Callable[[str], str]) -> Trial:
+    """Trial of a call of Python.
+
+    Args:
+        name: Name of the trial.
+        work: The call; it returns what is wrong with the result, an empty text if nothing is.
+        unclear: What is wrong with the message of a ``ValueError``, ``TypeError`` or ``OSError``; empty if nothing is.
+    """
+    try:
+        wrong = work()
+    except (ValueError, TypeError, OSError) as error:
+        fault = unclear(str(error))
+        return Trial(name, "wrong" if fault else "refused", (fault or str(error))[:300])
+    except MemoryError as error:
+        return Trial(name, "memory", str(error)[:300])
+    except BaseException as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        detail = f"{Path(last.filename).name}:{last.lineno}: {type(error).__name__}: {error}"[:300]
+        return Trial(name, "memory" if "allocate" in str(error) else "traceback", detail)
+    return Trial(name, "wrong" if wrong else "completed", wrong)
 
 
 def _serve(connection: Connection, attempt: Attempt, folder: Path, memory: int) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import distributed
 import numpy as np
-import tifffile
+from attacks.files import FULL_SCALE, TIMING, vibrating_counts, write_tiff
 from attacks.trial import Trial
 
 import rsvib_torch as rsv
@@ -17,19 +17,8 @@ from rsvib_torch.stacks import engines
 
 __all__ = ["trials"]
 
-_TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
 _FRAMES, _WINDOW = 33, 3
 _SECONDS = 150.0  # limit of a trial
-
-
-def _write(path: Path, seed: int) -> None:
-    """Frames of 96 x 96 px of a vibrating camera."""
-    generator = np.random.default_rng(seed)
-    scene = 0.5 + 0.1 * generator.standard_normal((160, 160))
-    scene = (scene + np.roll(scene, 1, 0) + np.roll(scene, 1, 1)) / 3
-    vibration = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
-    frames = rsv.simulate_frames(scene.clip(0, 1), _TIMING, vibration, _FRAMES, frame_size=(96, 96)).numpy()
-    tifffile.imwrite(path, np.rint(4095 * frames.clip(0, 1)).astype(np.uint16), photometric="minisblack", metadata=None)
 
 
 class _DyingWorker(distributed.WorkerPlugin):
@@ -44,10 +33,9 @@ class _DyingWorker(distributed.WorkerPlugin):
 
 
 def _process(folder: Path, sink: str, **options: object) -> None:
-    options = {"detection": {"method": "bands", "tones": 1}, "restoration": {"method": "dewarp"}} | options
-    rsv.process_stack(
-        folder / "frames.tif", folder / sink, _TIMING, full_scale=4095, window=_WINDOW, workers=2, **options
-    )
+    common = {"detection": {"method": "bands", "tones": 1}, "restoration": {"method": "dewarp"}, "window": _WINDOW}
+    common |= {"full_scale": FULL_SCALE, "workers": 2}
+    rsv.process_stack(folder / "frames.tif", folder / sink, TIMING, **common | options)
 
 
 def _same(folder: Path, sink: str) -> bool:
@@ -89,7 +77,7 @@ def _refused(name: str, folder: Path, sink: str, words: str, scheduler: str) -> 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Up to ``count`` trials, most of them with a worker that is killed at a random time."""
-    _write(folder / "frames.tif", seed)
+    write_tiff(folder / "frames.tif", vibrating_counts(TIMING, _FRAMES, (96, 96), seed))
     _process(folder, "expected.tif")
     generator = np.random.default_rng(seed)
     engines.NO_WORKERS_SECONDS = 10.0

@@ -90,12 +90,24 @@ def _of_class(size: int, name: str, number: int) -> Input:
     return Input(_frames(taken.frames), taken.timing, *_plain(size, len(taken.frames)))
 
 
-def _of_shape(size: int, height: int, width: int) -> Input:
-    """A plain vibration in long or wide frames, with a square recording of as many pixels."""
-    timing = rsv.SensorTiming(FRAME_PERIOD / (BLANKING * height), 20 * height / 2048, BLANKING * height)
-    vibration = rsv.Vibration([1.5, 1.2], [53.0, 65.0], [0.4, 1.3])
+def _city(height: int, width: int) -> torch.Tensor:
+    return city_and_fields(height, width, seed=SEED)
+
+
+def _simulated(
+    size: int,
+    height: int = 0,
+    width: int = 0,
+    draw: Callable[[int, int], torch.Tensor] = _city,
+    exposure: float = 20.0,
+    amplitude: tuple[float, ...] = (1.5, 1.2),
+) -> Input:
+    """A vibration of two or, with roll, three components in four frames, with a square recording of as many pixels."""
+    height, width, count = height or size, width or size, len(amplitude)
+    timing = rsv.SensorTiming(FRAME_PERIOD / (BLANKING * height), exposure * height / 2048, BLANKING * height)
+    vibration = rsv.Vibration(list(amplitude), [53.0, 65.0, 41.0][:count], [0.4, 1.3, 0.2][:count])
     frames = rsv.simulate_frames(
-        city_and_fields(height + 64, width + 64, seed=SEED),
+        draw(height + 64, width + 64),
         timing,
         vibration,
         4,
@@ -106,28 +118,10 @@ def _of_shape(size: int, height: int, width: int) -> Input:
     return Input(frames, timing, *_plain(size, 4))
 
 
-def _of_scene(
-    size: int, scene: torch.Tensor, exposure: float = 20.0, amplitude: tuple[float, ...] = (1.5, 1.2)
-) -> Input:
-    """A vibration of two or, with roll, three components in four frames of a scene."""
-    timing = rsv.SensorTiming(FRAME_PERIOD / (BLANKING * size), exposure * size / 2048, BLANKING * size)
-    count = len(amplitude)
-    frames = rsv.simulate_frames(
-        scene,
-        timing,
-        rsv.Vibration(list(amplitude), [53.0, 65.0, 41.0][:count], [0.4, 1.3, 0.2][:count]),
-        4,
-        frame_size=(size, size),
-        noise=rsv.SensorNoise(read_noise=NOISE),
-        generator=torch.Generator().manual_seed(SEED),
-    )
-    return Input(frames, timing, *_plain(size, 4))
-
-
-def _two_waves(size: int) -> torch.Tensor:
+def _two_waves(height: int, width: int) -> torch.Tensor:
     """A scene that repeats every 12 px along x and every 15 px along y."""
-    place = torch.arange(size + 64)
-    along, across = torch.sin(2 * torch.pi * place / 12), torch.sin(2 * torch.pi * place / 15)
+    along = torch.sin(2 * torch.pi * torch.arange(width) / 12)
+    across = torch.sin(2 * torch.pi * torch.arange(height) / 15)
     return 0.5 + 0.25 * along + 0.2 * across[:, None]
 
 
@@ -167,15 +161,11 @@ def inputs() -> dict[str, Callable[[int], Input]]:
     built["uniform image"] = partial(_still, uniform=True)
     built["six tones, 8 frames"] = partial(_of_number, count=8, build=_many_tones)
     built["30 frames"] = partial(_of_number, count=30, build=partial(plain, num_frames=30, scene="texture"))
-    built["periodic scene"] = lambda size: _of_scene(size, _two_waves(size))
-    built["exposure 200, 3 and 5 px"] = lambda size: _of_scene(
-        size, city_and_fields(size + 64, size + 64, seed=SEED), 200.0, (3.1, 5.2)
-    )
-    built["roll, exposure 200"] = lambda size: _of_scene(
-        size, city_and_fields(size + 64, size + 64, seed=SEED), 200.0, (1.5, 1.2, 1 / size)
-    )
-    built["long frames"] = lambda size: _of_shape(size, 4 * size, size // 4)
-    built["wide frames"] = lambda size: _of_shape(size, max(96, size // 4), size * size // max(96, size // 4))
+    built["periodic scene"] = partial(_simulated, draw=_two_waves)
+    built["exposure 200, 3 and 5 px"] = partial(_simulated, exposure=200.0, amplitude=(3.1, 5.2))
+    built["roll, exposure 200"] = lambda size: _simulated(size, exposure=200.0, amplitude=(1.5, 1.2, 1 / size))
+    built["long frames"] = lambda size: _simulated(size, 4 * size, size // 4)
+    built["wide frames"] = lambda size: _simulated(size, max(96, size // 4), size * size // max(96, size // 4))
     return built
 
 

@@ -17,7 +17,6 @@ from benchmarks import streaming
 from harness import Rows, table
 
 from rsvib_torch.io import open_stack
-from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import cut_windows
 
@@ -28,19 +27,6 @@ OPTIONS = {
 }
 QUICK = {"dask_frames": 22, "dask_size": 96, "dask_workers": (1,)}
 _LINKS = {"1 Gbit/s": 125e6, "10 Gbit/s": 1250e6}  # bytes per second
-
-
-def _process(source: Path, sink: Path, size: int, **options: Any) -> Any:
-    return process_stack(
-        source,
-        sink,
-        streaming.timing_of(size),
-        window=streaming.WINDOW,
-        detection=streaming.DETECTION,
-        restoration=streaming.RESTORATION,
-        full_scale=4095,
-        **options,
-    )
 
 
 def _local_bytes() -> int | None:
@@ -74,12 +60,12 @@ def _one_cluster(workers: int, source: Path, few: Path, sink: Path, size: int, r
         ) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):
-        _process(few, sink, size, scheduler=cluster.scheduler_address)  # imports and warm-up of every worker
+        streaming.process(few, sink, size, scheduler=cluster.scheduler_address)  # imports and warm-up of every worker
         timed = []
         for _ in range(runs):
             there, here = sum(client.run(time.process_time).values()), time.process_time()
             moved, begin = _local_bytes(), time.perf_counter()
-            report = _process(source, sink, size, scheduler=cluster.scheduler_address)
+            report = streaming.process(source, sink, size, scheduler=cluster.scheduler_address)
             seconds = time.perf_counter() - begin
             moved = None if moved is None else (_local_bytes() or 0) - moved
             cost = sum(client.run(time.process_time).values()) - there
@@ -103,7 +89,7 @@ def rows(options: argparse.Namespace) -> Rows:
         streaming.write_long(source, options.dask_frames, size)
         streaming.write_long(few, 8 * (streaming.WINDOW - 1) + 1, size)
         payload = _payload(source, size)
-        here = [_process(source, folder / "out.tif", size, workers=1).seconds for _ in range(runs)]
+        here = [streaming.process(source, folder / "out.tif", size, workers=1).seconds for _ in range(runs)]
         results = [{"name": "here, one worker", "seconds_a_frame": min(here) / options.dask_frames, **payload}]
         expected = (folder / "out.tif").read_bytes()
         for workers in options.dask_workers:

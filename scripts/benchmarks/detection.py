@@ -1,267 +1,229 @@
-"""Accuracy of detection, compared with the Cramér-Rao bound, and with goals on cases not used for development.
+"""Errors of detection, its stated standard deviations, and the Cramér-Rao bound, also of roll and zoom.
 
-Frames come from benchmarks/independent_camera.py, which shares no code with the package. Monte Carlo: pairs of many
-noise seeds, phases and scenes; errors over the bound for an unknown scene, and how often the 95 % intervals contain the
-truth. Cases: largest and root-mean-square error in per cent and π.
+Frames come from the camera of ``honesty_camera``. Every case is one motion with several noise seeds; the free motions
+are drawn for every seed. The bound is that for a random scene.
 """
 
 import argparse
-import itertools
 import math
 import time
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.detection_cases import CASES, NAMES, PAPER, SMALL, Take, take
-from benchmarks.independent_camera import Array, Shake
+from benchmarks.honesty_camera import FINER, MARGIN, Array, Layer, Motion, fine_shape, seen_by_pixels, take_frames
+from benchmarks.honesty_scenes import city
 from harness import Rows, table
+from scipy.ndimage import map_coordinates
 
 import rsvib_torch as rsv
+from rsvib_torch.evaluation import cramer_rao_bound
 
-NOISES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
-SEED = 11
+FRAMES = 4
+READOUT, FRAME_PERIOD, EXPOSURE = 24.6e-3, 25.6e-3, 2e-4  # s
+RIM = 32  # px of the scene of the bound beyond the frame
+NAMES = ("x", "y", "roll", "zoom")
+PARAMETERS = ("amplitude", "frequency", "phase")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Tones of x (px), y (px), roll (rad) and zoom, one of each axis; amplitude 0 for none."""
+
+    name: str
+    amplitude: tuple[float, ...]
+    frequency: tuple[float, ...]
+    phase: tuple[float, ...] = (0.3, 1.1, 2.0, 0.7)
+
+    def vibration(self) -> rsv.Vibration:
+        """The motion, with as many axes as have a tone."""
+        axes = 2 + sum(size > 0 for size in self.amplitude[2:])
+        return rsv.Vibration(*(values[:axes] for values in (self.amplitude, self.frequency, self.phase)))
+
+
+CASES = {
+    "paper": Case("two axes of Liu et al. 2023", (3.1, 5.2), (50.0, 30.0)),
+    "small": Case("two axes, amplitudes of 0.2 and 0.13 px", (0.2, 0.13), (155.0, 155.0)),
+    "roll": Case("three axes, roll 1 mrad", (3.0, 5.0, 1e-3), (90.0, 61.0, 70.0)),
+    "weak": Case("three axes, roll 0.5 mrad", (3.0, 5.0, 5e-4), (90.0, 61.0, 70.0)),
+    "strong": Case("three axes, roll 2 mrad", (3.0, 5.0, 2e-3), (90.0, 61.0, 70.0)),
+    "same": Case("roll with the frequency of x", (3.0, 5.0, 1e-3), (70.0, 61.0, 70.0)),
+    "zoom": Case("four axes, zoom 5e-4", (3.0, 5.0, 1e-3, 5e-4), (90.0, 61.0, 70.0, 53.0)),
+    "none": Case("no roll", (3.0, 5.0), (90.0, 61.0)),
+}
+FREE = {"free": 3, "free zoom": 4, "free none": 2}  # random motions with so many axes
 OPTIONS = {
-    "detection_method": ("direct", "method of detect_vibration"),
-    "detection_size": ((1024, 512), "rows, columns of the trials"),
-    "detection_noises": (NOISES, "noise levels of full scale"),
-    "detection_scenes": (2, "drawn scenes"),
-    "detection_phases": (4, "draws of the phases"),
-    "detection_repeats": (4, "draws of the noise"),
-    "detection_images": ((), "image files as further scenes", Path),
-    "cases": (False, "also run the held-out cases"),
-    "case_size": ((2048, 1024), "rows, columns of the cases"),
-    "case_scenes": (2, "scenes of each case"),
-    "case_phases": (3, "draws of the phases of each case"),
+    "detection_motions": ((*CASES, *FREE), "detection: motions", (*CASES, *FREE)),
+    "detection_noises": ((0.005,), "detection: noise levels of full scale"),
+    "detection_size": (512, "detection: rows and columns"),
+    "detection_seeds": (20, "detection: noise seeds"),
+    "detection_axes": (2, "detection: measure at least so many axes"),
+    "detection_auto": (False, "detection: detection decides on the axes"),
+    "detection_optics": (0.7, "detection: standard deviation of the optics in px"),
 }
-QUICK = {
-    "detection_size": (512, 256),
-    "detection_noises": (0.01,),
-    "detection_scenes": 1,
-    "detection_phases": 1,
-    "detection_repeats": 2,
-    "case_size": (512, 256),
-    "case_scenes": 1,
-    "case_phases": 1,
-}
-NEAR = 0.05  # of the frequency; a tone with a larger error is a different one
+QUICK = {"detection_motions": ("roll", "free"), "detection_size": 224, "detection_seeds": 1}
 
 
-def errors_of(found: rsv.DetectionResult, shake: Shake) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Errors and estimated standard deviations of each true tone (2, K); NaN if it was not detected."""
-    errors = {name: np.full(shake.amplitude.shape, np.nan) for name in NAMES}
-    stated = {name: np.full(shake.amplitude.shape, np.nan) for name in NAMES}
-    vibration, std = found.vibration, found.std
-    for axis, tone in np.ndindex(shake.amplitude.shape):
-        if shake.amplitude[axis, tone] == 0:
-            continue
-        present = vibration.amplitude[axis] > 0
-        miss = torch.where(present, (vibration.frequency[axis] - shake.frequency[axis, tone]).abs(), math.inf)
-        best = int(miss.argmin())
-        if float(miss[best]) > NEAR * shake.frequency[axis, tone]:
-            continue
-        for name in NAMES:
-            error = float(getattr(vibration, name)[axis, best]) - getattr(shake, name)[axis, tone]
-            errors[name][axis, tone] = math.remainder(error, 2 * math.pi) if name == "phase" else error
-            stated[name][axis, tone] = float(getattr(std, name)[axis, best])
-    return errors, stated
+def rms(values: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
-def trial(taken: Take, noise: float, seed: int, method: str) -> dict[str, Any]:
-    """Detect in noisy frames: errors, also in units of the estimated standard deviation."""
-    generator = np.random.default_rng(seed)
-    frames = torch.from_numpy(taken.frames + noise * generator.standard_normal(taken.frames.shape)).float()
-    begin = time.perf_counter()
-    found = rsv.detect_vibration(frames, taken.timing, method=method)
-    seconds = time.perf_counter() - begin
-    errors, stated = errors_of(found, taken.shake)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        over_stated = {name: errors[name] / stated[name] for name in NAMES}
-        percent = {
-            "period": 100 * (taken.shake.frequency / (taken.shake.frequency + errors["frequency"]) - 1),
-            "amplitude": 100 * errors["amplitude"] / taken.shake.amplitude,
-            "phase": errors["phase"] / math.pi,
-        }
-    extra = int((found.vibration.amplitude > 0).sum()) - int((taken.shake.amplitude > 0).sum())
-    return {
-        "seconds": seconds,
-        "errors": errors,
-        "over_stated": over_stated,
-        "percent": percent,
-        "extra": extra,
-        "reliable": found.reliable.numpy(),
-    }
+def timing_of(size: int) -> rsv.SensorTiming:
+    """A camera with the same times for every number of rows."""
+    row_time = READOUT / size
+    return rsv.SensorTiming(row_time, EXPOSURE / row_time, FRAME_PERIOD / row_time)
 
 
-def monte_carlo(options: argparse.Namespace) -> Rows:
-    """Errors over the bound for every motion and noise, pooled over scenes, phases and seeds."""
-    size = tuple(options.detection_size)
-    sources = [SEED + i for i in range(options.detection_scenes)] + list(options.detection_images)
-    results = []
-    for motion in (PAPER, SMALL) if sources else ():
-        trials: dict[float, list[dict[str, Any]]] = {noise: [] for noise in options.detection_noises}
-        for (i, source), phase in itertools.product(enumerate(sources), range(options.detection_phases)):
-            taken = take(motion, source, size, 2, seed=1000 * i + phase)
-            # the bound for an unknown scene is proportional to the noise
-            unit = taken.bound("projection", 1.0)
-            for noise in options.detection_noises:
-                random = taken.bound("random", noise)
-                for repeat in range(options.detection_repeats):
-                    done = trial(taken, noise, hash_seed(i, phase, repeat, noise), options.detection_method)
-                    done["bound"] = {name: noise * unit[name] for name in NAMES}
-                    done["random"] = random
-                    done["truth"] = taken.shake
-                    trials[noise].append(done)
-        results += [
-            {"part": "monte carlo", "motion": motion.name, "noise": noise, "size": size, **pooled(done)}
-            for noise, done in trials.items()
+def motion_of(vibration: rsv.Vibration) -> Motion:
+    """The components as a function of times."""
+
+    def components(times: Array) -> Array:
+        parts = [
+            (size * np.sin(2 * np.pi * hertz * times + phase))
+            for size, hertz, phase in zip(*(getattr(vibration, n)[:, 0].tolist() for n in PARAMETERS), strict=True)
         ]
-    return results
+        return np.stack(parts + [np.zeros(times.shape)] * (4 - len(parts)))
+
+    return components
 
 
-def hash_seed(*values: float) -> list[int]:
-    """A different seed for every trial."""
-    return [int(1e6 * value) for value in values]
+def free_components(seed: int, axes: int) -> Motion:
+    """Random motion below about 100 Hz: 1.5 px rms along x and y, roll of 1 mrad, zoom of 1e-3."""
+    generator, frequency = np.random.default_rng(seed), np.linspace(1.0, 120.0, 100)
+    spectrum = np.exp(-0.5 * (frequency / 40.0) ** 2)
+    amplitude = spectrum * np.sqrt(-np.log(generator.uniform(size=(4, 100))))
+    size = np.array([1.5, 1.5, 1e-3, 1e-3]) * (np.arange(4) < axes)
+    amplitude *= np.sqrt(2) * size[:, None] / np.linalg.norm(amplitude, axis=1, keepdims=True)
+    phase = generator.uniform(-np.pi, np.pi, (4, 100))
+
+    def components(times: Array) -> Array:
+        angle = 2 * np.pi * frequency * times[..., None] + phase[(slice(None), *(None,) * times.ndim)]
+        return np.asarray((amplitude[(slice(None), *(None,) * times.ndim)] * np.sin(angle)).sum(-1))
+
+    return components
 
 
-def _rms(values: Array) -> float:
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
+def scene_of(size: int, optics: float) -> tuple[Layer, torch.Tensor]:
+    """A drawn city as a layer of the camera, and its pixels at rest, ``RIM`` px larger on each side than the frame."""
+    layer = Layer(seen_by_pixels(city(fine_shape(size, size), np.random.default_rng(3)), optics))
+    place = FINER * (np.arange(-RIM, size + RIM) + MARGIN + 0.5)  # as in take_frames
+    pixels = map_coordinates(layer.light, np.meshgrid(place, place, indexing="ij"), np.float64, prefilter=False)
+    return layer, torch.from_numpy(pixels)
 
 
-def pooled(trials: list[dict[str, Any]]) -> dict[str, Any]:
-    """Statistics of many trials of one motion and noise; values per axis are lists (x, y)."""
-    result: dict[str, Any] = {"trials": len(trials), "seconds": float(np.median([t["seconds"] for t in trials]))}
-    for name in NAMES:
-        ratio = np.array([t["errors"][name] / t["bound"][name] for t in trials])
-        stated = np.array([t["over_stated"][name] for t in trials])
-        random = np.array([t["random"][name] / t["bound"][name] for t in trials])
-        result[name] = {
-            "over_bound": [_rms(ratio[:, axis]) for axis in range(2)],
-            "over_stated": [_rms(stated[:, axis]) for axis in range(2)],
-            "random_over_bound": [_rms(random[:, axis]) for axis in range(2)],
-            "rms": [_rms(np.array([t["errors"][name][axis] for t in trials])) for axis in range(2)],
-            "bound": [_rms(np.array([t["bound"][name][axis] for t in trials])) for axis in range(2)],
-            "random": [_rms(np.array([t["random"][name][axis] for t in trials])) for axis in range(2)],
-        }
-    everything = np.array([[t["errors"][name] / t["bound"][name] for name in NAMES] for t in trials])
-    stated = np.array([[t["over_stated"][name] for name in NAMES] for t in trials])
-    known = np.isfinite(stated)
-    covered = float((np.abs(stated[known]) <= 1.96).mean()) if known.any() else math.nan
-    independent = max(known.sum() / len(NAMES), 1.0)  # the errors of the parameters of a tone are correlated
-    result["over_bound"] = _rms(everything)
-    squares = np.array([_rms(one) ** 2 for one in everything])
-    squares = squares[np.isfinite(squares)]
-    result["over_bound_std"] = (
-        float(squares.std(ddof=1) / math.sqrt(len(squares)) / (2 * result["over_bound"]))
-        if len(squares) > 1
-        else math.nan
-    )
-    result["coverage"] = covered
-    result["coverage_std"] = math.sqrt(max(covered * (1 - covered), 0.25 / independent) / independent)
-    result["lost"] = float(1 - known.mean())
-    result["extra_tones"] = float(np.mean([t["extra"] for t in trials]))
-    result["reliable"] = float(np.mean([t["reliable"] for t in trials]))
-    for name in ("period", "amplitude", "phase"):
-        values = np.array([t["percent"][name] for t in trials])
-        result[f"{name}_error"] = {
-            "rms": [_rms(values[:, axis]) for axis in range(2)],
-            "largest": float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else math.nan,
-            "all_rms": _rms(values),
-        }
-    return result
+def noisy(frames: Array, noise: float, seed: int) -> torch.Tensor:
+    """Frames with white noise."""
+    return torch.from_numpy(frames + noise * np.random.default_rng(seed).standard_normal(frames.shape)).float()
 
 
-def held_out_cases(options: argparse.Namespace) -> Rows:
-    """Largest and root-mean-square errors of the cases, over scenes and phases."""
-    size = tuple(options.case_size)
-    results = []
-    for number, case in enumerate(CASES):
-        done = []
-        for scene, phase in itertools.product(range(options.case_scenes), range(options.case_phases)):
-            taken = take(case.motion, SEED + 100 + scene, size, case.num_frames, seed=7000 + 100 * number + phase)
-            bound = taken.bound("gradients", case.noise)
-            result = trial(taken, case.noise, hash_seed(number, scene, phase), options.detection_method)
-            done.append({**result, "bound": bound, "random": bound})
-        results.append(
-            {
-                "part": "case",
-                "motion": case.motion.name,
-                "noise": case.noise,
-                "num_frames": case.num_frames,
-                "size": size,
-                "goal": case.goal,
-                **pooled(done),
-            }
-        )
-    return results
+def refusals(seed: int, found: Any) -> list[str]:
+    """Reasons against the axes of a result, with its seed."""
+    return [f"{seed}: {NAMES[axis]} {'; '.join(why)}" for axis, why in enumerate(found.reasons) if why]
+
+
+def tones(case: Case, noise: float, options: argparse.Namespace) -> dict[str, Any]:
+    """Errors of the parameters of one motion, over the bound and over the stated standard deviations."""
+    size, timing, truth = options.detection_size, timing_of(options.detection_size), case.vibration()
+    axes = max(truth.num_axes, options.detection_axes)
+    layer, scene = scene_of(size, options.detection_optics)
+    frames = take_frames([layer], motion_of(truth), timing.row_starts(FRAMES, size).numpy(), EXPOSURE, size)
+    bound = cramer_rao_bound(scene, timing, truth, FRAMES, noise=noise, frame_size=(size, size), method="random")
+    errors: dict[tuple[int, str], list[tuple[float, float]]] = {}
+    begin, refused, wrong_tones = time.perf_counter(), [], 0
+    for seed in range(options.detection_seeds):
+        auto = "auto" if options.detection_auto else False
+        found = rsv.detect_vibration(noisy(frames, noise, seed), timing, roll=auto or axes > 2, zoom=auto or axes > 3)
+        refused += refusals(seed, found)
+        others = found.vibration.num_axes != truth.num_axes
+        wrong_tones += others or bool((found.vibration.amplitude[:, 1:] > 0).any())
+        for axis in range(min(truth.num_axes, found.vibration.num_axes)):
+            for name in PARAMETERS:
+                value, true, std = (float(getattr(part, name)[axis, 0]) for part in (found.vibration, truth, found.std))
+                error = math.remainder(value - true, 2 * math.pi) if name == "phase" else value - true
+                errors.setdefault((axis, name), []).append((error, std))
+    parameters = []
+    for (axis, name), pairs in errors.items():
+        error, std = np.array(pairs).T
+        least, ratio = float(getattr(bound, name)[axis, 0]), error / std
+        figures = {"bound": least, "rms": rms(error) / least, "mean": float(error.mean()) / least}
+        coverage = float(np.mean(np.abs(ratio) < 1.96))
+        parameters.append({"axis": NAMES[axis], "parameter": name, **figures, "z": rms(ratio), "coverage": coverage})
+    result = {"kind": "tones", "case": case.name, "refused": refused, "wrong_tones": wrong_tones}
+    return {**result, "seconds": (time.perf_counter() - begin) / options.detection_seeds, "parameters": parameters}
+
+
+def free(axes: int, noise: float, options: argparse.Namespace) -> dict[str, Any]:
+    """Errors of random motions, a new one for every seed."""
+    size, timing = options.detection_size, timing_of(options.detection_size)
+    layer, _ = scene_of(size, options.detection_optics)
+    starts = timing.row_starts(FRAMES, size).numpy()
+    motions, errors, ratios, covered, apart, stated = [], [], [], [], [], []
+    begin, refused = time.perf_counter(), []
+    for seed in range(options.detection_seeds):
+        motion = free_components(seed, axes)
+        frames = take_frames([layer], motion, starts, EXPOSURE, size)
+        found = rsv.detect_motion(noisy(frames, noise, seed), timing, roll=axes > 2, zoom=axes > 3)
+        refused += refusals(seed, found)
+        true = motion(found.times.numpy())[:axes].transpose(1, 2, 0)
+        error = found.displacement.numpy() - (true - true.mean((0, 1)))
+        ratio = error / found.std.numpy()
+        # of the rows that show one scene row, less the mean over the frames
+        rows_of_scene = np.arange(0.1 * size, 0.9 * size)
+        times = FRAME_PERIOD * np.arange(FRAMES)[:, None] + READOUT / size * rows_of_scene
+        for _ in range(20):
+            times = FRAME_PERIOD * np.arange(FRAMES)[:, None] + READOUT / size * (rows_of_scene + motion(times)[1])
+        times += 0.5 * EXPOSURE
+        seen = found.motion.displacement(torch.from_numpy(times)).numpy() - motion(times)[:axes].transpose(1, 2, 0)
+        seen -= seen.mean(0)
+        for values, part in ((motions, true), (errors, error), (ratios, ratio), (apart, seen)):
+            values.append(np.sqrt(np.mean(part**2, (0, 1))))
+        covered.append(np.mean(np.abs(ratio) < 1.96, (0, 1)))
+        stated.append(found.std_seen.numpy())
+    figures = {"motion": motions, "rms": errors, "z": ratios, "seen": apart, "seen_std": stated}
+    parameters = [
+        {"axis": NAMES[axis], "coverage": float(np.mean(np.array(covered)[:, axis]))}
+        | {name: rms(np.array(values)[:, axis]) for name, values in figures.items()}
+        for axis in range(axes)
+    ]
+    result = {"kind": "free", "case": f"free motion, {axes} axes", "refused": refused, "wrong_tones": 0}
+    return {**result, "seconds": (time.perf_counter() - begin) / options.detection_seeds, "parameters": parameters}
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """The Monte Carlo trials, and with ``--cases`` the cases."""
-    return monte_carlo(options) + (held_out_cases(options) if options.cases else [])
-
-
-def _number(value: float) -> str:
-    return f"{value:.2g}" if abs(value) < 1 else f"{value:.1f}"
-
-
-def _pair(values: list[float]) -> str:
-    return ", ".join(_number(value) for value in values)
+    """All motions with all noise levels."""
+    return [
+        {"noise": noise} | (free(FREE[name], noise, options) if name in FREE else tones(CASES[name], noise, options))
+        for name in options.detection_motions
+        for noise in options.detection_noises
+    ]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as Markdown tables."""
-    text: list[str] = []
-    trials = [r for r in results if r["part"] == "monte carlo"]
-    for motion in dict.fromkeys(r["motion"] for r in trials):
-        of_motion = [r for r in trials if r["motion"] == motion]
-        height, width = of_motion[0]["size"]
+    """A table for each motion."""
+    text = []
+    for row in results:
         text += [
-            f"{motion}: pairs of {height} x {width} px, {of_motion[0]['trials']} trials per line, "
-            f"{of_motion[0]['seconds']:.1f} s each. Errors are root-mean-square values for x, y; the bound is that for "
-            "an unknown scene, in brackets the ratio of the bound for a random scene to it.",
+            f"{row['case']}, noise {row['noise']}: {options.detection_size} px, {options.detection_seeds} seeds, "
+            f"{row['seconds']:.1f} s each, {len(row['refused'])} axes refused, {row['wrong_tones']} results with other "
+            "axes or further tones.",
             "",
         ]
-        heads = ("noise", "period (%)", "amplitude (%)", "phase (π)", "error / bound: amplitude", "frequency", "phase")
-        heads += ("all", "error / estimated std", "in 95 % interval", "missed", "extra tones", "reliable")
-        lines_of_motion = []
-        for r in of_motion:
-            over = [
-                f"{_pair(r[name]['over_bound'])} ({_pair(r[name]['random_over_bound'])})"
-                for name in ("amplitude", "frequency", "phase")
-            ]
-            stated = [value for name in NAMES for value in r[name]["over_stated"]]
-            cells = [
-                f"{r['noise']:g}",
-                *(_pair(r[f"{name}_error"]["rms"]) for name in ("period", "amplitude", "phase")),
-                *over,
-                f"**{r['over_bound']:.2f}** ± {r['over_bound_std']:.2f}",
-                f"{(sum(v * v for v in stated) / len(stated)) ** 0.5:.2f}",
-                f"{100 * r['coverage']:.0f} ± {100 * r['coverage_std']:.0f} %",
-                f"{100 * r['lost']:.0f} %",
-                f"{r['extra_tones']:.2f}",
-                f"{100 * r['reliable']:.0f} %",
-            ]
-            lines_of_motion.append(cells)
-        text += table(heads, lines_of_motion)
-    cases = [r for r in results if r["part"] == "case"]
-    if not cases:
-        return text
-    height, width = cases[0]["size"]
-    text += [
-        f"Cases, {height} x {width} px, {cases[0]['trials']} trials each: largest error (root-mean-square), goal.",
-        "",
-    ]
-    lines_of_cases = []
-    for r in cases:
-        cells = [r["motion"], str(r["num_frames"]), f"{r['noise']:g}"]
-        for name, goal in zip(("period", "amplitude", "phase"), r["goal"], strict=True):
-            error = r[f"{name}_error"]
-            shown = f"{_number(error['largest'])} ({_number(error['all_rms'])})"
-            cells += [shown if error["largest"] <= goal else f"**{shown}**", f"{goal:g}"]
-        cells += [f"{r['over_bound']:.2f}", f"{100 * r['lost']:.0f} %", f"{r['extra_tones']:.2f}"]
-        lines_of_cases.append([*cells, f"{r['seconds']:.1f}"])
-    heads = ("case", "frames", "noise", "period (%)", "goal", "amplitude (%)", "goal", "phase (π)", "goal")
-    return text + table((*heads, "error / bound", "missed", "extra tones", "seconds"), lines_of_cases)
+        cells = []
+        for p in row["parameters"]:
+            last = (f"{p['z']:.2f}", f"{p['coverage']:.0%}")
+            if row["kind"] == "tones":
+                first = (p["parameter"], f"{p['bound']:.3g}", f"{p['rms']:.2f}", f"{p['mean']:+.2f}")
+            else:
+                over = p["seen"] / p["seen_std"]
+                first = (f"{p['motion']:.3g}", f"{p['rms']:.2g}", f"{p['seen']:.2g}", f"{over:.2f}")
+            cells.append((p["axis"], *first, *last))
+        heads = {
+            "tones": ("parameter", "bound", "rms error / bound", "mean error / bound"),
+            "free": ("rms motion", "rms error", "rms error between frames", "over its std"),
+        }
+        text += table(("axis", *heads[row["kind"]], "rms error / std", "coverage"), cells)
+        if row["refused"]:
+            text += [*(f"* {why}" for why in row["refused"]), ""]
+    return text

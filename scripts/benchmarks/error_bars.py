@@ -28,7 +28,7 @@ sys.path += [str(_TESTS), str(_TESTS / "calibration")]
 
 from motion_truth import common_warp, rms  # noqa: E402
 from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine  # noqa: E402
-from truth import Motion, draw_scene, take_frames  # noqa: E402
+from truth import Curve, draw_scene, take_frames  # noqa: E402
 
 Array = NDArray[np.float64]
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)
@@ -44,31 +44,25 @@ OPTIONS = {
 QUICK = {"bar_kinds": ("walk", "wall"), "bar_motions": 1, "bar_recordings": 2}
 
 
-class Drawn(Motion):
+def drawn(kind: str, seed: int) -> Curve:
     """A random motion of one kind."""
-
-    def __init__(self, kind: str, seed: int) -> None:
-        draw = np.random.default_rng(seed)
-        span = 1.2 * FRAMES * TIMING.frame_period
-        times = np.linspace(-0.1 * span, span, 400)
-        turns = times[:, None] / TIMING.frame_period
-        if kind == "walk":
-            path = gaussian_filter1d(np.cumsum(draw.standard_normal((400, 2)), 0), 8, axis=0)
-            path *= 2.0 / path.std(0)
-        elif kind == "smooth":
-            path = np.cumsum(np.cumsum(draw.standard_normal((400, 2)), 0), 0)
-            path = 3.0 * (path - path.mean(0)) / path.std(0)
-        else:
-            tones = [(draw.uniform(0.2, 1.8), draw.uniform(0.3, 2, 2)) for _ in range(3)]
-            tones = tones if kind == "tones" else [(1 + draw.uniform(-0.08, 0.08), np.full(2, 1.5))]
-            path = draw.uniform(-2, 2, 2) * turns
-            for frequency, size in tones:
-                path = path + size * np.sin(2 * np.pi * frequency * turns + draw.uniform(0, 2 * np.pi, 2))
-        object.__setattr__(self, "curve", CubicSpline(times, path))
-
-    def displacement(self, times: Array) -> Array:
-        """Displacement in px at times in seconds."""
-        return np.asarray(self.curve(times))  # type: ignore[attr-defined]
+    draw = np.random.default_rng(seed)
+    span = 1.2 * FRAMES * TIMING.frame_period
+    times = np.linspace(-0.1 * span, span, 400)
+    turns = times[:, None] / TIMING.frame_period
+    if kind == "walk":
+        path = gaussian_filter1d(np.cumsum(draw.standard_normal((400, 2)), 0), 8, axis=0)
+        path *= 2.0 / path.std(0)
+    elif kind == "smooth":
+        path = np.cumsum(np.cumsum(draw.standard_normal((400, 2)), 0), 0)
+        path = 3.0 * (path - path.mean(0)) / path.std(0)
+    else:
+        tones = [(draw.uniform(0.2, 1.8), draw.uniform(0.3, 2, 2)) for _ in range(3)]
+        tones = tones if kind == "tones" else [(1 + draw.uniform(-0.08, 0.08), np.full(2, 1.5))]
+        path = draw.uniform(-2, 2, 2) * turns
+        for frequency, size in tones:
+            path = path + size * np.sin(2 * np.pi * frequency * turns + draw.uniform(0, 2 * np.pi, 2))
+    return Curve(CubicSpline(times, path))
 
 
 def free_motion(kind: str, motions: int, seeds: int) -> dict[str, Any]:
@@ -76,7 +70,7 @@ def free_motion(kind: str, motions: int, seeds: int) -> dict[str, Any]:
     pulls, seen = [], []
     moments = (TIMING.row_starts(FRAMES, ROWS) + 0.5 * TIMING.exposure_time).numpy()
     for number in range(motions):
-        motion = Drawn(kind, 100 + number)
+        motion = drawn(kind, 100 + number)
         clean = take_frames(draw_scene(ROWS + 80, COLUMNS + 80, 20 + number % 5), TIMING, motion, FRAMES, 0.0)
         for seed in range(seeds):
             noise = NOISE * np.random.default_rng(seed).standard_normal(clean.shape)

@@ -44,6 +44,7 @@ MIN_OFFSET = 0.05  # px, amplitude of the offsets of a tone from which it must b
 MANY_STD, WRONG_SHARE = 5.0, 0.02  # of a parameter
 WRONG_DISPLACEMENT, WRONG_PX, KNOWN_DISPLACEMENT = 0.05, 0.01, 0.02  # share of its rms, px, share
 MERGED = 0.25  # of 1 / duration; closer tones count as one
+WRONG_IN = ("wrong_parameter", "wrong_displacement")  # keys of the figures of an axis
 WORSE_DB = 0.1
 RIM = 1 / 12  # of the frame; pixels near the border are not compared
 WITHIN_95 = 1.96
@@ -161,12 +162,26 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
         outcome = "correct"
     else:
         outcome = "assumed" if not wrong_displacement and is_assumed(found, taken, axis, tones) else "wrong"
+    wrong = [name for name, is_wrong in zip(WRONG_IN, (wrong_parameter, wrong_displacement), strict=True) if is_wrong]
+    return of_axis(found, axis, outcome, wrong, (error, size, std), tones, len(true))
+
+
+def of_axis(
+    found: rsv.DetectionResult,
+    axis: int,
+    outcome: str,
+    wrong: list[str],
+    sizes: tuple[float, float, float],
+    tones: list[dict[str, float]],
+    true_tones: int,
+) -> dict[str, Any]:
+    """Outcome and figures of an axis; ``sizes`` are error, rms and standard deviation of the displacement in px."""
+    error, size, std = sizes
     return {
         "outcome": outcome,
-        "wrong_parameter": outcome == "wrong" and wrong_parameter,
-        "wrong_displacement": outcome == "wrong" and wrong_displacement,
+        **{name: outcome == "wrong" and name in wrong for name in WRONG_IN},
         "tones": tones,
-        "true_tones": len(true),
+        "true_tones": true_tones,
         "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
         "largest_z": max((abs(t[f"{name}_z"]) for t in tones for name in ("amplitude", "frequency")), default=0.0),
         "displacement_px": size,
@@ -187,19 +202,8 @@ def judge_turn(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
     std = arm * float(displacement_uncertainty(found.vibration, found.std, taken.timing, num_frames, height)[0][axis])
     reliable = bool(found.reliable[axis])
     wrong = reliable and error > max(WRONG_DISPLACEMENT * size, WRONG_PX) and error > MANY_STD * std
-    return {
-        "outcome": "wrong" if wrong else "correct" if reliable else "refused",
-        "wrong_parameter": False,
-        "wrong_displacement": wrong,
-        "tones": [],
-        "true_tones": int(size > 0),
-        "found_tones": int((found.vibration.amplitude[axis] > 0).sum()),
-        "largest_z": 0.0,
-        "displacement_px": size,
-        "displacement_error": error / max(size, 1e-9),
-        "displacement_std": std / max(size, 1e-9),
-        "reasons": list(found.reasons[axis]),
-    }
+    outcome = "wrong" if wrong else "correct" if reliable else "refused"
+    return of_axis(found, axis, outcome, ["wrong_displacement"], (error, size, std), [], int(size > 0))
 
 
 def best_constant(image: Array, still: Array, rim: int, steps: int = 4) -> Array:

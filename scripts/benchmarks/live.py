@@ -66,10 +66,10 @@ class Changing:
         return float(4 * np.pi * (AMPLITUDE * FREQUENCY).max() * duration)
 
 
-def timing_of(size: int) -> rsv.SensorTiming:
+def timing_of(size: int, exposure_rows: int = EXPOSURE_ROWS) -> rsv.SensorTiming:
     """A camera of 30 frames/s with ``size`` rows and a tenth of the frame period for blanking."""
     row_time = 0.9 / RATE / size
-    return rsv.SensorTiming(row_time=row_time, exposure_rows=EXPOSURE_ROWS, frame_rows=1 / RATE / row_time)
+    return rsv.SensorTiming(row_time=row_time, exposure_rows=exposure_rows, frame_rows=1 / RATE / row_time)
 
 
 def frames_of(size: int, motion: Changing, count: int) -> NDArray[np.uint8]:

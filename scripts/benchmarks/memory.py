@@ -46,7 +46,6 @@ def rows(options: argparse.Namespace) -> Rows:
                         size=size,
                         memory=asked,
                         workers=count,
-                        scheduler=None,
                         restoration=restoration,
                     )
                     results.append(

@@ -13,42 +13,30 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from benchmarks import restoration
-from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.library_chain import detect_by_libraries, kernel_of_row
+from benchmarks.library_chain import detect_by_libraries
 from benchmarks.restoration import (
     AMPLITUDE,
-    FADE,
     FREQUENCY,
     MARGIN,
     RIM,
     SCENES,
     SEED,
-    TIMED_NOISE,
-    fft_round_trip,
+    camera,
     quality,
+    recordings,
     vibration,
 )
-from benchmarks.restoration_peers import (
-    Peer,
-    by_wiener,
-    loop_rows,
-    remap_lanczos,
-    restore_rows,
-    rows_and_displacements,
-    sampled_rows,
-)
+from benchmarks.restoration_peers import Peer, remap_lanczos, sampled_rows, slabs_and_kernels, wiener_loop, wiener_rows
 from harness import Rows, Timed, in_turns, named, shown_seconds, table
-from numpy.typing import NDArray
 from torch import Tensor
 
 import rsvib_torch as rsv
 
 OPTIONS = restoration.OPTIONS | {"pipeline_rows": (2048, "pipeline: rows of the frames where chains are compared")}
 QUICK = restoration.QUICK | {"pipeline_rows": 384}
-WIENER, TIMED_BALANCE = "skimage wiener, row loop", 0.01
+TIMED_BALANCE, TIMED_NOISE = 0.01, 0.005
 PAPER, FASTEST = "matchTemplate, curve_fit, wiener rows (the paper's)", "matchTemplate, curve_fit, remap (fastest)"
 OURS, DEWARP = "detect_vibration, restore", 'detect_vibration, "dewarp"'
 NARROW = "detect_vibration on a quarter of the columns, restore"
@@ -82,12 +70,6 @@ def detect(frames: Tensor, timing: rsv.SensorTiming, name: str) -> rsv.Detection
     return rsv.detect_vibration(frames, timing, **options)
 
 
-def camera(exposure: float, num_rows: int) -> rsv.SensorTiming:
-    """The paper's camera; fewer rows are slower, so that frame period and exposure time are unchanged."""
-    slower = 2048 / num_rows
-    return rsv.SensorTiming(row_time=20.52e-6 * slower, exposure_rows=exposure / slower, frame_rows=num_rows)
-
-
 def errors_of(found: rsv.Vibration) -> dict[str, float]:
     """Errors of amplitude and period in % of the strongest tone, on the axis that has the larger one."""
     amplitude, frequency = found.amplitude[:, 0].cpu(), found.frequency[:, 0].cpu()
@@ -102,7 +84,7 @@ def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, 
     """Both frames restored by the package."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
-        return [Peer(frame, 0.0, "") for frame in rsv.restore(frames, timing, found, method=method)]
+        return [Peer(frame, 0.0) for frame in rsv.restore(frames, timing, found, method=method)]
 
 
 def compare_chains(frames: Tensor, still: Tensor, timing: rsv.SensorTiming) -> Rows:
@@ -113,7 +95,7 @@ def compare_chains(frames: Tensor, still: Tensor, timing: rsv.SensorTiming) -> R
         PAPER: (
             by_libraries,
             None,
-            lambda: [loop_rows(WIENER, array[i], timing, by_libraries, still, RIM, i) for i in range(2)],
+            lambda: [wiener_rows(array[i], timing, by_libraries, still, RIM, i) for i in range(2)],
         ),
         FASTEST: (by_libraries, None, lambda: [remap_lanczos(array[i], timing, by_libraries, i) for i in range(2)]),
     }
@@ -136,33 +118,18 @@ def compare_chains(frames: Tensor, still: Tensor, timing: rsv.SensorTiming) -> R
 
 def accuracy(options: argparse.Namespace) -> Rows:
     """Every chain on every scene, exposure and noise."""
-    size, results = (options.pipeline_rows, options.grid_size), []
-    for name in options.scenes:
-        scene = SCENES[name](size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, SEED)
-        still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
-        for exposure in options.exposures:
-            timing = camera(exposure, size[0])
-            taken = take_frames(closed(scene.double().numpy(), FADE), Shake.of(vibration()), timing, 2, size)
-            clean = torch.from_numpy(taken).float()
-            for noise in options.noises:
-                frames = rsv.SensorNoise(read_noise=noise).apply(clean, torch.Generator().manual_seed(SEED))
-                case = {"part": "accuracy", "scene": name, "exposure_rows": exposure, "noise": noise}
-                results += [{**case, **row} for row in compare_chains(frames, still, timing)]
-    return results
-
-
-def wiener_loop(
-    frame: NDArray[np.float32], rows: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, index: int
-) -> NDArray[np.float32]:
-    """Rows of frame ``index`` restored one after another: kernel, slab, Wiener filter (Secs. 3.1 and 3.2)."""
-    shown_by, _ = rows_and_displacements(rows, timing, found, index)
-    starts = (timing.frame_starts(index + 1)[index] + shown_by * timing.row_time).tolist()
-    middles = shown_by.round().long()
-    kernels = [
-        kernel_of_row(found, start, timing, moved)
-        for start, moved in zip(starts, (middles - rows).tolist(), strict=True)
+    size = (options.pipeline_rows, options.grid_size)
+    return [
+        {"part": "accuracy", **case, **row}
+        for case, frames, still, timing in recordings(options, size, size[0])
+        for row in compare_chains(frames, still, timing)
     ]
-    return restore_rows(frame, middles.tolist(), kernels, by_wiener(TIMED_BALANCE))
+
+
+def fft_round_trip(frame: Tensor) -> Tensor:
+    """The unit of time: forward and inverse ``torch.fft`` in float32."""
+    image: Tensor = torch.fft.irfft2(torch.fft.rfft2(frame), s=frame.shape)
+    return image
 
 
 def speed(options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming) -> Rows:
@@ -183,7 +150,9 @@ def speed(options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming)
             array, rows_ = frames.numpy(), sampled_rows(frames.shape[-2], RIM)
             lib = detect_by_libraries(array, timing)
             works["libraries"] = lambda a=array: detect_by_libraries(a, timing)
-            works["wiener"] = lambda a=array, r=rows_, v=lib: [wiener_loop(a[i], r, timing, v, i) for i in range(2)]
+            works["wiener"] = lambda a=array, r=rows_, v=lib: [
+                wiener_loop(slabs_and_kernels(a[i], r, timing, v, i), TIMED_BALANCE) for i in range(2)
+            ]
             works["remap"] = lambda a=array, v=lib: [remap_lanczos(a[i], timing, v, i) for i in range(2)]
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
         done = in_turns(works, options.runs)

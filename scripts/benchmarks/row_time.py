@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.detection_cases import RIM
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
 from harness import Rows, table
 
@@ -23,6 +22,7 @@ from rsvib_torch.evaluation.bound import Recording, projected_information
 
 FRAME_PERIOD, READOUT, EXPOSURE = 1 / 30, 25.6e-3, 5e-4  # s
 NOISE = 0.005
+RIM = 24  # px; width of the border over which a scene fades to its mean
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ class Section:
 
 SECTIONS: dict[str, Section] = {
     "cost": Section("Time of detection"),
-    "detection": Section("Accuracy of detection"),
     "restoration": Section("Restoration"),
     "finer": Section("Finer grid"),
     "mosaic": Section("Colour mosaics"),
@@ -37,13 +36,13 @@ SECTIONS: dict[str, Section] = {
     "verdict": Section("Verdict on restorations", by_default=False),
     "honesty": Section("Reliable results that are wrong", by_default=False),
     "timing": Section("Mistakes of the timing", by_default=False),
-    "roll": Section("Roll and zoom", by_default=False),
+    "detection": Section("Accuracy of detection, roll and zoom", by_default=False),
     "row_time": Section("Row time from motion", by_default=False),
     "error_bars": Section("Standard deviations", by_default=False),
 }
 
 
-EARLIER_NAMES = {"roofline": "gpu"}  # of sections that have become part of others
+EARLIER_NAMES = {"roofline": "gpu", "roll": "detection"}  # of sections that have become part of others
 
 
 def module_of(name: str) -> Any:

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from harness import Rows, one_thread, table
-from scipy.special import j1
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
-from edge_truth import draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixels
+from edge_truth import OPTICS, draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixels
 
 import rsvib_torch as rsv
 
@@ -22,33 +21,6 @@ QUICK = {"seeds": 2}
 NOISE = 0.008  # 1 % of the contrast, 0.8
 SIGMAS = (0.5, 0.8)
 Transfer = Callable[[np.ndarray], np.ndarray]
-
-
-def diffraction(cutoff: float) -> Transfer:
-    def transfer(f: np.ndarray) -> np.ndarray:
-        s = np.clip(np.abs(f) / cutoff, 0, 1)
-        return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
-
-    return transfer
-
-
-def defocus(radius: float) -> Transfer:
-    def transfer(f: np.ndarray) -> np.ndarray:
-        z = 2 * np.pi * radius * np.asarray(f) + 1e-12
-        return 2 * j1(z) / z * gaussian(0.3)(f)
-
-    return transfer
-
-
-OTHERS: dict[str, Transfer] = {
-    "motion of 3 px": lambda f: np.sinc(3 * f) * gaussian(0.4)(f),
-    "disc of confusion, radius 1.2 px": defocus(1.2),
-    "sharpened, overshoot 0.12": lambda f: gaussian(0.6)(f) * (2 - gaussian(1.2)(f)),
-    "one-sided blur": lambda f: gaussian(0.5)(f) / (1 + 2j * np.pi * f * 0.6),
-    "15 % halo, sigma = 3 px": lambda f: 0.85 * gaussian(0.5)(f) + 0.15 * gaussian(3.0)(f),
-    "diffraction, cut-off 1.2 cycles/px": diffraction(1.2),
-    "diffraction, cut-off 0.6 cycles/px": diffraction(0.6),
-}
 
 
 def measure(image: np.ndarray) -> rsv.MtfCurve:
@@ -104,7 +76,7 @@ def gaussian_row(sigma: float, seeds: int) -> dict[str, Any]:
 
 def other_row(name: str, seeds: int) -> dict[str, Any]:
     """Errors with other optics, without and with noise."""
-    truth, image = through_pixels(OTHERS[name], 5.2), draw_edge_of(OTHERS[name], 5.2)
+    truth, image = through_pixels(OPTICS[name], 5.2), draw_edge_of(OPTICS[name], 5.2)
     error, clean = errors(image, truth, 0.02)
     noisy = [
         errors(image + NOISE * np.random.default_rng(seed).standard_normal(image.shape), truth, 0.02)[1]
@@ -130,7 +102,7 @@ def rows(options: argparse.Namespace) -> Rows:
     with one_thread():
         return [
             *(gaussian_row(sigma, options.seeds) for sigma in SIGMAS),
-            *(other_row(name, fewer) for name in OTHERS),
+            *(other_row(name, fewer) for name in OPTICS),
             eight_bits(0.0, 1),
             eight_bits(1.0, fewer),
         ]

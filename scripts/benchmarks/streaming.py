@@ -70,31 +70,18 @@ def peak_memory() -> float:
     raise OSError("the kernel does not report peak memory")
 
 
-def one_run(
-    source: str,
-    sink: str,
-    size: int,
-    memory: str | int | None,
-    workers: int | None,
-    scheduler: str | None,
-    restoration: dict[str, Any] | None = None,
-) -> Any:
+def process(source: Path | str, sink: Path | str, size: int, **options: Any) -> Any:
+    """Process a stack; returns its report."""
+    common: dict[str, Any] = {"window": WINDOW, "detection": DETECTION, "restoration": RESTORATION, "full_scale": 4095}
+    return process_stack(source, sink, timing_of(size), **common | options)
+
+
+def one_run(source: str, sink: str, size: int, **options: Any) -> dict[str, Any]:
     """Process a stack in this process."""
     import resource  # noqa: PLC0415 - not available on all systems
 
     begin = time.perf_counter()
-    report = process_stack(
-        source,
-        sink,
-        timing_of(size),
-        window=WINDOW,
-        detection=DETECTION,
-        restoration=RESTORATION if restoration is None else restoration,
-        full_scale=4095,
-        memory=memory,
-        workers=workers,
-        scheduler=scheduler,
-    )
+    report = process(source, sink, size, **options)
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = time.perf_counter() - begin
     return {
@@ -148,12 +135,12 @@ def rows(options: argparse.Namespace) -> Rows:
         for count in options.frames:
             source = folder / "frames.npy"
             write_long(source, count, size)
-            common = {"source": str(source), "sink": str(sink), "size": size, "scheduler": None}
-            run = run_apart(**common, memory=options.memory, workers=None)
+            common = {"source": str(source), "sink": str(sink), "size": size}
+            run = run_apart(**common, memory=options.memory)
             results.append({"name": f"{count} frames, memory {options.memory}", **run})
         few = 3 * (WINDOW - 1) + 1
         write_long(folder / "few.npy", few, size)
-        common |= {"source": str(folder / "few.npy"), "memory": None}
+        common |= {"source": str(folder / "few.npy")}
         torch.set_num_threads(1)
         works: dict[str, Callable[[], Any]] = {
             "computation only, one thread": lambda: _computing_alone(folder / "few.npy", size, 3),

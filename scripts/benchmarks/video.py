@@ -20,6 +20,7 @@ from typing import Any
 import av
 import numpy as np
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
+from benchmarks.live import AMPLITUDE, FREQUENCY, PHASE, RATE, timing_of
 from harness import Rows, table
 from numpy.typing import NDArray
 
@@ -32,9 +33,8 @@ OPTIONS = {
     "video_rows": (1080, "video: rows, 16:9"),
 }
 QUICK = {"video_frames": 12, "video_rows": 180}
-RATE, MARGIN, SEED, NOISE = 30, 32, 3, 0.004
+MARGIN, SEED, NOISE = 32, 3, 0.004
 EXPOSURE_ROWS = 15
-AMPLITUDE, FREQUENCY, PHASE = np.array([2.1, 1.6]), np.array([52.0, 71.0]), np.array([0.5, 1.0])
 CRF = "12"  # of the clip
 METHODS = ("exact", "dewarp")
 GOALS = {"exact": 0.6, "dewarp": 0.16}  # s of a processor per frame: 3 and 12 frames/s on two cores
@@ -62,15 +62,9 @@ PARTS: dict[str, list[tuple[str, str]]] = {
 CODECS = "decoding, encoding and the rest"
 
 
-def timing_of(rows: int) -> rsv.SensorTiming:
-    """A camera of 30 frames/s with a tenth of the frame period for blanking."""
-    row_time = 0.9 / RATE / rows
-    return rsv.SensorTiming(row_time=row_time, exposure_rows=EXPOSURE_ROWS, frame_rows=1 / RATE / row_time)
-
-
 def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Array]]:
     """Counts (T, H, W) of Y, U and V, and their scenes at rest, full scale 1."""
-    timing, counts, still = timing_of(rows), [], []
+    timing, counts, still = timing_of(rows, EXPOSURE_ROWS), [], []
     for number, step in enumerate((1, 2, 2)):
         size = (rows // step, 16 * rows // 9 // step)
         scene = city_and_fields(size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, seed=SEED + number).double().numpy()
@@ -166,7 +160,9 @@ def rows(options: argparse.Namespace) -> Rows:
             target = Path(folder) / f"{method}.mp4"
             begin, cpu = time.perf_counter(), time.process_time()
             with processor_times(PARTS) as spent:
-                process_video(clip, target, timing_of(options.video_rows), restoration={"method": method})
+                process_video(
+                    clip, target, timing_of(options.video_rows, EXPOSURE_ROWS), restoration={"method": method}
+                )
             used, seconds = time.process_time() - cpu, time.perf_counter() - begin
             results.append(
                 {

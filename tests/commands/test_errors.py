@@ -3,7 +3,6 @@
 import json
 import os
 import struct
-import threading
 import zlib
 from pathlib import Path
 
@@ -69,15 +68,6 @@ def test_unforeseen_errors_are_one_line(error, line, camera, failing, capsys):
 def test_functions_raise_errors_of_the_program_unchanged(tmp_path, failing):
     with pytest.raises(KeyError, match="row"):
         process_stack(failing(KeyError("row")), tmp_path / "b.npy", TIMING)
-
-
-def test_threads_that_cannot_be_started(camera, monkeypatch, capsys):
-    def fail(_):
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(threading.Thread, "start", fail)
-    assert run_command(["run", "frames.tif", "results", *camera]) == 2
-    assert capsys.readouterr().err.startswith("rsvib: error: the system cannot start another thread")
 
 
 def test_figures_that_cannot_be_drawn_are_a_warning(camera, monkeypatch, capsys):

@@ -4,9 +4,8 @@ import re
 
 import numpy as np
 import pytest
-import tifffile
 import torch
-from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -109,13 +108,10 @@ def test_unrelated_recording_is_not_reliable(frames, tmp_path):
 
 
 def test_periodic_motion_has_ambiguous_clock_offsets(tmp_path, scene):
-    class Sine(Motion):
-        def displacement(self, times):
-            return np.stack([3 * np.sin(2 * np.pi * 31 * times), 2 * np.cos(2 * np.pi * 31 * times)], -1)
-
+    sine = Curve(lambda t: np.stack([3 * np.sin(2 * np.pi * 31 * t), 2 * np.cos(2 * np.pi * 31 * t)], -1))
     clock = np.arange(0.0, 0.4, 1e-3)
-    path = log(tmp_path / "sine.csv", clock, Sine().displacement(clock))
-    frames = torch.from_numpy(take_frames(scene, TIMING, Sine(), 3, 0.005)).float()
+    path = log(tmp_path / "sine.csv", clock, sine.displacement(clock))
+    frames = torch.from_numpy(take_frames(scene, TIMING, sine, 3, 0.005)).float()
     found = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"))
     assert "motion_repeats" in {reason.code for reason in found.findings}
     near = rsv.align_motion(frames, TIMING, rsv.read_motion(path, unit="px"), offsets=(0.0, 0.015))
@@ -173,49 +169,6 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     assert run_command([*arguments, *forced]) == 0
     assert "y: rows are further apart" in capsys.readouterr().err
     assert (tmp_path / "out.tif").exists()
-
-
-def test_known_writes_the_input_where_the_restored_frames_are_worse(frames, tmp_path, capsys):
-    """A wrong sign along y passes the check of the offsets, because x is right; the verdict on the frames decides."""
-    (tmp_path / "camera.toml").write_text(CONFIG + "[restoration]\nsaturation = 4095\n")
-    rsv.write_stack(tmp_path / "frames.tif", frames, dtype="uint16", full_scale=4095)
-    times = np.arange(-0.02, 0.1, 5e-4)
-    files = [str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), "--config", str(tmp_path / "camera.toml")]
-    common = ["known", "--overwrite", *files, "--unit", "px", "--offset", "0", "--motion", str(tmp_path / "motion.csv")]
-    given = tifffile.imread(tmp_path / "frames.tif")
-    for factor, more, state, message in (
-        ([1, 1], [], "restored", "restored frames agree"),
-        ([1, -0.9], [], "unchanged", "restored is no better than raw"),
-        ([1, -0.9], ["--force"], "restored", "restored is no better than raw"),
-        ([0, 0], ["--force"], "unchanged", "no vibration to remove: the frames are written unchanged"),
-    ):
-        log(tmp_path / "motion.csv", times, factor * HandShake().displacement(times))
-        assert run_command([*common, *more]) == 0
-        shown = capsys.readouterr()
-        assert message in shown.out + shown.err
-        assert ("--force writes the restored ones" in shown.err) == (factor == [1, -0.9] and not more)
-        assert (tifffile.imread(tmp_path / "out.tif") == given).all() == (state == "unchanged")
-
-
-@pytest.mark.parametrize(
-    ("place", "size", "message"),
-    [
-        (slice(None, None, -1), 1.0, "times must increase"),
-        (np.r_[0:500, 520:1000], 1.0, "gap of"),
-        (slice(None), 1e3, "check time_unit='s'"),
-    ],
-)
-def test_errors_in_a_recording_are_one_line(frames, tmp_path, capsys, place, size, message):
-    (tmp_path / "camera.toml").write_text(CONFIG)
-    rsv.write_stack(tmp_path / "frames.tif", frames)
-    clock = np.arange(812.0, 813.0, 1e-3)
-    path = log(tmp_path / "angles.csv", size * clock[place], angles(clock)[place])
-    files = [str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), "--config", str(tmp_path / "camera.toml")]
-    assert run_command(["known", *files, "--motion", str(path), "--unit", "rad", "--focal-length", "900"]) == 2
-    errors = capsys.readouterr().err.strip().splitlines()
-    assert len(errors) == 1
-    assert message in errors[0]
-    assert not (tmp_path / "out.tif").exists()
 
 
 def at(times, factor=1.0):

@@ -45,6 +45,12 @@ def errors(result, motion):
     return period, amplitude, phase_error(found.phase[:, 0], motion.phase).max() / np.pi
 
 
+def check(result, motion, *limits):
+    assert all(error < limit for error, limit in zip(errors(result, motion), limits, strict=True)), errors(
+        result, motion
+    )
+
+
 def codes(result):
     """Codes of the reasons against each axis."""
     return [[reason.code for reason in of_axis] for of_axis in result.findings]
@@ -62,8 +68,7 @@ def pairs(paper_camera):
 def test_paper_pair(pairs, paper_camera, registration, case):
     frames, motion = pairs[case]
     result = detect_bands(frames, paper_camera, registration=registration)
-    for error, limit in zip(errors(result, motion), LIMITS[registration], strict=True):
-        assert error < limit
+    check(result, motion, *LIMITS[registration])
     assert result.vibration.amplitude.shape == (2, 1)
     assert result.reliable.tolist() == [True, True]
     assert result.findings == ((), ())
@@ -76,10 +81,7 @@ def test_paper_pair(pairs, paper_camera, registration, case):
 def test_negative_gain(paper_camera, phase):
     motion = Motion(amplitude=(1.5, 2.5), frequency=(30.0, 30.0), phase=(phase, phase + 0.5))
     result = detect_bands(noisy_frames(paper_camera, motion, 3), paper_camera)
-    period, amplitude, angle = errors(result, motion)
-    assert period < 0.3
-    assert amplitude < 1.0
-    assert angle < 0.01
+    check(result, motion, 0.3, 1.0, 0.01)
     assert bool((result.gain < -1.4).all())
 
 
@@ -99,8 +101,7 @@ def test_image_motion_is_separated(paper_camera, registration):
     motion = Motion(phase=random_phase(5), image_motion=(500.0, -240.0))
     frames = noisy_frames(paper_camera, motion, 5, columns=704, margin=60)
     result = detect_bands(frames, paper_camera, registration=registration)
-    for error, limit in zip(errors(result, motion), LIMITS[registration], strict=True):
-        assert error < limit
+    check(result, motion, *LIMITS[registration])
     assert result.vibration.image_motion.tolist() == pytest.approx([500.0, -240.0], abs=3.0)
     assert bool(result.reliable.all())
 
@@ -139,10 +140,7 @@ def test_frames_of_noise_are_not_reliable(paper_camera, registration, seed):
 def test_small_amplitudes(paper_camera):
     motion = Motion(amplitude=(0.2, 0.13), frequency=(155.0, 155.0), phase=(0.9, -2.0))
     result = detect_bands(noisy_frames(paper_camera, motion, 8, columns=640), paper_camera)
-    period, amplitude, phase = errors(result, motion)
-    assert period < 0.5
-    assert amplitude < 6.0
-    assert phase < 0.06
+    check(result, motion, 0.5, 6.0, 0.06)
     assert bool(result.reliable.all())
 
 
@@ -248,15 +246,6 @@ def fitted_vibration(measurements, start=(52.0, 28.5)):
     return vibration_of_fit(fit)
 
 
-def test_inversion_is_exact_without_noise():
-    measurements, motion = synthetic_measurements(0.0, 0, 1)
-    vibration, _ = fitted_vibration(measurements)
-    assert vibration.amplitude[0, :, 0].tolist() == pytest.approx(motion.amplitude, rel=1e-6)
-    assert vibration.frequency[0, :, 0].tolist() == pytest.approx(motion.frequency, rel=1e-6)
-    assert phase_error(vibration.phase[0, :, 0], motion.phase).max() < 1e-6
-    assert vibration.image_motion[0].tolist() == pytest.approx(motion.image_motion, abs=1e-4)
-
-
 def test_standard_deviations_agree_with_scatter():
     batch = 400
     measurements, motion = synthetic_measurements(0.03, 1, batch)
@@ -297,10 +286,7 @@ def test_dropped_frame_times(paper_camera):
     frames = noisy_frames(paper_camera, motion, 2, 3)[[0, 2]]
     timing = replace(paper_camera, frame_start_times=[0.0, 2 * paper_camera.frame_period])
     result = detect_bands(frames, timing)
-    period, amplitude, phase = errors(result, motion)
-    assert period < 0.3
-    assert amplitude < 1.0
-    assert phase < 0.01
+    check(result, motion, 0.3, 1.0, 0.01)
 
 
 def test_module_refuses_unknown_options(paper_camera):
@@ -363,23 +349,15 @@ def with_pixel(value):
             ValueError,
             "full scale of uint16 frames unknown: pass full_scale",
         ),
-        (torch.zeros(2, 256, 128, dtype=torch.bool), {}, TypeError, "frames must be real numbers"),
         (detail(2, 24, 128), {}, ValueError, "too small for bands of 32 rows searched over 16 px"),
         (detail(2, 256, 40), {}, ValueError, "too small for bands"),
         (detail(2, 2100, 128), {}, ValueError, "frame_rows=2048 is less than the 2100 rows"),
         (detail(2, 256, 128), {"method": "magic"}, ValueError, "method must be one of .*got 'magic'"),
-        (detail(2, 256, 128), {"registration": "orb"}, ValueError, "registration must be one of .*got 'orb'"),
     ],
 )
 def test_bad_input(paper_camera, frames, options, error, message):
     with pytest.raises(error, match=message):
         detect_bands(frames, paper_camera, **options)
-
-
-def test_too_few_start_times():
-    timing = SensorTiming(ROW_TIME, 20, 2048, frame_start_times=[0.0, 0.05])
-    with pytest.raises(ValueError, match="frame_start_times has 2 entries for 3 frames"):
-        detect_bands(detail(3, 256, 128), timing)
 
 
 @pytest.mark.parametrize("size", [(24, 640), (64, 90), (40, 2048)])

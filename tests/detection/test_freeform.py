@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from motion_truth import common_warp, offset_error, rms
-from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -92,26 +92,21 @@ def test_colour_and_scan_along_columns(scene, found):
 def test_image_motion_is_separated(scene):
     wide = draw_scene(HEIGHT + 2 * MARGIN + 160, WIDTH + 2 * MARGIN + 160, 6)
 
-    class Scan(Motion):
-        def displacement(self, times):
-            wave = 1.5 * np.sin(2 * np.pi * 5.3 * times / SPAN)
-            return np.stack([wave, -500.0 * (times - 0.5 * SPAN)], axis=-1)
-
-    frames = take_frames(wide, TIMING, Scan(), FRAMES, 0.005, margin=MARGIN + 80)
+    scan = Curve(
+        lambda times: np.stack([1.5 * np.sin(2 * np.pi * 5.3 * times / SPAN), -500.0 * (times - 0.5 * SPAN)], axis=-1)
+    )
+    frames = take_frames(wide, TIMING, scan, FRAMES, 0.005, margin=MARGIN + 80)
     found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
     assert found.motion.image_motion[1] == pytest.approx(-500.0, rel=5e-3)
-    error = found.displacement.numpy() - Scan().displacement(found.times.numpy())
+    error = found.displacement.numpy() - scan.displacement(found.times.numpy())
     assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.1).all()
 
 
 def test_two_frames_are_enough_for_a_slow_motion(scene):
-    class Slow(Motion):
-        def displacement(self, times):
-            return np.stack([30.0 * times, 2 * np.sin(20 * times)], axis=-1)
-
-    frames = take_frames(scene, TIMING, Slow(), 2, 0.002)
+    slow = Curve(lambda times: np.stack([30.0 * times, 2 * np.sin(20 * times)], axis=-1))
+    frames = take_frames(scene, TIMING, slow, 2, 0.002)
     found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
-    error = found.displacement.numpy() - Slow().displacement(found.times.numpy())
+    error = found.displacement.numpy() - slow.displacement(found.times.numpy())
     assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.02).all()
 
 
@@ -197,12 +192,9 @@ def test_command(scene, frames, tmp_path, capsys):
     ("frames", "options", "message"),
     [
         (torch.rand(1, 64, 64), {}, "at least 2 frames"),
-        (torch.full((2, 64, 64), torch.nan), {}, "frames have no pixel with data"),
         (torch.rand(2, 64, 64), {"ignore": torch.zeros(3, 64, 64, dtype=torch.bool)}, "ignore"),
         (torch.rand(2, 64, 64), {"knot_rows": 1}, "knot_rows"),
         (torch.rand(2, 64, 64), {"iterations": 0}, "iterations"),
-        (torch.full((2, 64, 64), 0.5), {}, "frame 0 is constant"),
-        (torch.rand(2, 300, 64), {}, "frame_rows=270"),
     ],
 )
 def test_bad_input(frames, options, message):
@@ -211,11 +203,8 @@ def test_bad_input(frames, options, message):
 
 
 def test_motion_beyond_the_search_range_is_reported(scene):
-    class Far(Motion):
-        def displacement(self, times):
-            return np.stack([30 * np.sin(2 * np.pi * times / TIMING.frame_period * 0.7), 0 * times], axis=-1)
-
-    frames = take_frames(scene, TIMING, Far(), 3, 0.005)
+    far = Curve(lambda t: np.stack([30 * np.sin(2 * np.pi * t / TIMING.frame_period * 0.7), 0 * t], axis=-1))
+    frames = take_frames(scene, TIMING, far, 3, 0.005)
     with pytest.raises(ValueError, match="search=4 px"):
         rsv.detect_motion(torch.from_numpy(frames).float(), TIMING, search=4)
     tones = rsv.detect_vibration(torch.from_numpy(frames).float(), TIMING, search=4)

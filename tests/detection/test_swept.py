@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -71,12 +71,11 @@ def test_frames_are_restored(scene, frames, found):
 def tone(amplitude, frequency, decay=0.0, chirp=0.0, phase=0.0):
     """The same tone along both axes, with a phase of its own along y."""
 
-    class Tone(Motion):
-        def displacement(self, times):
-            angle = 2 * np.pi * (frequency * times + chirp * times**2 / 2) + phase
-            return (amplitude * np.exp(-decay * times))[:, None] * np.sin(angle[:, None] + np.array([0.0, 1.0]))
+    def displacement(times):
+        angle = 2 * np.pi * (frequency * times + chirp * times**2 / 2) + phase
+        return (amplitude * np.exp(-decay * times))[:, None] * np.sin(angle[:, None] + np.array([0.0, 1.0]))
 
-    return Tone()
+    return Curve(displacement)
 
 
 NEAR_BLIND = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=220)
@@ -131,11 +130,8 @@ def test_columns_read_in_reverse(frames, found):
 
 
 def test_axis_without_motion_has_no_tone(scene):
-    class MotionAlongX(Motion):
-        def displacement(self, times):
-            return np.stack([2 * np.exp(-10 * times) * np.sin(2 * np.pi * 45 * times), 0 * times], -1)
-
-    frames = torch.from_numpy(take_frames(scene, TIMING, MotionAlongX(), 3, 0.005)).float()
+    along_x = Curve(lambda t: np.stack([2 * np.exp(-10 * t) * np.sin(2 * np.pi * 45 * t), 0 * t], -1))
+    frames = torch.from_numpy(take_frames(scene, TIMING, along_x, 3, 0.005)).float()
     found = rsv.detect_swept_tone(frames, TIMING)
     assert found.amplitude[1] == 0
     assert found.findings[1] == (Reason("no_tone", "y"),)

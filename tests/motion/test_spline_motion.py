@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.interpolate import CubicSpline
-from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+from truth import MARGIN, Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch.motion.spline import FreeMotion
@@ -82,23 +82,19 @@ def test_samples_at_uneven_times():
     assert (uneven.displacement(inside) - motion().displacement(inside)).abs().amax() < 0.02
 
 
-class Free(Motion):
-    """The same path for the independent simulator."""
-
-    def displacement(self, times):
-        return spline()(times)
+FREE = Curve(spline())  # the same path for the independent simulator
 
 
 @pytest.fixture(scope="module", name="scene_and_frames")
 def make_scene_and_frames():
     scene = draw_scene(320 + 2 * MARGIN, 192 + 2 * MARGIN, 2)
-    return scene, take_frames(scene, TIMING, Free(), 3, 0.003)
+    return scene, take_frames(scene, TIMING, FREE, 3, 0.003)
 
 
 def test_simulated_frames_equal_those_of_the_independent_simulator(scene_and_frames):
     scene, _ = scene_and_frames
     frames = rsv.simulate_frames(torch.from_numpy(scene), TIMING, motion(), 2, frame_size=(320, 192))
-    assert decibel(frames.numpy(), take_frames(scene, TIMING, Free(), 2), rim=16) > 60
+    assert decibel(frames.numpy(), take_frames(scene, TIMING, FREE, 2), rim=16) > 60
 
 
 @pytest.mark.parametrize(("method", "least"), [("exact", 38.0), ("dewarp", 33.0)])

@@ -37,13 +37,6 @@ def test_mean_displacement_is_the_integral(exposure):
     assert found == pytest.approx(expected, abs=1e-9)
 
 
-def test_velocity_is_the_derivative():
-    times = np.linspace(0.0, 0.1, 21)
-    step = 1e-6
-    expected = (displacement(times + step) - displacement(times - step)) / (2 * step)
-    assert vibration().velocity(torch.from_numpy(times)).numpy() == pytest.approx(expected, rel=1e-5, abs=1e-3)
-
-
 def test_gain():
     gain = Vibration([3.1, 5.2], [50.0, 30.0]).gain(TIMING.frame_period)
     assert gain[:, 0].tolist() == pytest.approx([0.62, -1.46], abs=0.01)

@@ -13,22 +13,19 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
+import detections
 import numpy as np
 import pytest
 import torch
-from detections import findings_of
 from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
 
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.detection import DetectionResult
-from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.io import write_stack
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
 from rsvib_torch.report.html.page import frames_in_turn, measure_edges, whole_frame
 from rsvib_torch.report.html.words import TERMS, about_rows, mark_of, verdict_sentences
@@ -42,26 +39,7 @@ SHAKE = Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2])
 
 def result_of(vibration=SHAKE, reliable=(True, True), reasons=((), ())):
     """A detection without errors."""
-    rows = torch.arange(16, 240, 16).double()
-    times = (rows * TIMING.row_time)[None]
-    later = times + TIMING.frame_period
-    offsets = vibration.offset(times, later, TIMING.exposure_time)
-    curve = OffsetCurve(torch.tensor([[0, 1]]), rows, times, later, offsets, torch.ones_like(times), (32, 32))
-    small = 0.001 * torch.ones_like(vibration.amplitude)
-    std = VibrationStd(small, small, 1e-3 * small, small, small[:, 0], small[:, 0])
-    gain = vibration.gain(TIMING.frame_period)
-    return DetectionResult(
-        vibration,
-        std,
-        gain,
-        torch.zeros(2).double(),
-        torch.tensor(reliable),
-        findings_of(reasons),
-        (),
-        curve,
-        offsets,
-        TimingSensitivity(*[gain] * 6),
-    )
+    return detections.result_of(vibration, TIMING, 0.001, last_row=240, reliable=reliable, reasons=reasons)
 
 
 def verdict_of(outcome, *reasons):

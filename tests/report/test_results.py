@@ -9,14 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from detections import findings_of
+from detections import result_of
 
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import read_vibration, write_offsets, write_restoration, write_vibration
 from rsvib_torch.restoration import RestorationVerdict
@@ -31,36 +29,14 @@ def draw_result() -> DetectionResult:
     vibration = Vibration(
         [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.0], [130.0, 0.0]], [[0.3, 2.0], [-1.0, 0.0]], [20.0, 0.0]
     )
-    std = VibrationStd(
-        *(0.01 * torch.ones_like(vibration.amplitude) for _ in range(4)),
-        0.1 * torch.ones(2).double(),
-        torch.zeros(2).double(),
-    )
-    std.period[1, 1] = math.inf
-    rows = torch.arange(16, 480, 16).double()
-    times = torch.arange(2)[:, None] * TIMING.frame_period + rows * TIMING.row_time
-    later = times + TIMING.frame_period
-    fitted = vibration.offset(times, later, TIMING.exposure_time)
-    offsets = fitted + 0.02 * torch.randn(fitted.shape, generator=torch.Generator().manual_seed(2)).double()
-    offsets[1, 3] = torch.nan
-    quality = torch.full_like(times, 0.9)
-    quality[1, 3] = 0.0
-    curve = OffsetCurve(torch.tensor([[0, 1], [1, 2]]), rows, times, later, offsets, quality, (32, 32))
-    residual = (offsets - fitted).abs().nanmean((0, 1))
-    gain = vibration.gain(TIMING.frame_period)
-    findings = findings_of([[], ["only one period is seen"]])
-    return DetectionResult(
-        vibration,
-        std,
-        gain,
-        residual,
-        torch.tensor([True, False]),
-        findings,
-        ("row_time=2e-05 s: assumed",),
-        curve,
-        fitted,
-        TimingSensitivity(*[gain] * 6),
-    )
+    reasons = ([], ["only one period is seen"])
+    found = result_of(vibration, TIMING, 0.01, last_row=480, num_pairs=2, reliable=(True, False), reasons=reasons)
+    found.std.period[1, 1] = math.inf
+    offsets = found.offsets.offsets
+    offsets += 0.02 * torch.randn(offsets.shape, generator=torch.Generator().manual_seed(2)).double()
+    offsets[1, 3], found.offsets.quality[1, 3] = torch.nan, 0.0
+    residual = (offsets - found.fitted).abs().nanmean((0, 1))
+    return replace(found, residual=residual, assumptions=("row_time=2e-05 s: assumed",))
 
 
 def test_vibration_file_is_plain_json(tmp_path, result):
@@ -121,6 +97,9 @@ def put(data, value, *keys):
         (lambda d: put(d, 2, "version"), "expected format 'rsvib vibration' of version 1"),
         (lambda d: put(d, "rsvib windows", "format"), "not a vibration.json, but a file of the format 'rsvib windows'"),
         (lambda d: put(d, 0.0, "timing", "row_time"), "timing: row_time must be larger than 0"),
+        (lambda d: put(d, None, "offsets"), "offsets: expected a table, got None"),
+        (lambda d: put(d, [[1.0], [2.0, 3.0]], "gain"), "gain: expected numbers in lists of equal lengths"),
+        (lambda d: put(d, {}, "std"), "std.amplitude: missing key"),
     ],
 )
 def test_malformed_vibration_files_are_refused(tmp_path, result, change, message):

@@ -3,7 +3,7 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.restoration import VibrationRestorer, estimate_noise, restore, visible_pixels
+from rsvib_torch.restoration import VibrationRestorer, restore, visible_pixels
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 NOISE = 0.003
@@ -84,51 +84,6 @@ def test_boundaries_are_not_periodic():
     assert restored.amax() > 0.8
 
 
-def test_batch_and_channels_equal_single_stacks(short):
-    _, frames, _ = short
-    stacks = as_tensor(frames)[None, :, None, :, :96] * torch.tensor([1.0, 0.5]).reshape(2, 1, 1, 1, 1)
-    stacks = torch.cat([stacks, stacks.flip(-1)], dim=2)
-    vibrations = Vibration(
-        torch.tensor([[[3.1], [5.2]], [[2.0], [1.0]]]), torch.tensor([[50.0], [30.0]]), torch.tensor([[0.4], [1.3]])
-    )
-    together = restore(stacks, TIMING, vibrations, method="banded")
-    for index in range(2):
-        single = restore(stacks[index], TIMING, vibrations[index], method="banded")
-        torch.testing.assert_close(together[index], single, rtol=0, atol=2e-6)
-        grey = restore(stacks[index, :, 0], TIMING, vibrations[index], method="banded", noise_to_signal=0.01)
-        colour = restore(stacks[index], TIMING, vibrations[index], method="banded", noise_to_signal=0.01)
-        torch.testing.assert_close(colour[:, 0], grey, rtol=0, atol=2e-6)
-
-
-@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
-def test_orientation(short, scan_axis, direction):
-    _, frames, _ = short
-    frames = as_tensor(frames)
-    motion = Motion(image_motion=(120.0, -90.0))
-    expected = restore(frames, TIMING, motion.vibration(), method="banded")
-    timing = SensorTiming(20.52e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
-    sign = -1.0 if direction == "reverse" else 1.0
-    axes = [[*motion.amplitude], [*motion.frequency], [*motion.phase], [*motion.image_motion]]
-    if direction == "reverse":
-        axes[2][1] += torch.pi
-        axes[3][1] *= sign
-        frames, expected = frames.flip(-2), expected.flip(-2)
-    if scan_axis == -1:
-        axes = [values[::-1] for values in axes]
-        frames, expected = frames.transpose(-2, -1), expected.transpose(-2, -1)
-    torch.testing.assert_close(restore(frames, timing, Vibration(*axes), method="banded"), expected, rtol=0, atol=3e-6)
-
-
-def test_chunks_do_not_change_the_result(short):
-    _, frames, motion = short
-    frames = as_tensor(frames)[..., :64]
-    results = [
-        restore(frames, TIMING, motion.vibration(), method="banded", stride=3, chunk_rows=rows) for rows in (1, 7, 999)
-    ]
-    torch.testing.assert_close(results[0], results[1], rtol=0, atol=2e-6)
-    torch.testing.assert_close(results[0], results[2], rtol=0, atol=2e-6)
-
-
 def test_float32_agrees_with_float64_and_dtypes_are_kept(short):
     _, frames, motion = short
     exact = restore(as_tensor(frames, torch.float64), TIMING, motion.vibration(), method="banded")
@@ -154,29 +109,3 @@ def test_push_scan_frames_are_restored_in_their_own_coordinates():
         assert decibel(good, truth, 16) > max(decibel(frame, truth, 16) + 12, 46)
         error = (good.numpy() - truth)[seen.numpy()]
         assert (error**2).mean() ** 0.5 < 0.012
-
-
-def test_noise_is_estimated_in_textured_scenes():
-    scene = draw_scene(256, 256, seed=3)
-    for noise in (0.003, 0.02):
-        frame = scene + noise * torch.randn(256, 256, generator=torch.Generator().manual_seed(1)).numpy()
-        assert estimate_noise(torch.from_numpy(frame)).item() == pytest.approx(noise, rel=0.15)
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"frames": torch.zeros(8, 8)}, ValueError, r"frames must have shape .* got \(8, 8\)"),
-        (
-            {"frames": torch.zeros(1, 8, 8, dtype=torch.int16)},
-            ValueError,
-            "full scale of int16 frames unknown: pass full_scale",
-        ),
-        ({"frames": torch.zeros(1, 4096, 8)}, ValueError, "frame_rows=2048 is less than the 4096 rows"),
-        ({"vibration": Vibration.still((3,))}, ValueError, r"vibration of batch shape \(3,\) does not fit"),
-    ],
-)
-def test_bad_input(change, error, message):
-    arguments = {"frames": torch.zeros(2, 16, 16), "timing": TIMING, "vibration": Vibration(1.0, 50.0)}
-    with pytest.raises(error, match=message):
-        restore(**{**arguments, "method": "banded", **change})

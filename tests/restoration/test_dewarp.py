@@ -6,7 +6,7 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.restoration import restore, visible_pixels
+from rsvib_torch.restoration import restore
 
 dewarp = partial(restore, method="dewarp")
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -50,33 +50,6 @@ def test_blur_of_long_exposures_is_not_removed():
     frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.005, samples=48))
     exact = decibel(restore(frames, timing, motion.vibration(), method="exact"), crop(scene))
     assert exact > decibel(dewarp(frames, timing, motion.vibration()), crop(scene)) + 4
-
-
-def test_push_scan_batches_chunks_and_orientation(short):
-    _, frames, _ = short
-    motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, -400.0))
-    stacks = torch.stack([frames, frames.flip(-1)])[:, :, None]
-    together = dewarp(stacks, TIMING, motion.vibration())
-    single = dewarp(frames, TIMING, motion.vibration(), chunk_rows=13)
-    torch.testing.assert_close(together[0, :, 0], single, rtol=0, atol=1e-10)
-    mask, _ = visible_pixels(TIMING, motion.vibration(), (256, 208), 2)
-    assert 0.7 < mask.double().mean() < 1.0
-    turned = SensorTiming(20.52e-6, 20, 2048, scan_axis="x", readout_direction="reverse")
-    swapped = Vibration(
-        motion.amplitude[::-1],
-        motion.frequency[::-1],
-        [motion.phase[1] + torch.pi, motion.phase[0]],
-        [-motion.image_motion[1], motion.image_motion[0]],
-    )
-    restored = dewarp(frames.flip(-2).transpose(-2, -1), turned, swapped)
-    torch.testing.assert_close(restored.transpose(-2, -1).flip(-2), single, rtol=0, atol=1e-9)
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match="chunk_rows must be at least 1"):
-        dewarp(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), chunk_rows=0)
-    with pytest.raises(TypeError, match="method='dewarp' has no option 'noise'"):
-        dewarp(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), noise=0.1)
 
 
 def test_gradients_to_frames_and_vibration():

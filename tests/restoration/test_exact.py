@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from exact_steps import model_of, solved
-from scipy import ndimage
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
@@ -111,22 +110,6 @@ def test_boundaries_are_not_periodic(short):
     assert change[:, -32:, 64:].abs().max() < 0.01
 
 
-def test_results_do_not_depend_on_batch_chunks_and_channels(short):
-    _, frames, motion = short
-    stacks = with_noise(frames[:, :96, :80], 0.005, dtype=torch.float64)[None, :, None]
-    stacks = torch.cat([stacks, 0.5 * stacks], dim=0)
-    vibrations = Vibration(
-        torch.tensor([[[3.1], [5.2]], [[2.0], [1.0]]]), torch.tensor([[50.0], [30.0]]), torch.tensor([[0.4], [1.3]])
-    )
-    together = restore(stacks, TIMING, vibrations)
-    for index in range(2):
-        single = restore(stacks[index, :, 0], TIMING, vibrations[index], chunk_frequencies=7)
-        torch.testing.assert_close(together[index, :, 0], single, rtol=0, atol=1e-9)
-    colour = restore(torch.cat([stacks[0], stacks[0]], dim=1), TIMING, motion.vibration())
-    grey = restore(stacks[0, :, 0], TIMING, motion.vibration())
-    torch.testing.assert_close(colour[:, 1], grey, rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize("joint", [False, 2])
 def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatch):
     _, frames, motion = short
@@ -160,22 +143,6 @@ def test_results_do_not_depend_on_threads_and_gradients(short, joint, monkeypatc
     assert found[2].requires_grad
 
 
-@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
-def test_scan_axis_and_readout_direction(short, scan_axis, direction):
-    _, frames, motion = short
-    frames = with_noise(frames, 0.005)[..., :96]
-    expected = restore(frames, TIMING, motion.vibration())
-    timing = SensorTiming(20.52e-6, 20, 2048, scan_axis=scan_axis, readout_direction=direction)
-    axes = [[*motion.amplitude], [*motion.frequency], [*motion.phase]]
-    if direction == "reverse":
-        axes[2][1] += torch.pi
-        frames, expected = frames.flip(-2), expected.flip(-2)
-    if scan_axis == -1:
-        axes = [values[::-1] for values in axes]
-        frames, expected = frames.transpose(-2, -1), expected.transpose(-2, -1)
-    torch.testing.assert_close(restore(frames, timing, Vibration(*axes)), expected, rtol=0, atol=2e-5)
-
-
 def test_push_scan_frames_are_joined_where_they_overlap():
     motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, 400.0))  # 38 and 17 px from frame to frame
     margin, size = 180, 224
@@ -205,30 +172,6 @@ def test_ignored_pixels_are_estimated_from_all_others(short):
     assert decibel(blind, truth) < decibel(single, truth) - 10
 
 
-def test_missing_rows_and_pixels_do_not_affect_others(short):
-    truth, frames, motion = short
-    frames = with_noise(frames, 0.005)[:1]
-    ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(3)) < 0.01
-    ignore[0, 120:122] = True
-    starts = torch.arange(frames.shape[1]) * TIMING.row_time
-    x, y = motion.vibration().mean_displacement(starts, TIMING.exposure_time).round().long().T
-    rows, columns = ignore[0].nonzero().T
-    affected = np.zeros(truth.shape, dtype=bool)
-    place = (rows - y[rows]).clamp(0, truth.shape[0] - 1), (columns - x[rows]).clamp(0, truth.shape[1] - 1)
-    affected[place] = True
-    affected = ndimage.binary_dilation(affected, np.ones((5, 5)))
-    clean, filled = (
-        np.where(affected, truth, image[0].numpy())
-        for image in (
-            restore(frames, TIMING, motion.vibration()),
-            restore(frames.masked_fill(ignore, 0.9), TIMING, motion.vibration(), ignore=ignore),
-        )
-    )
-    assert decibel(filled, truth) > decibel(clean, truth) - 0.2
-    blind = restore(frames.masked_fill(ignore, 0.9), TIMING, motion.vibration())[0].numpy()
-    assert decibel(np.where(affected, truth, blind), truth) < decibel(clean, truth) - 3
-
-
 def test_gradients_to_frames_and_vibration():
     generator = torch.Generator().manual_seed(0)
     timing = SensorTiming(row_time=1e-3, exposure_rows=2, frame_rows=8)
@@ -240,18 +183,6 @@ def test_gradients_to_frames_and_vibration():
 
     inputs = (frames, vibration.amplitude, vibration.frequency, vibration.phase, vibration.image_motion)
     assert torch.autograd.gradcheck(run, tuple(value.clone().requires_grad_() for value in inputs))
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"ignore": torch.zeros(3)}, ValueError, r"ignore must be a boolean mask of shape \(2, 16, 16\)"),
-        ({"ignore": torch.ones(2, 16, 16, dtype=torch.bool)}, ValueError, "no pixel with data"),
-    ],
-)
-def test_bad_input(options, error, message):
-    with pytest.raises(error, match=message):
-        restore(torch.zeros(2, 16, 16), TIMING, Vibration(1.0, 50.0), **options)
 
 
 @pytest.mark.parametrize("joint", [False, True])

@@ -101,24 +101,6 @@ def test_blur_of_long_exposures_is_removed_better_than_by_dewarping():
     assert decibel(lucy(frames, timing, motion.vibration()), crop(scene)) > warped + 3
 
 
-def test_batch_and_channels_equal_single_stacks_of_a_push_scan():
-    motion = Motion(amplitude=(1.0, 0.7), image_motion=(400.0, -300.0))
-    frames = torch.rand(2, 2, 1, 40, 36, generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.1
-    together = lucy(frames, TIMING, motion.vibration(), iterations=3)
-    for index in range(2):
-        single = lucy(frames[index, :, 0], TIMING, motion.vibration(), iterations=3)
-        torch.testing.assert_close(together[index, :, 0], single, rtol=0, atol=1e-12)
-    colour = lucy(torch.cat([frames[0], frames[1]], dim=1), TIMING, motion.vibration(), iterations=3)
-    torch.testing.assert_close(colour[:, 1], together[1, :, 0], rtol=0, atol=1e-12)
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match="iterations must be at least 1"):
-        lucy(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), iterations=0)
-    with pytest.raises(ValueError, match="joint must be at least 1"):
-        lucy(torch.zeros(2, 16, 16), TIMING, Vibration(1.0, 50.0), joint=0)
-
-
 def inner_pixels(timing, motion, height, width, frame):
     """Pixels whose kernels lie within the scene."""
     seen = np.zeros((height, width), dtype=bool)
