@@ -9,7 +9,7 @@ import torch
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
-from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit
+from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit, with_errors_of_blocks
 from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
 from rsvib_torch.motion.timing import RowTiming
 
@@ -137,6 +137,23 @@ def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
     assert 0.15 < float(mean_square(in_std)[1]) < 1.3
     # a displacement of 0.1 px shows its part of the bias as an amplitude; the prior allows for 3e-3 px
     assert 0.5 < float(mean_square(in_std)[0]) < 2.5
+
+
+def test_errors_that_a_part_of_the_scene_has_in_all_frames_are_contained():
+    """Every row moves by another share of the motion: more frames do not average that out."""
+    generator, batch = np.random.default_rng(9), 200
+    frequency, starts = np.full(batch, 37.0), starts_of(TIMING, 6)
+    true = mean_sine(np.ones(batch), frequency, np.full(batch, 0.4), starts, TIMING.exposure_time)
+    wrong = true * (1 + 0.02 * generator.standard_normal((batch, ROWS, 1)))
+    measurements = measured(wrong, TIMING, generator, noise=1e-3)
+    raw = fitted(measurements, frequency)
+
+    def rms_in_std(fit):
+        vibration, std = vibration_of_fit(fit)
+        return float(((vibration.amplitude[:, 0, 0] - 1.0) / std.amplitude[:, 0, 0]).square().mean().sqrt())
+
+    assert rms_in_std(raw) > 1.7
+    assert 0.8 < rms_in_std(with_errors_of_blocks(measurements, raw)) < 1.2
 
 
 def test_stacks_of_a_batch_do_not_affect_each_other():
