@@ -33,7 +33,7 @@ from rsvib_torch.detection.tones.fit import (
     with_unknown_errors,
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit
-from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
+from rsvib_torch.detection.tones.uncertainty import with_further_tones, with_unknown_amplitudes, without_aliasing
 from rsvib_torch.detection.verdict import BandOffsets, Findings, judged
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
@@ -179,12 +179,15 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
     # for any errors; a part of the scene has the same errors in all frames; aliasing biases the displacements; the
     # record may contain a further tone. The displacement is that of every eighth row of all frames.
+    intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     if fitted.refined is None:
         fit = with_unknown_errors(fitted.measurements, fitted.fit)
     else:
         fit = with_errors_of_blocks(fitted.measurements, fitted.fit)
-        fit = without_aliasing(fitted.measurements, fit, fitted.refined.aliasing)
+        aliasing = fitted.refined.aliasing
+        fit = without_aliasing(fitted.measurements, fit, aliasing)
+        fit = with_unknown_amplitudes(fit, aliasing, intervals, timing.exposure_time)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(
         fitted.measurements, fit, row_starts, number_is_known=options.tones is not None
@@ -193,7 +196,6 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
 
     # 4. Verdict: for each axis, the reasons against it, from the rows or the bands that the vibration was fitted to.
-    intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
     moved = tone_displacements(fit, row_starts, timing.exposure_time)
     refined = fitted.refined
     findings = judged(

@@ -31,6 +31,7 @@ from rsvib_torch.detection.tones.fit import (
     is_bounded,
     model_displacements,
     motion_of_fit,
+    offset_gain,
     residual_of,
     shrunk,
     strongest_only,
@@ -104,7 +105,7 @@ def refine(
     # one axis after the other.
     device = frames.groups[0].starts.device
     blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
-    tried = np.repeat(~blurred[:, None], start.active.shape[1], 1)  # frames of equal blur count as tried
+    tried = ~(blurred[:, None] | _is_nearly_blind(refined.fit, intervals))  # other axes count as tried
     while not tried.all():
         frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)
         if not mirrored.any():
@@ -469,6 +470,8 @@ def covariance_of_changes(changes: Array) -> Array:
 
 # Mirrored frequencies
 
+_SMALL_GAIN = 0.3  # px of offset per px of displacement
+
 
 def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFit, tried: Array) -> tuple[Array, Array]:
     """Frequencies of the strongest tones, mirrored at the nearest blind frequency on the axis with the larger residual.
@@ -494,10 +497,17 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     frequency = strongest_only(start).frequencies[..., 0]
     mirrored = 2 * (frequency * interval).round() / interval - frequency
     unresolved = (np.abs(mirrored - frequency) * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]
-    where = unresolved & ~tried & (residual > 3.0) & (residual == residual.max(-1, keepdims=True))
+    wrong = (residual > 3.0) & (residual == residual.max(-1, keepdims=True))
+    where = unresolved & ~tried & (wrong | _is_nearly_blind(fit, interval[0]))
     if fit.model.harmonics > 1 or exposure_starts.shape[2] > 2:
         where = np.zeros_like(where)
     return np.where(where, mirrored, strongest.frequencies[..., 0])[..., None], where
+
+
+def _is_nearly_blind(fit: ToneFit, intervals: Array) -> Array:
+    """(B, A) bool, whether the strongest tone of an axis has a small gain: its mirrored frequency is near it."""
+    strongest = strongest_only(fit)
+    return strongest.active[..., 0] & (offset_gain(strongest.frequencies, intervals)[..., 0] < _SMALL_GAIN)
 
 
 def _with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:

@@ -40,18 +40,21 @@ from rsvib_torch.detection.tones.fit import (
     displacement_jacobian,
     displacement_std,
     model_displacements,
+    offset_gain,
     residual_of,
     tone_response,
     vibration_of_fit,
 )
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["StatedFit", "with_further_tones", "without_aliasing"]
+__all__ = ["StatedFit", "with_further_tones", "with_unknown_amplitudes", "without_aliasing"]
 
-# error of the amplitude of tones of 1 px or more over the expected size of the bias by aliasing; proportionally less of
-# smaller tones. In 54 and 55 axes with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the
+# Errors of amplitudes. px per px of the expected bias by aliasing, for tones of 1 px or more, proportionally less of
+# smaller ones: in 54 and 55 axes with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the
 # standard deviation was 1.26 and 1.93 without this term, and is 1.05 and 1.20 with it
 _UNKNOWN_ALIASING = 0.2
+# px^-2, relative, per square of the path within an exposure: with paths of 4 to 7 px, errors were 2e-4 to 8e-4
+_UNKNOWN_BLUR = 1.5e-5
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
 # intervals of 150 simulated recordings with random tones contain the truth, with 0.2 fewer
 _PRIOR_SIZE = 0.5
@@ -170,13 +173,6 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
     change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
     bias = _unit_bias(measurements, model_displacements(measurements, fit))
-    # What the model of the bias does not contain changes the amplitudes.
-    unknown = fit.tones * np.array([1.0, 1.0, 0.0]) / np.maximum(fit.amplitude, 1.0)[..., None]  # Re C, Im C and f
-    unknown = _UNKNOWN_ALIASING * size[:, None, None] * unknown.reshape(*unknown.shape[:2], -1)
-    unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
-    of_axes = covariance.reshape(len(covariance), axes, unknown.shape[-1], axes, -1)
-    for axis in range(axes):
-        of_axes[:, axis, :, axis] += unknown[:, axis, :, None] * unknown[:, axis, None]
     for axis, problem in _problems(measurements, fit)[:2]:
         Z, by_unit = problem.unexplained(bias[..., axis, None], axis)
         variance = 1 / (np.square(Z).sum(1) + problem.rounding(axis)[:, None] + precision)  # (B, 1), of b
@@ -201,6 +197,33 @@ def _unit_bias(measurements: Measurements, displacements: Array) -> Array:
     visible = measurements.visible[..., None]
     mean = (visible * turn).sum(2, keepdims=True) / np.maximum(visible.sum(2, keepdims=True), 1.0)
     return measurements.relative((turn * mean.conj()).imag)
+
+
+# --- Errors of the amplitudes ---
+
+
+def with_unknown_amplitudes(fit: ToneFit, aliasing: Array, intervals: Array, exposure_time: float) -> ToneFit:
+    """The fit with errors of its amplitudes that the models of aliasing and of unequal blur do not contain.
+
+    Args:
+        fit: With its covariance.
+        aliasing: (B,) px, expected size of the bias by aliasing.
+        intervals: (M,) s, times between the frames that are compared; errors of offsets are amplified by a small gain.
+        exposure_time: T_e in seconds.
+    """
+    size = fit.amplitude  # (B, A, K)
+    path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
+    gain = np.maximum(offset_gain(fit.frequencies, intervals), 1e-3)
+    by_aliasing = _UNKNOWN_ALIASING * aliasing[:, None, None] * np.minimum(size, 1.0)
+    by_blur = _UNKNOWN_BLUR * np.square(path) * size * 2.0 / gain
+    error = np.hypot(by_aliasing, by_blur) / np.maximum(size, 1e-300)  # relative
+    unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
+    unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
+    covariance, (axes, parameters) = fit.covariance.copy(), unknown.shape[1:]
+    of_axes = covariance.reshape(len(covariance), axes, parameters, axes, parameters)
+    for axis in range(axes):
+        of_axes[:, axis, :, axis] += unknown[:, axis, :, None] * unknown[:, axis, None]
+    return replace(fit, covariance=covariance)
 
 
 # --- Further tones and slow errors ---
