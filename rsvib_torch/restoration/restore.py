@@ -225,7 +225,7 @@ def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) 
         joint: As in ``restore_exact``; the middle frame replaces the image of all frames.
         scale: As in ``restore_exact``; values between the pixels are interpolated.
     """
-    images = frames.images if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
+    images = frames.images.clone() if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2

@@ -217,9 +217,9 @@ class VibrationTracker:
         """
         # 1. Input. Frames that show nothing new do not count, except for the time of the next one.
         time = self._checked_time(time)
-        with torch.inference_mode(mode=False), torch.no_grad():  # the result keeps the frame, not a copy of it
+        with torch.inference_mode(mode=False), torch.no_grad():  # cameras write into few buffers again and again
             prepared = prepare_frames(
-                as_tensor("frame", frame)[None],
+                as_tensor("frame", frame)[None].clone(),
                 self.timing,
                 full_scale=self.options.full_scale,
                 channels=self.options.channels,
