@@ -83,11 +83,12 @@ def grey_frames(
     Raises:
         TypeError: If frames are not numbers or ``ignore`` is not bool.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or
-            ``ignore`` does not fit; or a frame is a copy of the one before.
+            ``ignore`` does not fit; a frame is a copy of the one before; or frames are too far apart.
     """
     prepared = prepare_frames(
         frames, timing, full_scale=given.full_scale, channels=given.channels, ignore=given.ignore, minimum_frames=2
     )
+    prepared.timing.check_span(prepared.images.shape[1], prepared.images.shape[-2])
     images, valid = prepared.filled, None
     # registration needs measured pixels in every frame
     if prepared.missing is not None:
