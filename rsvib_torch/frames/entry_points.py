@@ -5,7 +5,11 @@ receives ``options``. A decorator has the type of the arguments that precede the
 """
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+import torch
 
 from rsvib_torch.core.flat_options import flat_options
 from rsvib_torch.core.precision import outside_graphs
@@ -76,4 +80,15 @@ def module_options(
 
 def entry_point(options: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None) -> Any:
     """A function with flat options, outside of compiled graphs; arguments as of ``flat_options``."""
-    return outside_graphs(flat_options(options, function, build))
+
+    @wraps(function)
+    def solved(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+            raise ValueError(
+                f"{function.__name__}: the frames do not determine the motion: they show too little detail, or objects "
+                "that move by themselves; use other frames"
+            ) from error
+
+    return outside_graphs(flat_options(options, solved, build))
