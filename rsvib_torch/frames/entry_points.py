@@ -90,5 +90,12 @@ def entry_point(options: Any, function: Callable[..., Any], build: Callable[...,
                 f"{function.__name__}: the frames do not determine the motion: they show too little detail, or objects "
                 "that move by themselves; use other frames"
             ) from error
+        except RuntimeError as error:
+            if torch._C._functorch.peek_interpreter_stack() is None:  # no transform of torch.func
+                raise
+            raise TypeError(
+                f"{function.__name__} does not support this transform of torch.func: use torch.autograd for "
+                "derivatives, and a batch (B, T, C, H, W) instead of vmap"
+            ) from error
 
     return outside_graphs(flat_options(options, solved, build))

@@ -89,7 +89,8 @@ def _spacing(info: StackInfo) -> _Spacing | None:
             f"increase; correct or remove it ({info.time_source})"
         )
     if few:
-        return _Spacing(np.zeros(0), *intervals.tolist() * 3, 0.0, equal=True)
+        period = float(intervals[0])
+        return _Spacing(np.zeros(0), period, period, period, 0.0, equal=True)
     median = float(np.median(intervals))
     single = float(intervals[np.round(intervals / median) == 1].mean())  # more accurate if times are rounded
     whole = np.round(intervals / single)
