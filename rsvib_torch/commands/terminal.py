@@ -66,9 +66,7 @@ _command_lines: list[str] = []  # the running one is the last
 @contextmanager
 def running(arguments: Sequence[str]) -> Iterator[None]:
     """Remember the command line while it runs."""
-    line = shlex.join(["rsvib", *arguments])
-    # names of files may have characters that hide or reorder what is shown
-    _command_lines.append("".join(one if one.isprintable() else ascii(one)[1:-1] for one in line))
+    _command_lines.append(printable(shlex.join(["rsvib", *arguments])))
     try:
         yield
     finally:

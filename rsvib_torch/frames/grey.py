@@ -67,6 +67,7 @@ def grey_frames(
     given: MaskedInputOptions,
     *,
     min_valid_fraction: float = 0.1,
+    timed: bool = True,
 ) -> GreyFrames:
     """Read and check stacks of frames, and convert them to grey frames in row order.
 
@@ -76,6 +77,7 @@ def grey_frames(
         timing: The sensor.
         given: Full scale, missing pixels and position of the channels.
         min_valid_fraction: Fraction of the pixels of each frame that must not be missing.
+        timed: Whether the sensor has the times of the frames; False where they are looked for.
 
     Warns:
         TimingWarning: As ``prepare_frames``.
@@ -88,7 +90,8 @@ def grey_frames(
     prepared = prepare_frames(
         frames, timing, full_scale=given.full_scale, channels=given.channels, ignore=given.ignore, minimum_frames=2
     )
-    prepared.timing.check_span(prepared.images.shape[1], prepared.images.shape[-2])
+    if timed:
+        prepared.timing.check_span(prepared.images.shape[1], prepared.images.shape[-2])
     images, valid = prepared.filled, None
     # registration needs measured pixels in every frame
     if prepared.missing is not None:
