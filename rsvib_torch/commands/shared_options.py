@@ -1,6 +1,7 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
 import itertools
+import os
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -233,7 +234,7 @@ def check_new(
     """
     paths = list(paths)
     check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
-    existing = [path for path in paths if path.exists() and not (path.is_dir() and not any(path.iterdir()))]
+    existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
         names = ", ".join(path.name for path in existing)
         raise FileExistsError(

@@ -47,7 +47,7 @@ _command_lines: list[str] = []  # the running one is the last
 @contextmanager
 def running(arguments: Sequence[str]) -> Iterator[None]:
     """Remember the command line while it runs."""
-    _command_lines.append(shlex.join(["rsvib", *arguments]))
+    _command_lines.append(printable(shlex.join(["rsvib", *arguments])))
     try:
         yield
     finally:

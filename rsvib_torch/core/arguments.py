@@ -69,18 +69,20 @@ def check_tensor(name: str, value: object) -> Tensor:
 
 
 def as_numbers(name: str, value: object, device: torch.device | None = None) -> Tensor:
-    """A tensor, a number or a nested list of numbers as a float64 tensor, by default on its device; gradients are kept.
+    """Return a copy of a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
+
+    By default on the device of a tensor.
 
     Example:
         >>> as_numbers("amplitude", [3, 5]).dtype
         torch.float64
     """
     if isinstance(value, Tensor):
-        return check_tensor(name, value).to(dtype=torch.float64, device=device)
+        return check_tensor(name, value).to(dtype=torch.float64, device=device, copy=True)
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{name} must not be a masked array; pass the values without the masked ones")
     try:
-        return torch.as_tensor(value, dtype=torch.float64, device="cpu" if device is None else device)
+        return torch.tensor(value, dtype=torch.float64, device="cpu" if device is None else device)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(
             f"{name} must be a number, a tensor, or numbers in lists of equal lengths, got {described(value)}"
@@ -259,7 +261,7 @@ def checked_methods(kind: type[R]) -> type[R]:
 
 
 def check_fields(value: Any) -> None:
-    """Check the types of the fields of a dataclass against their annotations; lists and arrays become tuples.
+    """Check the types of the fields of a dataclass against their annotations; lists become tuples, tensors are copied.
 
     Raises:
         TypeError: If a field has another type; numbers may be infinite or NaN.
@@ -268,7 +270,8 @@ def check_fields(value: Any) -> None:
     for name in (field.name for field in fields(value)):
         given = getattr(value, name)
         made = _checked(name, given, kinds[name], finite=False)
-        if isinstance(made, tuple) and not isinstance(given, tuple):
+        made = made.clone() if isinstance(made, Tensor) else made
+        if isinstance(made, (tuple, Tensor)) and not isinstance(given, tuple):
             object.__setattr__(value, name, made)
 
 

@@ -5,6 +5,7 @@ import fcntl
 import glob
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -163,7 +164,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         part = folder / target.name
         yield part
         sync(part)
-        os.replace(part, target)
+        _replace(part, target)
         sync(target.absolute().parent)
 
 
@@ -228,5 +229,12 @@ def move_into_place(
         os.replace(part, target)
         old.unlink() if old.is_symlink() else shutil.rmtree(old)
     else:
-        os.replace(part, target)
+        _replace(part, target)
     sync(target.absolute().parent)
+
+
+def _replace(part: Path, target: Path) -> None:
+    """Rename a file; an existing one is replaced, and its permissions are kept."""
+    if target.is_file() and part.is_file():
+        part.chmod(stat.S_IMODE(target.stat().st_mode))
+    os.replace(part, target)

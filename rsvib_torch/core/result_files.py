@@ -32,8 +32,8 @@ def load_result(kind: type[Any], path: Path) -> Any:
         )
     try:
         return decode(kind, data, "")
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions, for impossible values
+        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
 
 
 def save_figure(figure: "Figure", path: Path) -> None:

@@ -5,7 +5,11 @@ receives ``options``. A decorator has the type of the arguments that precede the
 """
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+import torch
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.flat_options import flat_options
@@ -98,4 +102,22 @@ def module_options(
 
 def entry_point(options: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None) -> Any:
     """A function with flat options, outside of compiled graphs; arguments as of ``flat_options``."""
-    return outside_graphs(flat_options(options, function, build))
+
+    @wraps(function)
+    def solved(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+            raise ValueError(
+                f"{function.__name__}: the frames do not determine the motion: they show too little detail, or objects "
+                "that move by themselves; use other frames"
+            ) from error
+        except RuntimeError as error:
+            if torch._C._functorch.peek_interpreter_stack() is None:  # no transform of torch.func
+                raise
+            raise TypeError(
+                f"{function.__name__} does not support this transform of torch.func: use torch.autograd for "
+                "derivatives, and a batch (B, T, C, H, W) instead of vmap"
+            ) from error
+
+    return outside_graphs(flat_options(options, solved, build))

@@ -59,15 +59,19 @@ def grey_frames(
     given: MaskedInputOptions,
     *,
     min_valid_fraction: float = 0.1,
+    timed: bool = True,
 ) -> GreyFrames:
     """Read and check stacks of frames as ``prepare_frames`` does, and convert them to grey frames in row order.
 
     There must be at least two frames. Frames that are constant, have too few pixels that are not missing, or are copies
     of the one before are refused.
+    ``timed``: whether the sensor has the times of the frames; False where they are looked for.
     """
     prepared = prepare_frames(
         frames, timing, full_scale=given.full_scale, channels=given.channels, ignore=given.ignore, minimum_frames=2
     )
+    if timed:
+        prepared.timing.check_span(prepared.images.shape[1], prepared.images.shape[-2])
     images, valid = prepared.filled, None
     # registration needs measured pixels in every frame
     if prepared.missing is not None:

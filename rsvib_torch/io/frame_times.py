@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.text import number_of
 from rsvib_torch.io.stack_info import StackInfo
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming
 
 __all__ = [
     "TimingWarning",
@@ -71,12 +71,26 @@ class _Spacing:
 
 
 def _spacing(info: StackInfo) -> _Spacing | None:
-    """Spacing according to the times or the frame rate of a file; None if it states neither."""
-    if info.frame_times is None or len(info.frame_times) < 2:
-        period = None if info.frame_rate is None else 1.0 / info.frame_rate
-        return None if period is None else _Spacing(np.zeros(0), period, period, period, 0.0, equal=True)
-    times = np.array(info.frame_times)
+    """Spacing according to the times or the frame rate of a file; None if it states neither.
+
+    Raises:
+        ValueError: If times do not increase, or they or the rate are not those of a camera.
+    """
+    few = info.frame_times is None or len(info.frame_times) < 2
+    if few and info.frame_rate is None:
+        return None
+    times = np.array((0.0, 1.0 / max(info.frame_rate or 0.0, 1e-300)) if few else info.frame_times)
     intervals = np.diff(times)
+    possible = (np.abs(times) <= MAX_START_TIME) & (np.append(intervals, 1.0) >= MIN_ROW_TIME)
+    if not possible.all():
+        stated = f"frame_rate={info.frame_rate}" if few else f"the time of frame {int(np.argmin(possible))}"
+        raise ValueError(
+            f"{info.path or 'the file'}: {stated} is not that of a camera: times in seconds must be finite and "
+            f"increase; correct or remove it ({info.time_source})"
+        )
+    if few:
+        period = float(intervals[0])
+        return _Spacing(np.zeros(0), period, period, period, 0.0, equal=True)
     median = float(np.median(intervals))
     single = float(intervals[np.round(intervals / median) == 1].mean())  # more accurate if times are rounded
     whole = np.round(intervals / single)

@@ -109,7 +109,8 @@ def open_hdf5(path: Path) -> ArrayReader | ContiguousReader:
             if info.frame_times is None and info.frame_rate is None:
                 info = replace(info, **_times_beside(file, dataset, info.shape[0]))
             offset = dataset.id.get_offset()
-            if dataset.chunks is None and offset is not None:
+            is_plain = dataset.id.get_type() == h5py.h5t.py_create(dataset.dtype)  # all bits, none shifted
+            if dataset.chunks is None and offset is not None and is_plain:
                 return ContiguousReader(path, info, int(offset), dataset.dtype)
             keep_open = True
             # one decoded chunk besides the block; measured with gzip, lzf, shuffle and without compression

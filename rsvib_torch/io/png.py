@@ -59,8 +59,12 @@ def _info(chunks: dict[bytes, bytes], size: int, path: Path, *, largest_ratio: i
         raise ValueError(f"{path}: damaged PNG file (no header)")
     width, height, bits, colour = struct.unpack(">IIBB", header[:10])
     channels = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}.get(colour, 0)  # of the decoded image, by colour type
-    if b"tRNS" in chunks:
+    if b"tRNS" in chunks and colour != 0:  # one transparent value of a grey image is not decoded
         channels = 4
+    if b"acTL" in chunks:
+        raise ValueError(
+            f"{path}: an animated PNG, of which only the first frame could be read; write its frames as files"
+        )
     if min(width, height, channels) < 1 or width * height * channels * bits // 8 > largest_ratio * size:
         raise ValueError(f"{path}: its header states {width} x {height} px, which {size} bytes cannot hold")
     dtype = np.dtype(np.uint16 if bits == 16 else np.uint8)

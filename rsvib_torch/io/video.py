@@ -182,8 +182,12 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
         pixels, rate = _pixels(first), stream.average_rate
         duration = float(stream.frames / rate if rate else 0)  # stated by .avi, .mp4 and .mov
-        decoded = float(known[-1] - known[0]) if rising else duration
-        if len(times) < 0.9 * stream.frames - 1 and decoded < 0.9 * duration:  # .avi also counts empty frames
+        if not stream.frames and "matroska" in container.format.name and len(container.streams) == 1:
+            duration = 1e-6 * (container.duration or 0)  # of the longest of several streams
+        decoded = float(known[-1] - known[0] + (1 / rate if rate else 0)) if rising else duration
+        if (
+            len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration
+        ):  # .avi also counts empty frames
             raise ValueError(f"truncated: {len(times)} frames, {decoded:.3g} of {duration:.3g} s, can be decoded")
         info = StackInfo(
             (len(times), *pixels.shape),

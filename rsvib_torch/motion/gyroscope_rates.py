@@ -11,13 +11,13 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import Result
+from rsvib_torch.core.reading import MAX_SAMPLES
 from rsvib_torch.core.text import text_table
 
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
 Array = NDArray[np.float64]
-MAX_SAMPLES = 10**7  # 80 minutes at 2 kHz
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.reading import check_regular
+from rsvib_torch.core.reading import check_regular, rows_of_numbers, text_lines
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.options import MotionUnit, TimeUnit
@@ -94,34 +94,21 @@ def read_motion(
 
 def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
     """Times (N,) and values (N, 2) of a file; a cubic spline requires at least 4 samples."""
-    rows: list[list[float]] = []
     check_regular(path)
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            names = [name.strip().lower() for name in reader.fieldnames or []]
+            lines = text_lines(path, file)
+            names = [name.strip().lower() for name in next(csv.reader(lines, skipinitialspace=True), [])]
             missing = [name for name in _COLUMNS if name not in names]
             if missing:
                 present = ", ".join(names) or "nothing"
                 raise ValueError(f"{path}: column {missing[0]!r} is missing; the first line has {one_line(present)}")
-            reader.fieldnames = names
-            rows.extend([_number(path, reader.line_num, name, row[name]) for name in _COLUMNS] for row in reader)
+            table = rows_of_numbers(path, lines, names, [names.index(name) for name in _COLUMNS], 2)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: not a CSV file: {error}") from error
-    if len(rows) < least_samples:
-        raise ValueError(f"{path}: {len(rows)} samples; at least {least_samples} are required")
-    table = np.asarray(rows)
+    if len(table) < least_samples:
+        raise ValueError(f"{path}: {len(table)} samples; at least {least_samples} are required")
     return table[:, 0], table[:, 1:]
-
-
-def _number(path: Path, line: int, name: str, text: str | None) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"{path}, line {line}: {name} must be a number, got {one_line(repr(text), 60)}")
-    return value
 
 
 def check_times(path: Path, times: Array, unit: str, longest_gap: float = 4.0) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 MIN_ROW_TIME = 1e-9  # s; the fastest sensors read a row in 0.1 us
 MAX_FRAMES, MAX_ROWS = 10**8, 10**6  # 40 days of a camera with 30 frames/s; the largest sensors have 3e4 rows
 MAX_BATCH = 10**6  # stacks; their frames of 128 x 128 px would fill 130 GB
+MAX_SPAN = 2**19  # row times from the first to the last frame; the detection in 4 frames then takes 30 s and 0.5 GB
+_MAX_BLANKING = 32  # row times per row; of more frames with so long a blanking time, 1 ms of 32 ms is read
 MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
 
@@ -200,6 +202,24 @@ class SensorTiming:
                 f"row times from one frame to the next, including blanking rows, 1 / (frame rate x row time): with "
                 f"{self.frame_rate:g} frames/s, row_time is at most {self.frame_period / num_rows:.6g} s"
             )
+
+    def check_span(self, num_frames: int, num_rows: int) -> None:
+        """Raise a ``ValueError`` if frames are too far apart for their number of rows to resolve frequencies.
+
+        Between two frames, a vibration has a number of periods that its frequency must determine: the number of
+        frequencies that are tried, and the time and memory that they take, grow with the span.
+        """
+        starts = self.frame_starts(num_frames)
+        step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
+        if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):
+            return
+        units = {"ms": 1e3, "us": 1e6, "ns": 1e9}  # within a factor of two
+        unit = next((name for name, size in units.items() if 0.5 < step / (size * self.frame_period) < 2), None)
+        remedy = "use frames that follow each other" + (f"; times are seconds, and these may be {unit}" if unit else "")
+        raise ValueError(
+            f"frames are {step:.4g} s apart and {span:.4g} s in all, too long for frames that are read in "
+            f"{num_rows * self.row_time:.3g} s; check frame_start_times and frame_rows, or {remedy}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The arguments that make this timing, as plain numbers and texts."""

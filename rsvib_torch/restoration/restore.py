@@ -206,7 +206,7 @@ def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) 
 
     On a finer grid, values between the pixels are interpolated.
     """
-    images = frames.images if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
+    images = frames.images.clone() if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2

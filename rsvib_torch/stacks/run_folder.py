@@ -15,6 +15,7 @@ import re
 import secrets
 import shutil
 import stat
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -136,7 +137,7 @@ class RunFolder:
         try:
             if os.fstat(self._folder).st_uid != os.geteuid():
                 raise self._refusal("it belongs to another user")
-            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock()
             if self._has_its_name():
                 return True
         except BlockingIOError as error:
@@ -147,6 +148,18 @@ class RunFolder:
             raise
         os.close(self._folder)  # a process that has ended meanwhile removed it
         return self._open()
+
+    def _lock(self) -> None:
+        """Lock the folder; a warning if the file system has no locks, as those of some clusters."""
+        try:
+            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                raise
+            warnings.warn(
+                f"{self.path}: the file system has no locks ({error.strerror}): start no other run with this output",
+                stacklevel=2,
+            )
 
     def _has_its_name(self) -> bool:
         with suppress(FileNotFoundError):

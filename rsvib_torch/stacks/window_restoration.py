@@ -197,13 +197,13 @@ def restore_block(
     axis = channel_axis("frames", frames.shape, channels)
     stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
     if len(stored) < 2 or any(frame_fault(frame, index, scale) for index, frame in enumerate(stored)):
-        return frames
+        return frames.copy()
     floats = counts_to_frames(stored, scale, "frames").to(device)
     try:
         detected = detect_vibration(floats, timing, **(detection or {}))
         restored = restore_trusted(floats, timing, detected, options, force=force, most_pairs=2)
     except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-        return frames
+        return frames.copy()
     if not restored.restored:
-        return frames
+        return frames.copy()
     return np.moveaxis(frames_to_counts(restored.frames, np.dtype(frames.dtype), scale), -3, axis)

@@ -71,6 +71,7 @@ class TrackedFrame:
         window: Number of frames of a detection, for the sensitivity to the timing.
         method: Method of ``restore``.
         options: Options of the method.
+        lost: Why the motion that was followed until the frame before is not known any more; empty if it is.
         latency: Number of frames that were given after this one.
     """
 
@@ -83,6 +84,7 @@ class TrackedFrame:
     frame: PreparedFrames
     tones: TrackedTones | None
     options: TrackerOptions
+    lost: str = ""
     latency: int = 0
 
     def moved_to(self, place: Tensor) -> "TrackedFrame":

@@ -52,7 +52,7 @@ from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions, TrackerOptions
 from rsvib_torch.registration.gradients import RowGradients
@@ -149,6 +149,11 @@ class _State:
     untried: int = 0  # frames since the last attempt to detect the vibration
     attempts: int = 0  # to detect the vibration, since the rows last agreed with the tones
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
+    lost: str = ""  # why the motion that was followed until the last frame is not known any more
+
+    def without_track(self, reason: str) -> "_State":
+        """The state without the motion that was followed, if there was one."""
+        return replace(self, track=None, lost="" if self.track is None else reason)
 
 
 class VibrationTracker:
@@ -217,9 +222,9 @@ class VibrationTracker:
         """
         # 1. Input. Frames that show nothing new do not count, except for the time of the next one.
         time = self._checked_time(time)
-        with torch.inference_mode(mode=False), torch.no_grad():  # the result keeps the frame, not a copy of it
+        with torch.inference_mode(mode=False), torch.no_grad():  # cameras write into few buffers again and again
             prepared = prepare_frames(
-                as_tensor("frame", frame)[None],
+                as_tensor("frame", frame)[None].clone(),
                 self.timing,
                 full_scale=self.options.full_scale,
                 channels=self.options.channels,
@@ -233,17 +238,22 @@ class VibrationTracker:
                 f"frame has {rows} rows of {columns} px, the frames before had {rows_before} of {columns_before}; "
                 "call reset() before another size"
             )
-        state = replace(self._state, time=time)
+        state = replace(self._state, time=time, lost="")
         if latest.shows_nothing_new(before):
             self._state = state
             return self._result(prepared, state, usable=False)
-        state = replace(state, frames=(*state.frames, latest)[-self.options.window :], untried=state.untried + 1)
+        longest = MAX_SPAN * self._rows.row_time  # s; frames further apart do not resolve frequencies
+        recent = tuple(frame for frame in state.frames if time - frame.time <= longest)
+        state = replace(state, frames=(*recent, latest)[-self.options.window :], untried=state.untried + 1)
 
         # 2. Predict the motion of a late frame, measure that of any other; detect the vibration if it is not known, or
         # if the rows contradict it.
-        predicted = None if measure else self._predicted(state)
-        with threads_for(latest.images):
-            state = self._detected(self._measured(state)) if predicted is None else predicted
+        with threads_for(latest.images), np.errstate(all="ignore"):
+            predicted = None if measure else self._predicted(state)
+            try:
+                state = self._detected(self._measured(state)) if predicted is None else predicted
+            except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+                state = state.without_track(str(error).partition("\n")[0])  # no argument is wrong: they were checked
 
         # 3. The result, moved to where the steady image is.
         tracked = self._result(prepared, state)
@@ -275,9 +285,11 @@ class VibrationTracker:
         # 1. Predict the motion in the middle of the two frames.
         centre = 0.5 * (track.start + frame.time) + 0.5 * height * self._rows.row_time
         prediction = track.filter.predicted(centre)
-        if not prediction.displacement_std() < _MAX_PREDICTED_STD:  # also if it is not a number
-            return replace(state, track=None)
         fit, step = prediction.as_fit(centre), centre - track.filter.time
+        size, seconds = max(frame.images.shape[-2:]), frame.time - track.start + height * self._rows.row_time
+        is_accurate = prediction.displacement_std() < _MAX_PREDICTED_STD  # not if it is not a number
+        if not (is_accurate and _is_possible(fit, size, seconds)):
+            return state.without_track("the motion cannot be predicted")
         path = state.path + track.filter.path(step)
 
         # 2. The gradients of the scene are used again unless they are old or the scene has moved.
@@ -302,7 +314,7 @@ class VibrationTracker:
             around = motion.mean_displacement(tensor(measurements.exposure_starts), self._rows.exposure_time)
             largest = float(np.abs(by_tones + by_drift - measurements.relative(table(around))).max())
             if not math.isfinite(largest):  # the rows were not measured
-                return replace(state, track=None)
+                return state.without_track("the rows cannot be measured")
             if largest < _MAX_CHANGE:
                 break
             fit, path, scene = corrected.as_fit(centre), state.path - corrected.path(-step), None
@@ -313,9 +325,9 @@ class VibrationTracker:
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
-        if not other.unexplained.max() < _MAX_UNEXPLAINED:
-            return replace(state, track=None)
         fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
+        if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
+            return state.without_track("the rows are far from where the motion places them")
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
         trusted = np.array([not against for against in tones.findings])
@@ -376,7 +388,7 @@ class VibrationTracker:
         if state.track is None:
             new = max(new, len(state.frames) if state.attempts == 0 else 0, state.untried)
         needed = max(2, self.options.window // 2) * 2 ** min(state.attempts, _MAX_DOUBLED)
-        if new < needed or state.untried < needed // 2:
+        if new < needed or state.untried < needed // 2 or len(state.frames) < 2:
             return 0
         return min(new, len(state.frames))
 
@@ -451,7 +463,7 @@ class VibrationTracker:
             drift = torch.stack([speed, torch.zeros_like(speed)], -1)
         drift = drift + torch.stack([(tones * rate).real, (tones * rate.square()).real], -1).mul(slow[..., None]).sum(1)
         if not bool(torch.isfinite(drift).all()):  # no row of the last frame was measured
-            return replace(state, track=None)
+            return state.without_track("the rows cannot be measured")
         # 2. Tones, with twice the standard deviations, because the last frame is measured again. Those of a record
         # allow for further tones, which the filter does not.
         tones = tones * ~slow
@@ -504,7 +516,15 @@ class VibrationTracker:
             frame=prepared,
             tones=tones,
             options=self.options,
+            lost=state.lost,
         )
+
+
+def _is_possible(fit: ToneFit, size: float, seconds: float) -> bool:
+    """Whether tones, and the image motion in some seconds, are smaller than a frame of ``size`` px; not if NaN."""
+    moved = np.abs(fit.drift) @ np.array([seconds, 0.5 * seconds**2])
+    is_small = bool((np.abs(fit.coefficients) < size).all() and (moved < size).all())
+    return is_small and bool(np.isfinite(fit.frequencies).all() and np.isfinite(fit.covariance).all())
 
 
 def _plausible(found: Attempt) -> Tensor:

@@ -113,5 +113,5 @@ class VideoBorder:
             return frame
         if self._before is not None and self._before.shape == frame.shape:
             frame = torch.where(tracked.visible, frame, self._before)
-        self._before = frame
+        self._before = frame.clone()  # the caller may draw on the frame of the video
         return frame if self.margins is None else self.margins.cut(frame)

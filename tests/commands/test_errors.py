@@ -12,6 +12,8 @@ from small_stack import CONFIG, TIMING, write_small
 
 from rsvib_torch import process_stack
 from rsvib_torch.commands.main import run_command
+from rsvib_torch.commands.shared_options import check_new
+from rsvib_torch.commands.terminal import running, running_command
 from rsvib_torch.core.text import printable
 from rsvib_torch.io import StackFormat, formats, open_stack
 from rsvib_torch.io.png import decode_png
@@ -172,3 +174,11 @@ def test_png_files_whose_pixels_are_complete_are_read(extra, tmp_path):
     path = tmp_path / "frame.png"
     path.write_bytes(png(zlib.compress(ROWS), extra=extra))
     assert (decode_png(path) == np.zeros((8, 8))).all()
+
+
+def test_links_without_target_are_not_replaced_and_names_are_shown_as_they_are(tmp_path):
+    (tmp_path / "out.tif").symlink_to(tmp_path / "none.tif")
+    with pytest.raises(FileExistsError, match=r"out.tif; choose another name, or replace them with --overwrite"):
+        check_new([tmp_path / "out.tif"], overwrite=False, inputs=[])
+    with running(["a\u202eb\x1b.tif"]):
+        assert running_command() == r"rsvib 'a\u202eb\x1b.tif'"

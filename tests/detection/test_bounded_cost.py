@@ -1,5 +1,8 @@
 """Rounds of measuring are bounded: what no vibration explains is refused after few rounds, with a reason."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 import rsvib_torch as rsv
@@ -60,3 +63,17 @@ def test_motion_that_no_tones_explain_is_refused_after_few_rounds():
     assert not found.reliable.any()
     assert rounds <= 10  # of the stated timing, and of another one if one is tried
     assert rounds_of_strips <= 3
+
+
+@pytest.mark.parametrize(
+    ("factor", "remedy"), [(1e3, "may be ms"), (1e6, "may be us"), (1e9, "may be ns"), (3e4, "that follow each other$")]
+)
+def test_frames_far_apart_are_refused_with_the_unit_that_is_likely(factor, remedy):
+    """Four frames that are 60 s apart took 2.4 GB, and more memory than any computer has beyond."""
+    starts = tuple(factor * TIMING.frame_period * index for index in range(4))
+    far = replace(TIMING, frame_start_times=starts)
+    frames = frames_of(VIBRATION)
+    with pytest.raises(ValueError, match=rf"frames are .* s apart and .*{remedy}"):
+        rsv.detect_vibration(frames, far)
+    with pytest.raises(ValueError, match=remedy):
+        rsv.detect_motion(frames, far)

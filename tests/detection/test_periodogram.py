@@ -1,6 +1,7 @@
 """The periodogram by transforms of unequal times, compared with a least-squares fit for each frequency."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -47,3 +48,16 @@ def test_strongest_frequencies_are_those_of_least_squares_fits(rows, frames):
         for axis in range(2):
             power = [decrease(record, weights[0, weighting, :, axis], frequency, axis) for frequency in frequencies]
             assert float(found[0, weighting, axis, 0]) == pytest.approx(frequencies[power.index(max(power))])
+
+
+def test_memory_does_not_grow_with_stacks_and_weightings():
+    record = measurements_of(20, 3)
+    many = record.repeated(4)
+    weights = many.weights[:, None].repeat(3, 1)
+    expected = strongest_frequencies(record, 2e-7, 1, 2, record.weights[:, None])
+    tracemalloc.start()
+    found = strongest_frequencies(many, 2e-7, 1, 2, weights)  # 109,000 frequencies
+    _, largest = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    np.testing.assert_array_equal(found, np.broadcast_to(expected, found.shape))
+    assert largest < 150e6  # bytes; all 12 at a time take 500 MB

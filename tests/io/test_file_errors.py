@@ -275,3 +275,12 @@ def test_paths_that_cannot_be_written(tmp_path, monkeypatch):
     for path in (tmp_path / "a.tif", tmp_path / "folder"):
         with pytest.raises(OSError, match=r"cannot write .* is not writable \(Permission denied\)"):
             check_stack_target(path, (3, 9, 7), dtype="uint8")
+
+
+def test_permissions_of_a_replaced_file_are_kept(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(0o640)
+    with whole_file(path) as part:
+        part.write_text("new")
+    assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", 0o640)

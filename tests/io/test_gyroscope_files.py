@@ -205,3 +205,26 @@ def test_result_is_saved(tmp_path):
     again = rsv.AngularRates.load(tmp_path / "rates.json")
     assert np.array_equal(again.rates.numpy(), rates.rates.numpy())
     assert "200 Hz" in rates.summary()
+
+
+@pytest.mark.parametrize(
+    ("columns", "row", "message"),
+    [
+        ("time,x,y,z", "{0},1,0,1,0,2,0,3", r"line 2: 8 values in 4 columns; write decimal points, not commas"),
+        ("time,x,y,z,x", "{0},1,2,3,4", "column 'x' occurs twice|could both be x"),
+    ],
+)
+def test_decimal_commas_and_repeated_columns_are_refused(tmp_path, columns, row, message):
+    """Motions were read from the wrong cells: decimal commas shift them, and the last of two columns counted."""
+    rows = [row.format(number) for number in range(8)]
+    (tmp_path / "a.csv").write_text("\n".join([columns, *rows]))
+    message = f"a.{{}}.*({message})"
+    with pytest.raises(ValueError, match=message.format("csv")):
+        rsv.read_motion(tmp_path / "a.csv", unit="px")
+    with pytest.raises(ValueError, match=message.format("csv")):
+        rsv.read_gyroscope(tmp_path / "a.csv", unit="rad/s")
+    log = gcsv(
+        tmp_path / "a.gcsv", columns=columns.replace("time", "t").replace("x", "gx").replace("y,z", "gy,gz"), rows=rows
+    )
+    with pytest.raises(ValueError, match=message.format("gcsv").replace("line 2", "line 8").replace("'x'", "'gx'")):
+        rsv.read_gyroscope(log)

@@ -1,6 +1,8 @@
 """Interrupted runs: no frame is missing, repeated or incomplete after they are resumed."""
 
+import errno
 import json
+import os
 import resource
 import shutil
 import signal
@@ -159,3 +161,16 @@ def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):
     assert report.resumed > 1
     np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), tifffile.imread(whole / "out.tif"))
     assert read_manifest(report.manifest).bad_frames == {}
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_file_systems_without_locks_are_written_to_with_a_warning(tmp_path, monkeypatch, number):
+    def refuse(file, operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    write_small(tmp_path / "in.tif")
+    with pytest.warns(UserWarning, match="the file system has no locks .*: start no other run with this output"):
+        report = process_small(tmp_path / "in.tif", tmp_path / "out.tif")
+    assert report.restored == report.windows
+    assert {path.name for path in tmp_path.iterdir()} >= {"in.tif", "out.tif"}

@@ -325,3 +325,21 @@ def test_wrong_frames_and_times_are_refused(steady):
         tracker.update(frames[1][:, :100])
     tracker.reset()
     assert tracker.update(frames[1], 1.5).state == "searching"
+
+
+def test_large_motions_with_gaps_end_in_a_search_and_not_in_an_error(steady):
+    """Filters whose covariance overflows, or whose equations have no solution, ended the session."""
+    frames, _ = steady
+    generator = np.random.default_rng(107)
+    step, longest, share = int(generator.choice([30, 60])), 10 ** generator.uniform(-1, 3), generator.choice([0.2, 0.5])
+    tracker, time, lost = rsv.VibrationTracker(TIMING, columns=None, window=2), 0.0, []
+    for index in range(20):
+        shift = 0 if index < 6 else step * (1 if index % 2 else -1)
+        frame = torch.roll(frames[index], (shift, -shift), (0, 1))
+        time += 1 / RATE if index < 6 or generator.random() > share else generator.uniform(0.03, longest)
+        tracked = tracker.update(frame, time, measure=bool(generator.random() < 0.8))
+        lost.append(tracked.lost)
+        assert torch.isfinite(tracked.restored).all()
+        assert tracked.detection is None or tracked.detection.vibration.amplitude.max() < SIZE
+    assert {""} < set(lost)
+    assert torch.isfinite(tracker.update(frames[20], time + 1e9).restored).all()

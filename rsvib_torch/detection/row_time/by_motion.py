@@ -137,7 +137,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         raise ValueError("recorded must be one motion, not a batch")
     # frames are converted with any row time: only scan axis and readout direction matter
     sensor = SensorTiming(1e-9, 1.0, 10.0 * 2**20, options.scan_axis)
-    stack = grey_frames(frames, sensor, options)
+    stack = grey_frames(frames, sensor, options, timed=False)
     if stack.batched:
         raise ValueError(f"calibrate_row_time_by_motion takes one stack, got a batch of {len(stack.images)}")
     num_frames, num_rows = stack.images.shape[1:3]

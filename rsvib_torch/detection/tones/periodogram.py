@@ -8,7 +8,7 @@ from scipy import fft, ndimage, special
 
 from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.fourier import fast_length
-from rsvib_torch.core.tables import Array, quantile, split_axis, without_nan
+from rsvib_torch.core.tables import Array, quantile, split_axis, take_stacks, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, tone_response
 
@@ -16,6 +16,7 @@ __all__ = ["best_candidate", "strongest_frequencies", "visibility"]
 
 _OVERSAMPLING = 8  # grid points per 1 / duration: a peak between two of them keeps 98 % of its height
 _CHUNK = 2**21  # values at a time
+_MAX_POWERS = 2**18  # frequencies, times weightings and stacks, at a time; each takes about 1.3 kB
 _TINY = 1e-300  # keeps equations solvable where nothing was measured
 
 
@@ -139,11 +140,17 @@ def strongest_frequencies(
         (B, S, 2, count) Hz, the highest peak first.
     """
     grid = _grid(float(measurements.duration.max()), sample_interval)
-    total = _of_families(_power(measurements, grid, weights), grid[1], harmonics)
-    # a peak is the maximum within half of 1 / duration on either side
     window = _OVERSAMPLING // 2
-    peak = total >= ndimage.maximum_filter1d(total, 2 * window + 1, mode="nearest")
-    places = np.where(peak, -total, 1.0).argsort(-1, stable=True)[..., :count]
+    stacks, weightings = weights.shape[:2]
+    at_once, count = max(1, _MAX_POWERS // grid[2]), min(count, grid[2])
+    places = np.empty((stacks, weightings, weights.shape[-1], count), np.int64)
+    for part in runs(stacks, max(1, at_once // weightings)):
+        some = take_stacks([measurements], np.arange(stacks)[part])
+        for weighting in runs(weightings, at_once):
+            total = _of_families(_power(some, grid, weights[part, weighting]), grid[1], harmonics)
+            # a peak is the maximum within half of 1 / duration on either side
+            peak = total >= ndimage.maximum_filter1d(total, 2 * window + 1, mode="nearest")
+            places[part, weighting] = np.where(peak, -total, 1.0).argsort(-1, stable=True)[..., :count]
     return grid[0] * (places + grid[1])
 
 

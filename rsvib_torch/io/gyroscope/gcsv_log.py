@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.reading import rows_of_numbers, text_lines
 from rsvib_torch.core.text import one_line
-from rsvib_torch.io.gyroscope.rates_table import angular_rates, rows_of_numbers, text_lines
+from rsvib_torch.io.gyroscope.rates_table import angular_rates
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 __all__ = ["check_orientation", "is_gcsv", "oriented", "read_gcsv"]
@@ -66,7 +67,7 @@ def read_gcsv(path: Path) -> AngularRates:
                 shown = one_line(",".join(names), 100)
                 raise ValueError(f"{path}: columns t, gx, gy and gz expected, the log has {shown}")
             wanted = ["t", *columns]
-            table = rows_of_numbers(path, lines, [names.index(name) for name in wanted], wanted, count + 1)
+            table = rows_of_numbers(path, lines, names, [names.index(name) for name in wanted], count + 1)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: not a gyroflow log: {error}") from error
     orientation = header.get("orientation", "XYZ")

@@ -21,6 +21,7 @@ from rsvib_torch.motion.gyroscope_rates import AngularRates
 __all__ = ["is_mp4", "read_gpmf"]
 
 Array = NDArray[np.float64]
+_MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
 
 _NUMBERS = {
     b"b": "i1", b"B": "u1", b"s": ">i2", b"S": ">u2", b"l": ">i4", b"L": ">u4", b"f": ">f4", b"d": ">f8", b"j": ">i8",
@@ -125,13 +126,18 @@ def _values(kind: bytes, size: int, content: bytes) -> Array:
     dtype = np.dtype(_NUMBERS.get(kind, "V1"))
     if dtype.kind == "V" or size == 0 or size % dtype.itemsize:
         raise IndexError(f"GPMF values of type {kind!r} and {size} bytes")
-    return np.frombuffer(content, dtype).astype(np.float64).reshape(-1, size // dtype.itemsize)
+    values = np.frombuffer(content, dtype).astype(np.float64).reshape(-1, size // dtype.itemsize)
+    if not np.isfinite(values).all():
+        raise IndexError("GPMF values that are not finite")
+    return values
 
 
 def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
     """Samples of the gyroscope of the first device that has one."""
     chosen: bytes | None = None
-    for packet in packets:
+    for count, packet in enumerate(packets):
+        if count == _MAX_PACKETS:
+            raise IndexError(f"more than {_MAX_PACKETS:,} GPMF packets")
         for key, _, _, _, device in _entries(packet.data):
             if key != b"DEVC":
                 continue

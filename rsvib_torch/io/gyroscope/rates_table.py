@@ -1,26 +1,23 @@
-"""Angular rates from CSV files, and the table of numbers that text formats share."""
+"""Angular rates from CSV files."""
 
 import csv
 import math
 import re
-from array import array
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rsvib_torch.core.reading import rows_of_numbers, text_lines
 from rsvib_torch.core.text import one_line
-from rsvib_torch.motion.gyroscope_rates import MAX_SAMPLES, AngularRates
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import SECONDS
 
-__all__ = ["angular_rates", "read_rates_table", "rows_of_numbers", "text_lines"]
+__all__ = ["angular_rates", "read_rates_table"]
 
 Array = NDArray[np.float64]
 
-MAX_LINE = 2**16  # characters of a line; a line without end is not read as a whole
 RADIANS = {"rad/s": 1.0, "deg/s": math.pi / 180}
 _UNIT = {"rad/s": "rad/s", "rad_s": "rad/s", "rads": "rad/s", "deg/s": "deg/s", "deg_s": "deg/s", "dps": "deg/s"}
 _TIME_NAME = re.compile(r"(?:t|time|timestamp)(?:[ _]?[(\[]?(?P<unit>s|ms|us|ns)[)\]]?)?")
@@ -28,47 +25,6 @@ _RATE_NAME = re.compile(
     r"(?:gyro(?:scope)?[ _]?|angular_velocity[ _]?|rate[ _]?|omega[ _]?|[grw])?(?P<axis>[xyz])"
     r"(?:[ _]?[(\[]?(?P<unit>rad/s|rad_s|rads|deg/s|deg_s|dps)[)\]]?)?"
 )
-
-
-def text_lines(path: Path, file: IO[str]) -> Iterator[str]:
-    """Lines of a text file, of bounded length."""
-    while line := file.readline(MAX_LINE):
-        if len(line) == MAX_LINE:
-            raise ValueError(f"{path}: a line of more than {MAX_LINE} characters; expected rows of numbers")
-        yield line
-
-
-def rows_of_numbers(
-    path: Path, lines: Iterable[str], columns: list[int], names: list[str], first_line: int
-) -> NDArray[np.float64]:
-    """Numbers (N, C) in some columns of comma-separated lines; empty lines are skipped.
-
-    Args:
-        path: The file, for messages.
-        lines: Lines after the names of the columns.
-        columns: Numbers C of the columns, from 0.
-        names: Names of these columns, for messages.
-        first_line: Number of the first of the lines in the file, from 1.
-    """
-    values = array("d")
-    limit = MAX_SAMPLES * len(columns)
-    reader = csv.reader(lines, skipinitialspace=True)
-    for cells in reader:
-        if not cells or cells == [""]:
-            continue
-        for column, name in zip(columns, names, strict=True):
-            text = cells[column] if column < len(cells) else ""
-            try:
-                value = float(text)
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                number = first_line + reader.line_num - 1
-                raise ValueError(f"{path}, line {number}: {name} must be a number, got {one_line(repr(text), 60)}")
-            values.append(value)
-        if len(values) > limit:
-            raise ValueError(f"{path}: more than {MAX_SAMPLES:,} samples; cut the recording to the time of the frames")
-    return np.frombuffer(values, dtype=np.float64).reshape(-1, len(columns))
 
 
 def angular_rates(path: Path, times: Array, rates: Array, source: str) -> AngularRates:
@@ -86,7 +42,7 @@ def read_rates_table(path: Path, unit: str | None, time_unit: str | None) -> Ang
             lines = text_lines(path, file)
             names = [name.strip().lower() for name in next(csv.reader(lines), [])]
             columns, time_unit, unit = _columns(path, names, time_unit, unit)
-            table = rows_of_numbers(path, lines, columns, [names[column] for column in columns], 2)
+            table = rows_of_numbers(path, lines, names, columns, 2)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: not a CSV file: {error}") from error
     return angular_rates(path, table[:, 0] * SECONDS[time_unit], table[:, 1:] * RADIANS[unit], f"{path.name}, CSV")

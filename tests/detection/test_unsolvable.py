@@ -1,0 +1,33 @@
+"""Frames that do not determine a motion end in a result that is refused, or a ``ValueError`` in plain words."""
+
+from contextlib import suppress
+
+import pytest
+import torch
+
+import rsvib_torch as rsv
+
+SIZE = 128
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=140)
+ROWS, COLUMNS = torch.arange(SIZE)[:, None], torch.arange(SIZE)
+
+
+def moving(draw):
+    """Four frames of a drawing of rows and columns that moves by (2, 1) px per frame."""
+    return torch.stack([draw(ROWS - index, COLUMNS - 2 * index) for index in range(4)]).float()
+
+
+FRAMES = {
+    "pixel": moving(lambda rows, columns: (rows == 60) & (columns == 50)),
+    "checkerboard": moving(lambda rows, columns: (rows // 8 + columns // 8) % 2),
+    "tiny": 1e-30 * torch.rand(4, SIZE, SIZE, generator=torch.Generator().manual_seed(0)),
+}
+
+
+@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("function", [rsv.detect_vibration, rsv.detect_motion, rsv.detect_swept_tone])
+def test_frames_that_do_not_determine_a_motion(function, name):
+    reliable = torch.tensor(False)
+    with suppress(ValueError):
+        reliable = function(FRAMES[name], TIMING).reliable
+    assert not reliable.any()
