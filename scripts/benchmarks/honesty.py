@@ -90,20 +90,24 @@ def observable_tones(taken: Recording, axis: int) -> Array:
 def tone_errors(found: rsv.DetectionResult, true: Array, axis: int) -> tuple[list[dict[str, float]], bool]:
     """Relative errors and errors over the standard deviation of the true tones, and whether the number is wrong.
 
-    The number is right if all true tones have a counterpart, and no tone is left without a true one.
+    The number is right if all true tones have a counterpart, and no tone is left without a true one. If it is wrong,
+    the standard deviation is that if another tone is hidden.
     """
     tones = (found.vibration.amplitude[axis] > 0).nonzero()[:, 0].tolist()
     frequencies = found.vibration.frequency[axis].numpy()
     miss = np.array([[abs(frequencies[tone] - frequency) for tone in tones] for _, frequency, _ in true])
-    errors = []
-    for one, at in zip(*linear_sum_assignment(miss), strict=True) if miss.size else ():
+    errors: list[dict[str, float]] = []
+    pairs = list(zip(*linear_sum_assignment(miss), strict=True)) if miss.size else []
+    wrong_number = len(pairs) < len(true) or len(tones) > len(pairs)
+    stated = found.std_if_hidden_tone if wrong_number and found.std_if_hidden_tone is not None else found.std
+    for one, at in pairs:
         pair: dict[str, float] = {"place": tones[at]}
         for name, value in zip(("amplitude", "frequency"), true[one], strict=False):
             error = float(getattr(found.vibration, name)[axis, tones[at]]) - value
-            std = float(getattr(found.std, name)[axis, tones[at]])
+            std = float(getattr(stated, name)[axis, tones[at]])
             pair[f"{name}_error"], pair[f"{name}_z"] = error / value, error / std if std > 0 else math.inf
         errors.append(pair)
-    return errors, len(errors) < len(true) or len(tones) > len(errors)
+    return errors, wrong_number
 
 
 def is_assumed(found: rsv.DetectionResult, taken: Recording, axis: int, tones: list[dict[str, float]]) -> bool:
@@ -146,7 +150,11 @@ def judge_axis(found: rsv.DetectionResult, taken: Recording, axis: int) -> dict[
     if taken.case.tones is not None:  # tones that are not observable may be found all the same
         truths.append(without_trend(taken.displacement_by(true), taken.starts))
     error, size = min((rms(without_trend(shown, stated.numpy()) - truth), rms(truth)) for truth in truths)
-    std = float(displacement_uncertainty(found.vibration, found.std, taken.timing, num_frames, height)[0][axis])
+    std = float(
+        displacement_uncertainty(
+            found.vibration, found.std_if_hidden_tone or found.std, taken.timing, num_frames, height
+        )[0][axis]
+    )
     tones, wrong_number = ([], False) if taken.case.tones is None else tone_errors(found, true, axis)
     reliable = bool(found.reliable[axis])
     wrong_parameter = any(

@@ -49,10 +49,10 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 __all__ = ["StatedFit", "with_further_tones", "with_unknown_amplitudes", "without_aliasing"]
 
-# Errors of amplitudes. px per px of the expected bias by aliasing, for tones of 1 px or more, proportionally less of
-# smaller ones: in 54 and 55 axes with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the
-# standard deviation was 1.26 and 1.93 without this term, and is 1.05 and 1.20 with it
-_UNKNOWN_ALIASING = 0.2
+# Errors of amplitudes A in px over the expected bias by aliasing: at most 2 A, and 0.8 / (1 + 2 A). In 54 and 55 axes
+# with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the standard deviation was 1.26 and 1.93
+# (largest 3.8 and 7.9) without this term, and is 0.89 and 0.98 (3.1 and 2.7) with it
+_UNKNOWN_ALIASING = 2.0, 0.8
 # px^-2, relative, per square of the path within an exposure: with paths of 4 to 7 px, errors were 2e-4 to 8e-4
 _UNKNOWN_BLUR = 1.5e-5
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
@@ -214,7 +214,8 @@ def with_unknown_amplitudes(fit: ToneFit, aliasing: Array, intervals: Array, exp
     size = fit.amplitude  # (B, A, K)
     path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
     gain = np.maximum(offset_gain(fit.frequencies, intervals), 1e-3)
-    by_aliasing = _UNKNOWN_ALIASING * aliasing[:, None, None] * np.minimum(size, 1.0)
+    small, large = _UNKNOWN_ALIASING
+    by_aliasing = aliasing[:, None, None] * np.minimum(small * size, large / (1 + 2 * size))
     by_blur = _UNKNOWN_BLUR * np.square(path) * size * 2.0 / gain
     error = np.hypot(by_aliasing, by_blur) / np.maximum(size, 1e-300)  # relative
     unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
