@@ -40,9 +40,13 @@ class PageOutput:
         class Handler(BaseHTTPRequestHandler):
             """Answers of the page."""
 
+            timeout = 10.0  # s, without a byte; connections that are never used would keep a thread each
+
             def do_GET(self) -> None:
                 """Answer a request."""
-                if self.path == "/frames":
+                if self.headers.get("Host", "").rpartition(":")[0] not in (_HOST, "localhost"):
+                    self.send_error(403, f"the page is at {output.url}")  # another site refers to this machine
+                elif self.path == "/frames":
                     output._send_frames(self)
                 elif self.path in ("/", "/state"):
                     state = output._state

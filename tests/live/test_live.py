@@ -149,6 +149,10 @@ def test_the_page_is_served_to_this_machine_only():
         port = urllib.parse.urlsplit(page.url).port
         with pytest.raises(urllib.error.URLError):  # another address of this machine
             urllib.request.urlopen(page.url.replace("127.0.0.1", "127.0.0.2"), timeout=5)
+        for host in (f"rebound.example:{port}", f"127.0.0.1.rebound.example:{port}", ""):
+            request = urllib.request.Request(page.url, headers={"Host": host})
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(request, timeout=5)
         page.show_state("52.0 Hz <x>")
         assert "52.0 Hz &lt;x&gt;" in urllib.request.urlopen(page.url, timeout=5).read().decode()
         assert urllib.request.urlopen(page.url + "state", timeout=5).read() == b"52.0 Hz <x>"
