@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from rsvib_torch.live import FrameOutput, FrameSource, LiveReport
     from rsvib_torch.tracking import TrackedFrame, VibrationTracker
 
-__all__ = ["live_session"]
-
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 
 

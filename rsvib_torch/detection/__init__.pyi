@@ -1,4 +1,4 @@
-from .detect import DetectionMethod, VibrationDetector, detect_vibration
+from .detect import VibrationDetector, detect_vibration
 from .diagnosis import TimingDiagnosis, diagnose_timing
 from .recorded.alignment import ClockAlignment, align_motion
 from .recorded.motion_check import MotionCheck, check_motion
@@ -10,7 +10,6 @@ from .shapes.swept import SweptTone, detect_swept_tone
 
 __all__ = [
     "ClockAlignment",
-    "DetectionMethod",
     "DetectionResult",
     "MotionCheck",
     "MotionDetection",

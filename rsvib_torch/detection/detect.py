@@ -26,9 +26,7 @@ from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming, check_timing
-from rsvib_torch.options import DetectionMethod, FreeMotionOptions, SweptToneOptions, VibrationOptions
-
-__all__ = ["DetectionMethod", "VibrationDetector", "VibrationModel", "detect_vibration"]
+from rsvib_torch.options import FreeMotionOptions, SweptToneOptions, VibrationOptions
 
 VibrationModel = Literal["tones", "free", "swept"]
 T = ParamSpec("T")

@@ -41,8 +41,6 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequenc
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
-__all__ = ["METHODS", "Attempt", "DetectionOptions", "Hypothesis", "Method", "Status", "attempt"]
-
 Status = Literal["converged", "not converged", "abandoned", "not visible"]
 
 

@@ -42,8 +42,6 @@ from rsvib_torch.detection.tones.selection import find_tones, robust_fit, signif
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration.gradients import RowGradients
 
-__all__ = ["FittedRows", "Refinement", "mirrored_frequencies", "refine", "with_unknown_changes"]
-
 
 @dataclass(frozen=True, eq=False)
 class FittedRows:

@@ -10,8 +10,6 @@ from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
-__all__ = ["attributes_of", "info_from_attributes"]
-
 
 def attributes_of(info: StackInfo) -> dict[str, Any]:
     """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""

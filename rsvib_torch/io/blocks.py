@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo, readable_frame
 
-__all__ = ["ArrayReader", "BlockReader"]
-
 
 class BlockReader(FrameReader):
     """Frames that are read in blocks; a block is kept until its last frame has been read.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 
-__all__ = ["ContiguousReader", "InterleavedReader", "check_frames_held"]
-
 BLOCK_BYTES = 1 << 26  # of frames that are read together; the whole file is read once per block
 BAND_BYTES = 1 << 24  # of the file that are read at once, so that not the whole file is in memory
 

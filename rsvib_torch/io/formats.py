@@ -12,8 +12,6 @@ from typing import Any
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.io.stack_format import StackFormat
 
-__all__ = ["FORMATS", "find_format", "packaged_format", "register_format", "target_format"]
-
 
 @dataclass(frozen=True)
 class _InModule:

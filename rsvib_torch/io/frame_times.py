@@ -11,14 +11,6 @@ from rsvib_torch.core.text import number_of
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming
 
-__all__ = [
-    "TimingWarning",
-    "describe_stack",
-    "exposure_times",
-    "timing_from_first_frame",
-    "timing_of_stack",
-]
-
 _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
 
 _ORIENTATIONS = {

@@ -9,16 +9,6 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_number
 
-__all__ = [
-    "beyond_full_scale",
-    "check_dtype",
-    "check_full_scale",
-    "counts_to_frames",
-    "frames_to_counts",
-    "known_full_scale",
-    "required_full_scale",
-]
-
 
 def check_dtype(dtype: np.dtype[Any]) -> None:
     """Raise a ``ValueError`` unless pixels of ``dtype`` are integers or floats of a supported size."""

@@ -17,8 +17,6 @@ from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 
-__all__ = ["open_hdf5", "write_hdf5"]
-
 _DATASET = "frames"  # name of the dataset that is written
 _MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms
 

@@ -16,8 +16,6 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.time_metadata import merged_times
 
-__all__ = ["ImagesReader", "check_folder", "check_image", "write_folder", "write_image"]
-
 _PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
 _KINDS = {"PNG": _PNG, "TIFF": _TIFF, "JPEG": _JPEG}
 _ENDINGS = (*_PNG, *_TIFF, *_JPEG)

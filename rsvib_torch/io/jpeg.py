@@ -12,8 +12,6 @@ from PIL import Image
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import exif_fields
 
-__all__ = ["decode_jpeg", "jpeg_info"]
-
 
 def _open(path: Path) -> Image.Image:
     with path.open("rb"):

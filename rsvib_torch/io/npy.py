@@ -12,8 +12,6 @@ from rsvib_torch.io.contiguous import ContiguousReader, InterleavedReader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["check_npy", "open_npy", "write_npy"]
-
 _MAX_HEADER_BYTES = 10_000  # as in numpy, which reads the header before it compares
 
 

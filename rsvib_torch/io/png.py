@@ -15,8 +15,6 @@ from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import exif_fields
 
-__all__ = ["decode_png", "encode_png", "png_info"]
-
 _FULL_SCALE_KEY = b"full_scale"
 
 

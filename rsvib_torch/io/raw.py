@@ -14,8 +14,6 @@ from rsvib_torch.io.array_attributes import info_from_attributes
 from rsvib_torch.io.contiguous import ContiguousReader
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["open_raw", "write_raw"]
-
 
 class _Sidecar(Section):
     """Content of the sidecar."""

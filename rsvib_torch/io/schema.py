@@ -8,8 +8,6 @@ from rsvib_torch.core.validation import Section, checked
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.vibration import Vibration
 
-__all__ = ["VibrationRecord"]
-
 Tones = list[float] | list[list[float]]
 
 

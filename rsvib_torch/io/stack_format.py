@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from rsvib_torch.io.stack_info import StackInfo
 
-__all__ = ["FrameReader", "StackFormat", "needed_package"]
-
 Frame = NDArray[Any]
 
 

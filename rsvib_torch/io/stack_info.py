@@ -14,15 +14,6 @@ from rsvib_torch.core.arguments import check_fields, checked_methods
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
 
-__all__ = [
-    "FrameError",
-    "Scope",
-    "StackInfo",
-    "Tag",
-    "readable_frame",
-    "readable_stack",
-]
-
 
 class FrameError(ValueError):
     """One frame of a stack cannot be read; the other frames may be readable."""

@@ -21,16 +21,6 @@ from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
 
-__all__ = [
-    "FramesOrFiles",
-    "LoadedFrames",
-    "PathLike",
-    "load_frames",
-    "open_stack",
-    "read_stack",
-    "read_stack_info",
-]
-
 PathLike = str | os.PathLike[str]
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
 _FRAME_COPIES = 24  # bytes per pixel of one frame while it is decoded and converted

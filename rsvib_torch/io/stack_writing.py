@@ -30,15 +30,6 @@ from rsvib_torch.io.stack_format import StackFormat
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import PathLike
 
-__all__ = [
-    "check_info_target",
-    "check_stack_target",
-    "metadata_not_kept",
-    "stack_files",
-    "write_frames",
-    "write_stack",
-]
-
 
 def stack_files(path: PathLike) -> list[Path]:
     """The paths that a stack occupies: its file or folder, and the files beside it (sidecars).

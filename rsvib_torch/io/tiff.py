@@ -19,9 +19,6 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, rea
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
-__all__ = ["open_tiff", "write_tiff"]
-
-
 # Tags on which the decoded pixels of a page depend, besides their position: subfile type, width, length, bits,
 # compression, photometric interpretation, fill order, samples, rows per strip, planar configuration, predictor, tile
 # size, extra samples, sample format, image depth, tile depth

@@ -13,8 +13,6 @@ import tifffile
 
 from rsvib_torch.io.stack_info import Scope, StackInfo, Tag
 
-__all__ = ["json_description", "read_metadata", "writer_options"]
-
 _DESCRIPTION, _IMAGEJ_COUNTS, _IMAGEJ = 270, 50838, 50839  # codes of tags
 _JSON = "JSON metadata"  # keys of the description that tifffile writes
 _RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in the description

@@ -14,8 +14,6 @@ from xml.etree import ElementTree
 import numpy as np
 from PIL import ExifTags, Image
 
-__all__ = ["exif_fields", "merged_times", "orientation_of", "tiff_times", "time_attributes", "times_of_attributes"]
-
 _SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
 
 _SECONDS = {

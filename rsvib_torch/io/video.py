@@ -22,24 +22,6 @@ from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
-__all__ = [
-    "CONTAINERS",
-    "ENDINGS",
-    "H264",
-    "Picture",
-    "Sound",
-    "VideoReader",
-    "add_video",
-    "check_video",
-    "open_container",
-    "open_output",
-    "open_source",
-    "picture_of",
-    "presentation_times",
-    "scanned",
-    "write_video",
-]
-
 _LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
 CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
 _READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")

@@ -27,8 +27,6 @@ from rsvib_torch.io.video import (
     scanned,
 )
 
-__all__ = ["PartWriter", "PlaneReader", "join_parts", "planes_of"]
-
 Frame = NDArray[Any]
 _FULL_RANGE = 2  # code of FFmpeg
 # of x264: without B-frames packets have the order of frames; for a frame of 1920 x 1080 px, ultrafast with crf 14 takes

@@ -16,8 +16,6 @@ from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-__all__ = ["open_zarr", "write_zarr"]
-
 _HEADER = "zarr.json"
 _MAX_CHUNKS = 1 << 14  # per frame; each takes about 0.3 ms
 _CONCURRENT = 10  # chunks that zarr decodes at the same time (async.concurrency)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.io.stack_format import needed_package
 
-__all__ = ["FrameOutput", "PipeOutput", "PreviewOutput", "VideoOutput"]
-
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
 # of FFmpeg: every frame is written when it is encoded, in a fragment (.mp4, .mov, .m4v) or cluster (.mkv) of its own.

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PageOutput"]
-
 _HOST = "127.0.0.1"  # never reachable from other machines
 _BOUNDARY = "rsvib-frame"
 _PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>rsvib live</title>

@@ -21,8 +21,6 @@ from rsvib_torch.live.sources import FrameReader, FrameSource
 from rsvib_torch.live.spectrogram import Spectrogram
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker, VideoBorder
 
-__all__ = ["LiveReport", "run_live", "to_counts"]
-
 _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, end of a service, end of a terminal

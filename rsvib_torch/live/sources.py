@@ -22,17 +22,6 @@ from rsvib_torch.core.checks import check_choice, check_whole_number
 from rsvib_torch.io import open_stack, read_stack_info, timing_from_first_frame
 from rsvib_torch.motion.timing import SensorTiming
 
-__all__ = [
-    "CameraSource",
-    "FileSource",
-    "FrameCounter",
-    "FrameReader",
-    "FrameSource",
-    "PipeSource",
-    "PixelFormat",
-    "TimedFrame",
-]
-
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 

@@ -16,8 +16,6 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.plots import plain_axes, save_figure
 from rsvib_torch.tracking import TrackedFrame
 
-__all__ = ["Spectrogram", "save_spectrogram"]
-
 
 class Spectrogram:
     """Amplitude of the displacement over time and frequency.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.number_table import MAX_SAMPLES
 from rsvib_torch.core.presentation import Result
-from rsvib_torch.core.reading import MAX_SAMPLES
 from rsvib_torch.core.text import text_table
 
 if TYPE_CHECKING:

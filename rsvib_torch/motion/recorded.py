@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.reading import check_regular, rows_of_numbers, text_lines
+from rsvib_torch.core.number_table import rows_of_numbers, text_lines
+from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.options import MotionUnit, TimeUnit
-
-__all__ = ["SECONDS", "MotionUnit", "TimeUnit", "check_times", "read_motion"]
 
 _RADIANS = {
     "rad": 1.0,

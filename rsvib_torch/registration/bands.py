@@ -11,19 +11,6 @@ from functools import cache
 import torch
 from torch import Tensor
 
-__all__ = [
-    "BINNING",
-    "LAGS",
-    "BandTask",
-    "cut_lags",
-    "fine_offsets",
-    "integer_peak",
-    "subpixel_peak",
-    "take_windows",
-    "template_margin",
-    "whole_pixel_peak",
-]
-
 BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel
 LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fix the peak to 0.001 px (subpixel_peak)
 

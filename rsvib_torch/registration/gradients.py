@@ -35,16 +35,6 @@ from rsvib_torch.registration.row_spectra import (
     mean_over_frames,
 )
 
-__all__ = [
-    "BLOCK",
-    "FrameComparison",
-    "RowGradients",
-    "residual_products",
-    "row_equations",
-    "row_gradients",
-    "scene_detail",
-]
-
 BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise
 # of the bias if A(u) was constant. Three drawn scenes behind optics of 0.3 and 0.4 px had biases of 6e-3 and 2.4e-3 px,
@@ -53,7 +43,7 @@ _SHARE_OF_ALIASING = 1 / 8
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
 
 
-class WarpedRows(Protocol):
+class _WarpedRows(Protocol):
     """What ``row_gradients`` requires of the frames: ``RowSpectra``, or rows that were joined from strips."""
 
     @property
@@ -98,7 +88,7 @@ class RowGradients:
 
 
 def row_gradients(
-    spectra: WarpedRows,
+    spectra: _WarpedRows,
     warped: Iterable[tuple[slice, Tensor]],
     rows: Tensor,
     shift: Tensor,

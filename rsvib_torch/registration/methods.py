@@ -18,14 +18,6 @@ from rsvib_torch.registration.bands import (
     whole_pixel_peak,
 )
 
-__all__ = [
-    "BAND_METHODS",
-    "register_ncc",
-    "register_phase",
-    "register_projection",
-]
-
-
 # Zero-mean normalised cross-correlation (NCC), computed with matrix products
 
 

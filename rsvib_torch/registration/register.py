@@ -28,8 +28,6 @@ from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
 from rsvib_torch.registration.bands import BandTask, template_margin
 from rsvib_torch.registration.methods import BAND_METHODS
 
-__all__ = ["OffsetCurve", "check_frame_size", "fits_frame", "register_bands", "register_rows"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OffsetCurve(

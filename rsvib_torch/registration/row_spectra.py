@@ -15,18 +15,6 @@ from rsvib_torch.core.chunking import chunks, gathered
 from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases, squared_modulus
 from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
 
-__all__ = [
-    "EVERY",
-    "MARGIN",
-    "RowSpectra",
-    "column_pattern",
-    "combined",
-    "differences",
-    "inner_columns",
-    "mean_over_frames",
-    "overlapping",
-]
-
 DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
 MARGIN = 8  # px; rows and columns this close to an edge have no weight: they are interpolated from extended values
 

@@ -3,8 +3,9 @@ from .frame_motion import visible_pixels
 from .noise import estimate_noise
 from .noise_gain import predict_noise_gain
 from .restoration_mtf import RestorationMtf, restoration_mtf
+from .restoration_warning import RestorationWarning
 from .restore import VibrationRestorer, restore
-from .verdict.judge import RestorationVerdict, RestorationWarning, judge_restoration
+from .verdict.judge import RestorationVerdict, judge_restoration
 from .verdict.pairs import TooLittleInCommonError
 from .verdict.trust import displacement_uncertainty, trusted_vibration
 

@@ -7,8 +7,6 @@ from typing import Protocol, Self, TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["steadied"]
-
 _ROUNDING = 1e-6  # s, of frame times
 
 

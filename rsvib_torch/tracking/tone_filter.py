@@ -22,8 +22,6 @@ from rsvib_torch.core.tables import Array, median, split_axis, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 
-__all__ = ["PROCESS_NOISE", "ToneFilter"]
-
 # Random walk of g and 2 pi f in rad/s per square root of a second, and of a in px/s^2 per square root of a second.
 # A tone that sweeps by 2 Hz/s changes by 12.6 rad/s in a second; a tone that grows to twice its amplitude has 0.7 / s.
 # A camera held by hand shakes by 2 px at 3 Hz, which are 13000 px/s^3. Measured in docs/live.md.

@@ -23,8 +23,6 @@ from rsvib_torch.options import TrackerOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 
-__all__ = ["TrackedFrame", "TrackedTones", "TrackingState", "time_to_middle"]
-
 TrackingState = Literal["searching", "tracking", "unusable"]
 
 

@@ -62,8 +62,6 @@ from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.tracking.tone_filter import ToneFilter
 from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, time_to_middle
 
-__all__ = ["VibrationTracker"]
-
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
 _MAX_UNEXPLAINED = 1.0  # px, residual displacement of rows; they are not measured correctly over larger distances

@@ -12,8 +12,6 @@ from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.options import BorderName
 from rsvib_torch.tracking.tracked_frame import TrackedFrame
 
-__all__ = ["Margins", "VideoBorder"]
-
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 
 

@@ -36,26 +36,6 @@ from rsvib_torch.registration.gradients import (
 )
 from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern, overlapping
 
-__all__ = [
-    "BLOCK_ROWS",
-    "MAX_GROUP_FRAMES",
-    "FrameGroups",
-    "MeasuredGroup",
-    "blur_ratio",
-    "column_pattern_of",
-    "compared_intervals",
-    "differential_motion",
-    "differently_blurred",
-    "displacements_of_parts",
-    "frame_groups",
-    "joined_groups",
-    "measure_group",
-    "measure_groups",
-    "measure_strips",
-    "stack_spectra",
-    "uneven_motion",
-]
-
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
 _MIN_OVERLAP = 0.5  # part of a frame that all frames of a group contain
 MAX_GROUP_FRAMES = 8  # frames with one mean scene; more lower the noise of that scene by less than 1 / 16

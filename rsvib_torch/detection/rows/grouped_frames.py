@@ -38,8 +38,6 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import MARGIN
 
-__all__ = ["GroupedFrames", "GroupedStrips", "MeasuredRows", "grouped_frames", "grouped_strips"]
-
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRows:

@@ -17,35 +17,6 @@ from rsvib_torch.core.tables import Array, cos_sin, select_stacks, split_axis, t
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = [
-    "LARGEST",
-    "MIN_GAIN",
-    "MotionModel",
-    "ToneFit",
-    "amplitude_std",
-    "axis_jacobian",
-    "displacement_jacobian",
-    "displacement_std",
-    "drift_response",
-    "fit_roughly",
-    "fit_tones",
-    "is_bounded",
-    "model_displacements",
-    "motion_of_fit",
-    "offset_gain",
-    "residual_of",
-    "shrunk",
-    "strongest_only",
-    "tone_displacements",
-    "tone_response",
-    "vibration_of_fit",
-    "with_axes",
-    "with_errors_of_blocks",
-    "with_tone_parameters",
-    "with_tones",
-    "with_unknown_errors",
-]
-
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
 # px, amplitude of tones near blind frequencies, of x, y, roll and zoom. A clip with a blind vibration along y was
 # fitted by a tone of 59 px; after warping by it, the known motion along x was not measurable in 13 of 24 repetitions.

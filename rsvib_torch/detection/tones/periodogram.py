@@ -12,8 +12,6 @@ from rsvib_torch.core.tables import Array, quantile, split_axis, take_stacks, wi
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, tone_response
 
-__all__ = ["best_candidate", "strongest_frequencies", "visibility"]
-
 _OVERSAMPLING = 8  # grid points per 1 / duration: a peak between two of them keeps 98 % of its height
 _CHUNK = 2**21  # values at a time
 _MAX_POWERS = 2**18  # frequencies, times weightings and stacks, at a time; each takes about 1.3 kB

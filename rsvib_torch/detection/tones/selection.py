@@ -18,15 +18,6 @@ from rsvib_torch.detection.tones.fit import (
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
 from rsvib_torch.options import MAX_TONES
 
-__all__ = [
-    "MIN_OFFSET",
-    "MIN_SIGNIFICANCE",
-    "find_tones",
-    "robust_fit",
-    "significant_only",
-    "typical_size",
-]
-
 MIN_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
 MIN_OFFSET = 0.01  # px, amplitude of the offsets of a tone; interpolation and unequal blur leave up to this
 _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over a frequency grid stays below

@@ -47,8 +47,6 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-__all__ = ["StatedFit", "with_further_tones", "with_unknown_amplitudes", "without_aliasing"]
-
 # Errors of amplitudes A in px over the expected bias by aliasing: at most 2 A, and 0.8 / (1 + 2 A). In 54 and 55 axes
 # with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the standard deviation was 1.26 and 1.93
 # (largest 3.8 and 7.9) without this term, and is 0.89 and 0.98 (3.1 and 2.7) with it

@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.reading import rows_of_numbers, text_lines
+from rsvib_torch.core.number_table import rows_of_numbers, text_lines
 from rsvib_torch.core.text import one_line
 from rsvib_torch.io.gyroscope.rates_table import angular_rates
 from rsvib_torch.motion.gyroscope_rates import AngularRates
-
-__all__ = ["check_orientation", "is_gcsv", "oriented", "read_gcsv"]
 
 _MARKS = (b"GYROFLOW IMU LOG", b"CAMERA IMU LOG")
 _MAX_HEADER = 1000  # lines

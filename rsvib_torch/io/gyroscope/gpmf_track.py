@@ -18,8 +18,6 @@ from rsvib_torch.io.gyroscope.rates_table import angular_rates
 from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
-__all__ = ["is_mp4", "read_gpmf"]
-
 Array = NDArray[np.float64]
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
 

@@ -9,12 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rsvib_torch.core.reading import rows_of_numbers, text_lines
+from rsvib_torch.core.number_table import rows_of_numbers, text_lines
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import SECONDS
-
-__all__ = ["angular_rates", "read_rates_table"]
 
 Array = NDArray[np.float64]
 

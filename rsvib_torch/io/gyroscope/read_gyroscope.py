@@ -16,8 +16,6 @@ from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import check_times
 from rsvib_torch.options import TimeUnit
 
-__all__ = ["RateUnit", "read_gyroscope"]
-
 RateUnit = Literal["rad/s", "deg/s"]
 
 

@@ -34,7 +34,6 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
-from rsvib_torch.restoration.restoration_warning import RestorationWarning
 from rsvib_torch.restoration.verdict.pairs import (
     FramePairs,
     Overlap,
@@ -46,16 +45,6 @@ from rsvib_torch.restoration.verdict.pairs import (
     shared_part,
 )
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
-
-__all__ = [
-    "Outcome",
-    "RestorationVerdict",
-    "RestorationWarning",
-    "judge_prepared",
-    "judge_restoration",
-    "judge_stacks",
-    "outcome_of_pair",
-]
 
 Outcome = Literal["helps", "unknown", "partly", "worse"]
 _OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
