@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checked_methods
+from rsvib_torch.core.checks import described
 from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reason import texts
 from rsvib_torch.core.text import text_table, wrapped
@@ -200,7 +201,9 @@ class Result(Summarised):
     @classmethod
     def stacked(cls, results: Sequence[Self]) -> Self:
         """Results of the same shape as a batch; the new dimension is the first. Other values are those of the first."""
-        result = copy(results[0])
+        if not isinstance(results, (list, tuple)) or not results or not all(isinstance(one, cls) for one in results):
+            raise TypeError(f"results must be a list of {cls.__name__}, at least one, got {described(results)}")
+        result: Self = copy(results[0])
         for name, first in result._fields_of_batch().items():
             values = [getattr(one, name) for one in results]
             joined: Any = tuple(values)

@@ -104,7 +104,7 @@ class Camera:
     def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """(u, v) of the rays (u, v, 1) of image points in px from the centre of the frame, by Newton's method."""
         check_broadcast(x=x, y=y)
-        x, y = torch.broadcast_tensors(x, y)
+        x, y = torch.broadcast_tensors(1.0 * x, 1.0 * y)
         along, across = (
             (x - self.principal_point[0]) / self.focal_length,
             (y - self.principal_point[1]) / self.focal_length,

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
+from rsvib_torch.core.checks import described
 from rsvib_torch.core.presentation import JudgedResult, verdict_table
 from rsvib_torch.core.text import wrapped
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
@@ -48,6 +49,8 @@ class DetectedVibration(
     @classmethod
     def of(cls, detection: "DetectedVibration") -> "DetectedVibration":
         """A detection without what derived classes add to it."""
+        if not isinstance(detection, DetectedVibration):
+            raise TypeError(f"detection must be a DetectedVibration, got {described(detection)}")
         return DetectedVibration(**{part.name: getattr(detection, part.name) for part in fields(DetectedVibration)})
 
     def __post_init__(self) -> None:

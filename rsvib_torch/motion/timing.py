@@ -209,6 +209,7 @@ class SensorTiming:
         Between two frames, a vibration has a number of periods that its frequency must determine: the number of
         frequencies that are tried, and the time and memory that they take, grow with the span.
         """
+        check_whole_number("num_rows", num_rows, at_least=1)
         starts = self.frame_starts(num_frames)
         step, span = float(starts.diff().median()), float(starts[-1] - starts[0])
         if span <= self.row_time * max(MAX_SPAN, _MAX_BLANKING * num_frames * num_rows):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.core.chunking import gathered, runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, phase_tables, spline_spectra
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
@@ -160,6 +160,8 @@ class FixedDewarp(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Restore frames (T, H, W), (T, C, H, W) or (B, T, C, H, W)."""
+        if not isinstance(frames, Tensor):
+            raise TypeError(f"frames must be a tensor, got {described(frames)}")
         batch = frames[None, :, None] if frames.ndim == 3 else frames[None] if frames.ndim == 4 else frames
         if batch.ndim != 5 or (batch.shape[1], *batch.shape[-2:]) != self.shape:
             raise ValueError(

@@ -1,14 +1,14 @@
 """Pixels of restored video frames that the sensor did not record: a border that moves from frame to frame."""
 
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, TypeVar
 
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.arguments import checked_methods, checks_arguments
+from rsvib_torch.core.checks import check_whole_number, described
 from rsvib_torch.options import BorderName
 from rsvib_torch.tracking.tracked_frame import TrackedFrame
 
@@ -16,6 +16,7 @@ Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 
 
 @dataclass(frozen=True)
+@checked_methods
 class Margins:
     """Rows and columns (px) to cut from the frames so that no extrapolated pixel remains.
 
@@ -32,7 +33,7 @@ class Margins:
     right: int = 0
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
+        for name, value in vars(self).items():
             check_whole_number(name, value, at_least=0)
 
     @classmethod
@@ -59,6 +60,8 @@ class Margins:
         Raises:
             ValueError: If nothing remains.
         """
+        if not hasattr(images, "shape") or len(images.shape) < 2:
+            raise TypeError(f"images must be a tensor or an array (..., H, W), got {described(images)}")
         height, width = images.shape[-2:]
         rows, columns = height - self.top - self.bottom, width - self.left - self.right
         if rows < 2 or columns < 2:
