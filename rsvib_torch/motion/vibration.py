@@ -445,7 +445,7 @@ def tone_rows(
     """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells of the ``quantities``.
 
     Of a batch, the strongest tone of each axis is shown. Standard deviations if a further tone is hidden are added
-    where they are larger.
+    where they are larger, but for phases: a line of a terminal has 80 characters.
     """
     rows = []
     for at, labels in _tones(vibration):
@@ -455,7 +455,7 @@ def tone_rows(
                 measured_text(
                     scale * getattr(vibration, name)[at],
                     None if std is None else scale * getattr(std, name)[at],
-                    hidden=None if hidden is None else scale * getattr(hidden, name)[at],
+                    hidden=None if hidden is None or name == "phase" else scale * getattr(hidden, name)[at],
                 )
                 for name, scale in ((name, _COLUMNS[name][1]) for name in quantities)
             ]
