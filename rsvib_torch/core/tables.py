@@ -73,7 +73,7 @@ def tensor(values: Array) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values))
 
 
-_MANY = 2048  # values; PyTorch is faster beyond
+_MANY = 2048  # values; PyTorch takes 6 ns each and 5 us for a call, NumPy 17 ns each
 
 
 def cos_sin(angle: Array) -> tuple[Array, Array]:

@@ -54,10 +54,8 @@ def restore_dewarp(frames: Tensor, motion: FrameMotion, options: DewarpOptions =
     mean displacement (Eq. 2) of that row with a phase ramp. Noise is not amplified.
     """
     length = extended_length(frames.shape[-1], motion.displacement_bound())
-    moves, spectra = (
-        _Moves.of(motion, length, frames.dtype),
-        torch.view_as_real(spline_spectra(frames, _DEGREE, length)),
-    )
+    moves = _Moves.of(motion, length, frames.dtype)
+    spectra = torch.view_as_real(spline_spectra(frames, _DEGREE, length))
 
     def rows_of(moved: Tensor) -> Tensor:
         rows: Tensor = torch.fft.irfft(torch.view_as_complex(moved), n=length)[..., : frames.shape[-1]]
@@ -162,6 +160,10 @@ class FixedDewarp(nn.Module):
         """Restore frames (T, H, W), (T, C, H, W) or (B, T, C, H, W)."""
         if not isinstance(frames, Tensor):
             raise TypeError(f"frames must be a tensor, got {described(frames)}")
+        if frames.dtype != self.to_spectra.dtype:
+            raise TypeError(
+                f"frames must be {self.to_spectra.dtype} as the module, got {frames.dtype}; pass frames.float()"
+            )
         batch = frames[None, :, None] if frames.ndim == 3 else frames[None] if frames.ndim == 4 else frames
         if batch.ndim != 5 or (batch.shape[1], *batch.shape[-2:]) != self.shape:
             raise ValueError(

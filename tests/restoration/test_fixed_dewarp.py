@@ -85,3 +85,5 @@ def test_frames_of_another_size_are_refused():
     dewarp = rsv.FixedDewarp(timing, VIBRATION, (72, 90), num_frames=2)
     with pytest.raises(ValueError, match=r"frames must be stacks of .* = \(2, 72, 90\)"):
         dewarp(frames[:1])
+    with pytest.raises(TypeError, match=r"frames must be torch\.float32"):
+        dewarp(frames.double())

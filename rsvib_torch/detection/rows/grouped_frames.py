@@ -54,11 +54,16 @@ class MeasuredRows:
     gradients: list[RowGradients]
     apart: Array | None = None
 
+    @property
+    def num_stacks(self) -> int:
+        """Number B of stacks."""
+        return len(self.measurements.visible)
+
     def stacks(self, stacks: Array) -> "MeasuredRows":
         """The measurements of some stacks."""
-        count, gradients = len(self.measurements.visible), []
+        gradients = []
         for part in self.gradients:
-            of_groups = np.arange(len(part.variance)).reshape(count, -1)[stacks].ravel()
+            of_groups = np.arange(len(part.variance)).reshape(self.num_stacks, -1)[stacks].ravel()
             gradients.append(part.stacks(tensor(of_groups).to(part.variance.device)))
         return MeasuredRows(
             take_stacks([self.measurements], stacks),
@@ -69,19 +74,18 @@ class MeasuredRows:
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
         if self.apart is None:
-            return differential_motion(self.gradients, len(self.measurements.visible))
+            return differential_motion(self.gradients, self.num_stacks)
         return np.sqrt(np.maximum(trimmed_mean(self.apart), 0.0))
 
     def uneven(self) -> Array:
         """(B, 2) px, the part of the differences along a row that roll and zoom cannot explain."""
         if self.apart is None:
-            return uneven_motion(self.gradients, len(self.measurements.visible))
+            return uneven_motion(self.gradients, self.num_stacks)
         return self.differential()
 
     def aliasing(self) -> Array:
         """(B,) px, expected size of the bias by aliasing, see ``RowGradients``."""
-        stacks = len(self.measurements.visible)
-        parts = [gradients.aliasing.unflatten(0, (stacks, -1)) for gradients in self.gradients]
+        parts = [gradients.aliasing.unflatten(0, (self.num_stacks, -1)) for gradients in self.gradients]
         return table(torch.cat(parts, 1).mean(1))
 
 

@@ -260,8 +260,7 @@ class _Problem:
 
     def covariance(self, state: _Estimate, deviation: Array) -> Array:
         """Covariance (B, 2 P, 2 P) for errors of a row of the covariance ``S W^-1 S``, S the deviations (B, 2)."""
-        matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
-        inverse = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
+        inverse = self.inverse(state)
         # W = R^T R, and the whitened errors R e have the covariance T T^T with T = R S R^-1; T^T R = R^-T S W
         diagonal = self.root.diagonal(axis1=-2, axis2=-1)
         safe = self.root + (diagonal == 0)[..., None] * np.eye(self.axes)
@@ -272,6 +271,12 @@ class _Problem:
         covariance = columns.mT @ columns
         return covariance if self.to_all is None else self.to_all @ covariance @ self.to_all.T
 
+    def inverse(self, state: _Estimate) -> Array:
+        """Inverse (B, M, M) of the normal matrix of the free parameters; 0 for the others."""
+        matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
+        inverse: Array = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
+        return inverse
+
     def covariance_of_blocks(self, state: _Estimate) -> Array:
         """Covariance (B, A P, A P) from the scatter of the residuals between blocks of the scene.
 
@@ -279,12 +284,8 @@ class _Problem:
         sums ``u_n`` of its whitened derivatives times residuals over all frames, it is ``H^-1 sum u_n u_n^T H^-1``
         (Liang and Zeger, Biometrika 73, 13, 1986).
         """
-        matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
-        inverse = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
-        columns = self._whitened(self.root, state.jacobian)
-        if self.to_all is not None:
-            columns = columns @ self.to_all
-        whitened = (self.root @ state.residual[..., None]).reshape(*columns.shape[:2], 1)
+        inverse = self.inverse(state)
+        columns, whitened = self.in_std(state.jacobian, state.residual)
         groups = self.measurements.groups
         count = state.residual.shape[1] // groups
         sums = (columns * whitened).reshape(len(columns), groups, count, -1, columns.shape[-1]).sum((1, 3))
@@ -303,15 +304,18 @@ class _Problem:
         factors = np.repeat(root, jacobian.shape[-1], -1)  # long inner loops are twice as fast
         return (factors * jacobian.reshape(*jacobian.shape[:-2], 1, -1)).reshape(len(jacobian), -1, factors.shape[-1])
 
+    def in_std(self, jacobian: Array, residual: Array) -> tuple[Array, Array]:
+        """Derivatives (B, N G A, M) by the free parameters and residual (B, N G A, 1), in standard deviations."""
+        columns = self._whitened(self.root, jacobian)
+        whitened = (self.root @ residual[..., None]).reshape(*columns.shape[:2], 1)
+        return columns if self.to_all is None else columns @ self.to_all, whitened
+
     def evaluate(self, values: Array) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
         jacobian = self.jacobian(values)
         linear = np.where(self.is_frequency, 0.0, values)[:, None, None]
         residual = self.measurements.displacements - (jacobian * linear).sum(-1)
-        whitened = (self.root @ residual[..., None]).reshape(len(residual), -1, 1)
-        columns = self._whitened(self.root, jacobian)
-        if self.to_all is not None:
-            columns = columns @ self.to_all
+        columns, whitened = self.in_std(jacobian, residual)
         right = (columns.mT @ whitened)[..., 0]
         return _Estimate(values, jacobian, residual, np.square(whitened).sum((1, 2)), columns.mT @ columns, right)
 
