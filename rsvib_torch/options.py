@@ -54,6 +54,7 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 
 Columns = Annotated[int, Field(ge=64, le=2**31)]  # px; narrower bands are often registered wrongly
 Frames = Annotated[int, Field(ge=2, le=2**31)]
+Side = Annotated[float, Field(gt=0.0, le=0.4)]  # parts of a frame; more leaves less than a fifth of it
 COMMAND_LINE: Any = {"command_line": True}  # mark of fields that are options of commands as well
 MAX_TONES = 4  # tones of one axis; a record of a few frames does not resolve more
 MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its 120th harmonic
@@ -452,8 +453,8 @@ class NoiseGainOptions(RestorationOptions, InputOptions):
 
 
 @options
-class FollowingOptions:
-    """How a vibration is followed from frame to frame."""
+class TrackerOptions(RestorationOptions, InputOptions):
+    """Options of ``VibrationTracker``."""
 
     window: Frames = Field(
         default=8,
@@ -462,12 +463,6 @@ class FollowingOptions:
     columns: Columns | None = Field(
         default=384, description="Columns that are measured, those with the most detail; None for all."
     )
-
-
-@options
-class TrackerOptions(FollowingOptions, RestorationOptions, InputOptions):
-    """Options of ``VibrationTracker``."""
-
     method: RestorationName = Field(default="dewarp", description='Method of ``restore``; ``"dewarp"`` is the fastest.')
     steady: NotNegative = Field(
         default=0.0,
@@ -583,20 +578,24 @@ class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
 
 
 @options
-class ProcessVideoOptions(RunOptions, FollowingOptions, ResourceOptions):
-    """Options of ``process_video``; both passes of ``border="crop"`` count as half of the progress."""
+class ProcessVideoOptions(RunOptions, ResourceOptions):
+    """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
     border: BorderName = Field(
         default="mirror",
         description='Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself; '
-        '``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins, for which the video is read '
-        "twice.",
+        '``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins.',
     )
     steady: NotNegative = Field(
         default=0.0,
-        description="s; every frame is moved to the mean of its path in the interval of this length around it: "
-        "vibration, rolling-shutter wobble and shaking are removed, slow motion is kept. 0: frames stay where they "
-        "are.",
+        description="s; every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose "
+        "period is this time or shorter is removed, slower motion is kept. 0: frames stay where they are, and only "
+        "vibration is removed.",
+    )
+    crop_limit: Side = Field(
+        default=0.1,
+        description="Largest displacement of a corner of a frame by ``steady``, in parts of the width or height; where "
+        "the path would need more, it is smoothed less.",
     )
     restoration: OptionTable = Field(
         default=None,

@@ -55,7 +55,6 @@ from rsvib_torch.commands.written_results import (
 )
 from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable, whole_folder
-from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import number_of, printable
 from rsvib_torch.options import BorderName, WindowOptions
@@ -415,7 +414,7 @@ def run(
         BorderName | None,
         typer.Option(
             help="With --video, pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame "
-            "before; crop, cut off by constant margins (the video is read twice).",
+            "before; crop, cut off by constant margins.",
             show_default="mirror",
         ),
     ] = None,
@@ -423,8 +422,14 @@ def run(
         float | None,
         typer.Option(
             metavar="SECONDS",
-            help="With --video, stabilise the image to the moving average of its path over this time.",
+            help="With --video, move the image to a smooth path: shaking of this period or shorter is removed.",
             show_default="the image stays where it is",
+        ),
+    ] = None,
+    crop_limit: Annotated[
+        float | None,
+        typer.Option(
+            help="With --steady, the largest shift of a corner, in parts of the width or height.", show_default="0.1"
         ),
     ] = None,
     compression: Annotated[str | None, typer.Option(help="Compression of a TIFF stack: zlib or lzma.")] = None,
@@ -452,10 +457,10 @@ def run(
     With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop makes a shaky video
     steady.
     """
-    if not video and (border is not None or steady is not None):
-        raise ValueError(f"{'--border' if border is not None else '--steady'} goes with --video")
-    if steady is not None:
-        check_number("steady", steady, at_least=0.0)
+    moved = {"border": border, "steady": steady, "crop_limit": crop_limit}
+    moved = {name: value for name, value in moved.items() if value is not None}
+    if moved and not video:
+        raise ValueError(f"--{next(iter(moved)).replace('_', '-')} goes with --video")
     output = _video_name(frames, output) if video else output
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
@@ -465,8 +470,7 @@ def run(
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **windows})
     frames_at_once = chosen.window
-    requested = border is not None or steady is not None
-    if video and is_followed(frames, info.shape[0], frames_at_once, requested=requested):
+    if video and is_followed(frames, info.shape[0], frames_at_once, requested=bool(moved)):
         windows_only = {"--window": windows.get("window"), "--bad-frames skip": windows.get("bad_frames") == "skip"}
         check_followed(windows_only | {"--scheduler": scheduler, "--compression": compression}, options)
         if {**settings.restoration, **restoration}.get("saturation") is None:
@@ -477,8 +481,7 @@ def run(
             output,
             settings,
             options,
-            border=border or "mirror",
-            steady=steady or 0.0,
+            **moved,
             full_scale=scale,
             resume=resume,
             memory=memory,

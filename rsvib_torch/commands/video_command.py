@@ -62,11 +62,6 @@ def run_followed(
     drawn = draw_safely(out / "before_after.png", lambda: _followed_figure(frames, out / output, stored))
     with whole_folder(out) as folder:
         names = [output, *drawn, "manifest.json", *write_windows(folder, out / "manifest.json")]
-    unknown = [record for record in stored.windows if record.error is not None]
-    if unknown:
-        first = unknown[0]
-        text = f"frames {first.first} to {first.last}: {first.error}, and they are written as taken"
-        error_line(f"{text}; see manifest.json", "warning")
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
@@ -77,9 +72,13 @@ def run_followed(
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
         error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
     vibration, lines = stored.lines()
+    for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
+        if stored.shaking is not None:
+            before, after = stored.shaking[name]
+            lines.append(f"shaking {where}: {before:.2g} px rms, {after:.2g} px afterwards")
     return Answer(
         {f"Vibration in {frames.name}": vibration, "Restoration": [result.summary(), *lines[1:]]},
-        {"windows": stored.totals()},
+        {"windows": stored.totals(), "shaking": stored.shaking},
         [out / name for name in names],
         [page_step(frames, out / "report", settings, "--manifest", out / "manifest.json")],
     )

@@ -67,6 +67,8 @@ class StackManifest(Result, file_format="rsvib stack"):
         bad_frames: Index of each frame that could not be used, with the reason.
         not_kept: Metadata of the input that the output does not contain.
         margins: px that were cut off the sides of the frames of a video.
+        shaking: Rms motion in px of a video before and after, in some frames of each part: ``frame_to_frame``, changes
+            of the motion of the frame, and ``rows``, of twelfths of the rows beside it.
         windows: Result of every window.
     """
 
@@ -78,6 +80,7 @@ class StackManifest(Result, file_format="rsvib stack"):
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()
     margins: dict[str, int] | None = None
+    shaking: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

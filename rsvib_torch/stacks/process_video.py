@@ -1,10 +1,8 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
-import math
-import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -16,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.validation import fields_of
 from rsvib_torch.frames.entry_points import file_options
@@ -35,12 +32,13 @@ from rsvib_torch.stacks.job import StackJob, plan_job
 from rsvib_torch.stacks.manifest import manifest_header
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
-from rsvib_torch.stacks.video_frames import FrameLayout, RestoredFrame, VideoRestorer
-from rsvib_torch.stacks.video_passes import PART_FRAMES, VideoPasses
-from rsvib_torch.stacks.video_tracks import FrameTrack
+from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, RestoredFrame, VideoRestorer
+from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, Shaking, VideoMotion, VideoPasses
 from rsvib_torch.tracking import Margins
 
-_MAX_INITIAL_FAILURES = 8  # parts; a run stops if the motion is known in none of them
+# A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible. Rows are
+# measured less well, because objects at other distances move beside them.
+_MORE_SHAKING, _VISIBLE_SHAKING = {"frame_to_frame": 1.1, "rows": 1.5}, 0.1  # -, px
 
 Frame = NDArray[Any]
 Planes = list[Frame]
@@ -50,22 +48,24 @@ Planes = list[Frame]
 def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessVideoOptions) -> StackReport:
     """Restore a video of any length from file to file, and steady it.
 
-    The vibration is followed from frame to frame (``VibrationTracker``) instead of detected in windows: neighbouring
-    frames are restored alike, nothing changes at the borders of windows, and detection takes little time. Frames of
-    4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
-    ``"dewarp"``. Decoding, tracking, restoration and encoding run in threads.
+    The video is read twice. The first pass follows corners from frame to frame and fits, in overlapping windows of 96
+    frames, the path of the camera (x, y, roll, zoom) and the tones of its vibration, each corner at the time of its
+    row: hands, pans, parallax and moving objects do not disturb them. The second pass restores the frames: tones, and
+    with ``steady`` also the skew and wobble by the path, are undone, and the frames are moved to a smooth path. Frames
+    of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
+    ``"dewarp"``. Decoding, restoration and encoding run in threads.
 
-    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. Frames whose motion is
-    not known are written as taken; the manifest counts them. The video is encoded in parts of 32 frames in the folder
-    ``.NAME.rsvib`` beside it, from which an interrupted run is resumed.
+    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
+    parts of 32 frames in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
+    the first frames of each part is compared with that of the input: a video that shakes more is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
         sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv, .avi (FFV1, without loss). Times, sound and metadata
             are those of the source.
         timing: As in ``process_stack``.
-        options: Options. A part of the video is a window in the manifest; its detection is that of the last frame, at
-            ``start_time``.
+        options: Options. A part of the video is a window in the manifest; its detection is that of its middle, with the
+            time origin ``start_time``.
 
     Returns:
         Summary of the run.
@@ -76,13 +76,14 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         OSError: If a file cannot be read or written; the run can then be resumed.
         TypeError: If an option is unknown.
         ValueError: If a value is out of range, the source is not readable, margins leave nothing, an output would
-            replace the input, or input, settings or versions differ from those of the run to resume.
+            replace the input, input, settings or versions differ from those of the run to resume, frames have no motion
+            in common, or the result shakes more than the source.
 
     Example:
         >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
     """
     begin, source, sink = time.perf_counter(), Path(source), Path(sink)
-    border, steady = options.border, options.steady
+    border = options.border
     video, at_once = _planned(source, timing, options)
     job = video.job
     if sink.suffix.lower() not in CONTAINERS:
@@ -95,23 +96,23 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     header = manifest_header(job, sink.name, None)
     header["settings"] |= {
         "window": None,  # for the commands that read manifests: parts are not windows of their own
-        "video": {"border": border, "steady": steady, "columns": options.columns, "window": options.window},
+        "video": {"border": border, "steady": options.steady, "crop_limit": options.crop_limit},
     }
-    waiting = math.ceil(0.5 * steady / timing.frame_period) * 2 * content.frame_bytes
-    check_fits(f"{source}: the frames of half of steady={steady:g} s", waiting, "choose a shorter time")
 
     def compute(folder: RunFolder) -> dict[str, Any]:
         nonlocal content
-        shown = _Progress(options.progress, len(video.starts), 2 if border == "crop" else 1)
-        with tempfile.TemporaryFile() as tracks, closing(open_stack(source)) as reader:
-            margins = video.margins(tracks, shown) if border == "crop" else None
-            content = _cut_content(content, margins)
-            check_info_target(sink, content, check_folder=False)
+        shown, shaking = _Progress(options.progress, len(video.starts)), Shaking()
+        motion = video.motion(shown)
+        margins = video.margins(motion) if border == "crop" else None
+        content = _cut_content(content, margins)
+        check_info_target(sink, content, check_folder=False)
+        with closing(open_stack(source)) as reader:
             planes = planes_of(reader) if video.layout.planar else None
             with closing(_Encoder(folder, sink, content, planes)) as encoder:
-                followed_frames = video.tracked(None if margins is None else tracks)
-                _restore_parts(video, followed_frames, folder, encoder, border, margins, at_once, shown)
-        return {"margins": None if margins is None else asdict(margins)}
+                _restore_parts(video, motion, folder, encoder, border, margins, at_once, shown, shaking)
+        measured = shaking.result()
+        _check_shaking(measured, folder)
+        return {"margins": None if margins is None else asdict(margins), "shaking": measured}
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
@@ -178,21 +179,24 @@ def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
     return replace(content, shape=(*content.shape[:-2], *kept))
 
 
-def _check_known(known: list[bool], parts: int, folder: RunFolder) -> None:
-    """Raise a ``ValueError`` if the motion is known in none of the parts so far."""
-    if len(known) >= min(_MAX_INITIAL_FAILURES, parts) and not any(known):
-        folder.remove()
-        raise ValueError(
-            "no vibration was found that the rows of the frames have in common; detect it in windows, which states the "
-            "reasons (process_stack; rsvib run with --output restored.mp4 instead of --video)"
-        )
+def _check_shaking(measured: Mapping[str, Sequence[float]] | None, folder: RunFolder) -> None:
+    """Raise a ``ValueError`` if the restored frames shake more than those of the input; nothing is kept."""
+    names = {"frame_to_frame": "from frame to frame", "rows": "between the rows"}
+    for key, (before, after) in (measured or {}).items():
+        if after > _MORE_SHAKING[key] * before + _VISIBLE_SHAKING:
+            folder.remove()
+            raise ValueError(
+                f"the restored video would shake more than the input: {after:.2g} px {names[key]}, {before:.2g} px "
+                "before. Check the timing (row_time, readout_direction, scan_axis), or whether the camera has "
+                "stabilised the frames already"
+            )
 
 
 class _Progress:
-    """Progress over the passes through a video, each of which counts alike."""
+    """Progress over both passes through a video, which count as half of it each."""
 
-    def __init__(self, show: Progress, count: int, passes: int) -> None:
-        self._show, self._count, self._passes, self._done = show, count, passes, 0
+    def __init__(self, show: Progress, count: int) -> None:
+        self._show, self._count, self._done = show, count, 0
         if show is not None:
             show(0, count)
 
@@ -200,7 +204,7 @@ class _Progress:
         """Count one frame of a pass."""
         self._done += 1
         if self._show is not None:
-            self._show(self._done // self._passes, self._count)
+            self._show(self._done // 2, self._count)
 
 
 def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -> tuple[VideoPasses, int]:
@@ -226,7 +230,7 @@ def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -
     restorer = VideoRestorer(layout, job.timing, method, job.device, masks=options.border != "mirror")
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
-    return VideoPasses(job, layout, restorer, starts, options.steady, options.columns, options.window), at_once
+    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit), at_once
 
 
 def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
@@ -241,13 +245,14 @@ def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
 
 def _restore_parts(
     video: VideoPasses,
-    followed_frames: Generator[tuple[FrameTrack, Frame | str], None, None],
+    motion: VideoMotion,
     folder: RunFolder,
     encoder: _Encoder,
     border: str,
     margins: Margins | None,
     at_once: int,
     progress: Callable[[], None],
+    shaking: Shaking,
 ) -> None:
     """Restore and encode all parts that are not in the folder."""
     share_one_heap()
@@ -255,16 +260,17 @@ def _restore_parts(
     threads = 1 if video.job.device == "cpu" else default_threads
     pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
     tracks: list[FrameTrack] = []  # of the part
-    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames of known motion
-    known = [record["detection"] is not None for record in folder.records()]
+    written: list[Frame] = []  # its first frames
+    pair: list[tuple[FrameTrack, Frame]] = []  # its first two neighbouring frames without fault
     before: Planes | None = None
     done = -1
+    decoded = video.decoded()
 
     def missing() -> Iterator[tuple[FrameTrack, Frame | str]]:
         """Frames of the parts that are not in the folder."""
-        for track, frame in followed_frames:
-            if track.index // PART_FRAMES not in folder:
-                yield track, frame
+        for index, frame in enumerate(decoded):
+            if index // PART_FRAMES not in folder:
+                yield video.track(motion, index), frame
             else:
                 progress()
 
@@ -273,26 +279,28 @@ def _restore_parts(
 
     frames = results_in_order(missing(), lambda item: pool.submit(restore, *item), lambda: at_once + 2, deque())
     try:
-        with closing(followed_frames), closing(frames):
+        with closing(decoded), closing(frames):
             for track, frame, restored in frames:
                 part = track.index // PART_FRAMES
                 if track.index != done + 1 or before is None:
                     ended = encoder.last_frame(part - 1)
                     before = None if ended is None else video.layout.planes(ended)
                 before, done = _without_gaps(restored, before, video.layout, border), track.index
+                final = video.layout.frame(_cut(before, margins))
                 with disk_errors_named(folder):
-                    encoder.write(part, video.layout.frame(_cut(before, margins)))
+                    encoder.write(part, final)
+                if len(tracks) < CHECKED_FRAMES:
+                    written.append(final)
                 tracks.append(track)
-                if len(pair) < 2 and track.known and not isinstance(frame, str):
+                if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
                     pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
                 if video.ends_part(done):
                     verdict = video.verdict(pair) if len(pair) == 2 else None
-                    record = video.record(part, tracks, verdict)
-                    known.append(any(track.known for track in tracks))
-                    _check_known(known, video.parts, folder)
+                    video.add_shaking(shaking, motion, tracks[0].index, written)
+                    record = video.record(part, tracks, motion, verdict)
                     with disk_errors_named(folder):
                         encoder.finish_part(record, video.layout.frame(before))
-                    tracks, pair = [], []
+                    tracks, pair, written = [], [], []
                 progress()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -315,5 +323,7 @@ def _cut(planes: Planes, margins: Margins | None) -> Planes:
     if margins is None:
         return planes
     first, *others = planes
-    sides = (margins.top, margins.bottom, margins.left, margins.right)
-    return [margins.cut(first), *(Margins(*(side // 2 for side in sides)).cut(plane) for plane in others)]
+    luma = margins.cut(first)
+    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``FrameLayout.margins``
+    top, left = margins.top // 2, margins.left // 2
+    return [luma, *(plane[..., top : top + rows, left : left + columns] for plane in others)]

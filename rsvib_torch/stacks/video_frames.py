@@ -1,8 +1,13 @@
-"""Restoration of one frame of a video: its planes, the pixels that the sensor did not record, and margins."""
+"""Restoration of one frame of a video: its planes, the pixels that the sensor did not record, and margins.
+
+Invariant: the displacement depends on the row only (docs/architecture.md); with roll and zoom also linearly on the
+column.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,12 +18,23 @@ from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
-from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import METHODS, restore_prepared
-from rsvib_torch.stacks.video_tracks import FrameTrack
 from rsvib_torch.tracking import Margins
 
+_MAP_COLUMNS = 9  # at which the displacement is computed with roll and zoom; the error is below 0.001 px
+_MAP_ROUNDS = 4  # of the row that a pixel was recorded in; rows move by less than a tenth of a pixel in a row time
+
 Frame = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTrack:
+    """What is removed from a frame of a video."""
+
+    index: int  # number of the frame
+    time: float  # s, exposure start of its first row, from the first frame
+    motion: Vibration  # the motion to remove, in image axes; its time origin is the middle of the frame
+    fault: str | None = None  # why the frame could not be used; None if it was used
 
 
 @dataclass(frozen=True)
@@ -39,6 +55,16 @@ class FrameLayout:
     def luma(self, frame: Frame) -> Frame:
         """The part of a frame in which motion is measured."""
         return frame[: self.size[0]] if self.planar else frame
+
+    def grey(self, frame: Frame) -> NDArray[np.uint8]:
+        """The frame as 8-bit counts (H, W), in which corners are followed."""
+        luma: NDArray[Any] = self.luma(frame)
+        luma = luma if luma.ndim == 2 else luma.mean(0)
+        if luma.dtype == np.uint8:
+            return luma.astype(np.uint8, copy=False)
+        low, high = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
+        counts: NDArray[np.float64] = (np.nan_to_num(luma, nan=low) - low) * (255.0 / max(high - low, 1e-30))
+        return counts.round().clip(0, 255).astype(np.uint8)
 
     def planes(self, frame: Frame) -> list[Frame]:
         """Planes (..., H, W): all pixels, or Y (H, W) and the chroma (2, H / 2, W / 2)."""
@@ -87,8 +113,9 @@ class VideoRestorer:
     Args:
         layout: Layout of the frames.
         timing: The sensor.
-        options: Method of ``restore`` and its options; chroma of half the resolution is only dewarped, because its blur
-            is half as wide.
+        options: Method of ``restore`` and its options. ``"dewarp"`` interpolates once, in the frame as stored. Of other
+            methods, the vibration is undone first, and then the frame is moved; chroma of half the resolution is only
+            dewarped, because its blur is half as wide.
         device: Device for the computation.
         masks: Whether ``RestoredFrame.visible`` is needed.
     """
@@ -104,19 +131,25 @@ class VideoRestorer:
         if isinstance(frame, str):
             return RestoredFrame(None, None, frame)
         planes = self.layout.planes(frame)
-        if track.fault is not None or not track.known:
+        if track.fault is not None or not bool(track.motion.moving_axes().any()):
             return RestoredFrame(planes, None, track.fault)
-        motions = [(self.timing_of(0), track.motion), (self.timing_of(1), track.motion.scaled(0.5))]
-        results = [self._plane(plane, number, *motions[number]) for number, plane in enumerate(planes)]
-        return RestoredFrame(results, self.visible(track) if self.masks else None)
-
-    def visible(self, track: FrameTrack, *, luma_only: bool = False) -> list[NDArray[np.bool_]]:
-        """For each plane, the pixels of the restored frame that the sensor recorded."""
-        height, width = self.layout.size
-        parts = [(self.timing_of(0), track.motion, (height, width))]
-        if self.layout.planar and not luma_only:
-            parts.append((self.timing_of(1), track.motion.scaled(0.5), (height // 2, width // 2)))
-        return [visible_pixels(timing, motion, size, 1)[0][0].numpy() for timing, motion, size in parts]
+        results: list[Frame] = []
+        visible: list[NDArray[np.bool_]] = []
+        for number, plane in enumerate(planes):
+            motion, timing = (track.motion if number == 0 else _on_half_pixels(track.motion)), self.timing_of(number)
+            if number == 0 and self.options.method != "dewarp" and bool((motion.amplitude > 0).any()):
+                # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
+                rowwise = motion.translation()
+                plane = self._without_vibration(plane, timing, replace(rowwise, image_shift=torch.zeros(2)))  # noqa: PLW2901
+                rest = {name: getattr(motion, name).clone() for name in ("image_motion", "image_acceleration")}
+                for values in rest.values():
+                    values[:2] = 0.0
+                motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
+            source = source_map(motion, timing, plane.shape[-2:])
+            results.append(moved_back(plane, source))
+            limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
+            visible.append(np.all((source >= 0) & (source <= limits), axis=0))
+        return RestoredFrame(results, visible if self.masks else None)
 
     def timing_of(self, plane: int) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
@@ -132,15 +165,65 @@ class VideoRestorer:
             frame_start_times=(0.5 * timing.row_time - half,),
         )
 
-    def _plane(self, plane: Frame, number: int, timing: SensorTiming, motion: Vibration) -> Frame:
-        if number == 1 and plane.min() == plane.max():  # no colours
-            return plane
-        options = self.options if number == 0 else RestorationOptions(method="dewarp")
-        level = self.layout.white if number == 0 and "clipped" in METHODS[options.method].masks else None
+    def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
         scale = self.layout.full_scale
+        level = self.layout.white if "clipped" in METHODS[self.options.method].masks else None
         images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.device)
         saturation = None if level is None else level / (scale or 1.0)
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
-            restored = restore_prepared(prepared, motion, options)
+            restored = restore_prepared(prepared, motion, self.options)
         return frames_to_counts(prepared.from_row_order(restored)[0], self.layout.dtype, scale)
+
+
+def source_map(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -> NDArray[np.float32]:
+    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded.
+
+    A pixel at rest at p was recorded at ``q = p + D(p, t(q))`` with the mean displacement D during the exposure of the
+    row of q. D is computed for every row and some columns, between which it is linear.
+    """
+    height, width = size
+    along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)  # axes (x, y) along which rows follow, and along rows
+    count, length = (height, width) if along == 1 else (width, height)
+    parts = _MAP_COLUMNS if motion.num_axes > 2 else 1
+    grid = np.empty((2, count, parts))  # in row order
+    grid[along] = np.arange(count)[:, None]
+    grid[across] = np.linspace(0.0, length - 1.0, parts) if parts > 1 else 0.0
+    centre = 0.5 * (np.array([width, height]) - 1)
+    x, y = (torch.from_numpy(grid[axis] - centre[axis]) for axis in (0, 1))
+    start, places = float(timing.frame_starts(1)[0]), grid
+    for _ in range(_MAP_ROUNDS):
+        rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
+        starts = torch.from_numpy(start + rows * timing.row_time)
+        moved = motion.mean_displacement(starts, timing.exposure_time)
+        offset = moved[..., :2]
+        if parts > 1:
+            turned, zoomed = moved[..., 2], moved[..., 3]
+            offset = offset + torch.stack([zoomed * x - turned * y, turned * x + zoomed * y], -1)
+        places = grid + np.moveaxis(offset.numpy(), -1, 0)
+    offsets = (places - grid).astype(np.float32)
+    if parts > 1:  # to all columns
+        place = np.arange(length) * ((parts - 1) / max(length - 1, 1))
+        hats = np.maximum(1.0 - np.abs(place - np.arange(parts)[:, None]), 0.0).astype(np.float32)
+        offsets = offsets @ hats
+    result = np.empty((2, count, length), dtype=np.float32)
+    result[along] = np.arange(count, dtype=np.float32)[:, None] + offsets[along]
+    result[across] = np.arange(length, dtype=np.float32) + offsets[across]
+    return result if along == 1 else result.transpose(0, 2, 1)
+
+
+def moved_back(plane: Frame, source: NDArray[np.float32]) -> Frame:
+    """Pixels (..., H, W) interpolated at places (2, H, W); beyond the border, the plane is mirrored."""
+    stored = plane if plane.dtype in (np.uint8, np.uint16, np.float32) else plane.astype(np.float32)
+    x, y = np.ascontiguousarray(source[0]), np.ascontiguousarray(source[1])
+    flat = stored.reshape(-1, *stored.shape[-2:])
+    moved = np.stack([cv2.remap(one, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT) for one in flat])
+    if stored.dtype != plane.dtype and plane.dtype.kind in "iu":
+        limits = np.iinfo(plane.dtype)
+        moved = np.clip(np.rint(moved), limits.min, limits.max)
+    return moved.reshape(plane.shape).astype(plane.dtype)
+
+
+def _on_half_pixels(motion: Vibration) -> Vibration:
+    """The motion in pixels of chroma, which are twice as large; roll and zoom are the same."""
+    return motion.scaled(torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64))

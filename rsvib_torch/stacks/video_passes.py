@@ -1,10 +1,10 @@
-"""Passes through a video: decoding, tracking and steadying of its frames, verdict and record of its parts."""
+"""Passes through a video: the motion of all frames, where they are moved to, verdict and record of the parts."""
 
-import pickle
-from collections.abc import Callable, Generator
+import math
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
-from typing import Any, BinaryIO
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.prefetch import prefetched
 from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.text import number_of
-from rsvib_torch.detection import DetectionResult
+from rsvib_torch.core.tables import Array
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames
@@ -22,33 +21,73 @@ from rsvib_torch.io.stack_info import FrameError
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.stacks.video_frames import FrameLayout, VideoRestorer
-from rsvib_torch.stacks.video_tracks import FrameTrack, followed
-from rsvib_torch.tracking import Margins, VibrationTracker
-from rsvib_torch.tracking.steadying import steadied
+from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer, source_map
+from rsvib_torch.tracking import Margins
+from rsvib_torch.tracking.camera_path import CameraPath, CornerFollower, Corners, Tone, camera_path, shake
+from rsvib_torch.tracking.steadying import steady_places
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
+CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
 _JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
-_AHEAD = 4  # frames decoded, and frames tracked, before they are used
+_AHEAD = 4  # frames decoded before they are used
+_SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
 
 Frame = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
+class VideoMotion:
+    """The motion of all frames of a video."""
+
+    path: CameraPath  # of the camera
+    times: Array  # (N,) s, middle of every frame
+    places: Array  # (N, 4) path
+    steady: Array  # (N, 4) where the frames are moved to
+    velocity: Array  # (N, 4) per s
+    acceleration: Array  # (N, 4) per s^2
+    faults: dict[int, str]  # number of each frame that could not be used, with the reason
+    shakes: dict[int, tuple[Array, float]]  # ``shake`` between the frame of this number and the next one
+
+
+@dataclass(eq=False)
+class Shaking:
+    """The shaking of frames before and after restoration, from ``shake`` of neighbouring frames in a row."""
+
+    changes: list[Array] = field(default_factory=list)  # (2, n, 2) px, changes of the motion, before and after
+    rows: list[Array] = field(default_factory=list)  # (2, n) px, of rows beside the motion
+
+    def add(self, before: list[tuple[Array, float]], after: list[tuple[Array, float]]) -> None:
+        """Add neighbouring frames in a row."""
+        self.changes.append(np.diff([[motion for motion, _ in row] for row in (before, after)], axis=1))
+        self.rows.append(np.array([[rows for _, rows in row] for row in (before, after)]))
+
+    def result(self) -> dict[str, tuple[float, float]] | None:
+        """Rms change of the motion from frame to frame, and of rows beside it, in px, before and after."""
+        if not self.changes:
+            return None
+        changes = np.concatenate(self.changes, 1)
+        rows = np.concatenate(self.rows, 1)
+        return {
+            "frame_to_frame": tuple(np.sqrt(np.square(changes).sum(-1).mean(-1)).tolist()),
+            "rows": tuple(np.sqrt(np.square(rows).mean(-1)).tolist()),
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class VideoPasses:
-    """What the passes through a video have in common: how frames are read, tracked, steadied, judged and recorded."""
+    """What the passes through a video have in common: how frames are read, moved, judged and recorded."""
 
     job: StackJob  # source and settings
     layout: FrameLayout  # layout of the frames
     restorer: VideoRestorer  # restores them
     starts: list[float]  # s, exposure start of every frame, from the first one
     steady: float  # as in ``process_video``
-    columns: int | None  # as in ``process_video``
-    window: int  # as in ``process_video``
+    crop_limit: float  # as in ``process_video``
 
     @property
     def parts(self) -> int:
@@ -59,65 +98,110 @@ class VideoPasses:
         """Whether a frame is the last one of a part."""
         return index % PART_FRAMES == PART_FRAMES - 1 or index == len(self.starts) - 1
 
-    def _decoded(self) -> Generator[tuple[int, float, Frame | str, Frame | str], None, None]:
-        """Number and start of every frame, its luma, and the frame itself, or why it cannot be read."""
+    def decoded(self) -> Generator[Frame | str, None, None]:
+        """Every frame, or why it cannot be read; decoded ahead in a thread."""
+        return prefetched(self._decoded(), _AHEAD)
+
+    def _decoded(self) -> Generator[Frame | str, None, None]:
         reader = open_stack(self.job.source)
         try:
             if reader.info != self.job.info:
                 raise ValueError(f"{self.job.source} has changed since it was first opened; start again")
             source: Any = planes_of(reader) or reader if self.layout.planar else reader
-            for index, start in enumerate(self.starts):
+            for index in range(len(self.starts)):
                 try:
-                    frame = source.frame(index)
+                    yield source.frame(index)
                 except FrameError as error:
-                    reason = " ".join(str(error).split())
-                    yield index, start, reason, reason
-                    continue
-                yield index, start, self.layout.luma(frame), frame
+                    yield " ".join(str(error).split())
         finally:
             reader.close()
 
-    def tracked(self, found: BinaryIO | None = None) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-        """Every frame with its motion, at its place in the steady video; decoded and tracked ahead in threads.
+    # First pass: the motion
 
-        Args:
-            found: The tracks that ``margins`` has written, if the motion was followed before.
-        """
-        if found is not None:
-            return prefetched(self._with_tracks(found), _AHEAD)
-        tracker = VibrationTracker(
-            replace(self.job.timing, frame_start_times=None),
-            window=self.window,
-            columns=self.columns,
-            wobble=self.steady > 0,
-            full_scale=self.layout.full_scale,
-            channels="first",
+    def motion(self, progress: Callable[[], None]) -> VideoMotion:
+        """The motion of all frames, from corners that are followed from each usable frame to the next one."""
+        faults: dict[int, str] = {}
+        shakes: dict[int, tuple[Array, float]] = {}
+
+        def pairs() -> Iterator[Corners | None]:
+            before: tuple[int, NDArray[np.uint8]] | None = None
+            follower = CornerFollower(self.job.timing)
+            with closing(self.decoded()) as frames:
+                for index, frame in enumerate(frames):
+                    progress()
+                    if isinstance(frame, str):
+                        faults[index] = frame
+                        continue
+                    grey = self.layout.grey(frame)
+                    if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
+                        faults[index] = f"frame {index} is constant, or a copy of the frame before"
+                        continue
+                    corners = follower.next(grey, self.starts[index])
+                    if before is not None:
+                        if corners is not None and before[0] == index - 1:
+                            shakes[index - 1] = shake(corners)
+                        yield corners
+                    before = index, grey
+
+        timing = self.job.timing
+        rows = self.layout.size[0 if timing.scan_axis == -2 else 1]
+        path = camera_path(pairs(), timing, self.layout.size)
+        times = np.array(self.starts) + 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        places = path.places(times)
+        return VideoMotion(
+            path,
+            times,
+            places,
+            steady_places(times, places, self.steady, self.layout.size, self.crop_limit),
+            path.derivatives(times, 1),
+            path.derivatives(times, 2),
+            faults,
+            shakes,
         )
 
-        def steady_frames() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-            with closing(prefetched(self._decoded(), _AHEAD)) as decoded:
-                yield from steadied(followed(decoded, tracker, self.ends_part), self.steady)
+    def track(self, motion: VideoMotion, index: int) -> FrameTrack:
+        """What is removed from a frame: the tones, skew and wobble by the path, and what the path is not smooth by."""
+        tones = motion.path.tones(float(motion.times[index]))
+        polynomial = [motion.velocity[index], motion.acceleration[index], motion.places[index] - motion.steady[index]]
+        if self.steady == 0:  # axes without vibration stay as taken
+            vibrates = np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
+            polynomial = [values * vibrates for values in polynomial]
+        height, width = self.layout.size
+        seconds = 0.5 * self.job.timing.row_time * max(height, width)
+        reach = np.abs(np.array(polynomial)) * np.array([[seconds], [seconds**2], [1.0]])
+        axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
+        amplitude, frequency, phase = tone_tables(tones, axes)
+        motion_of = Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
+        return FrameTrack(index, self.starts[index], motion_of, motion.faults.get(index))
 
-        return prefetched(steady_frames(), _AHEAD)
+    def margins(self, motion: VideoMotion) -> Margins:
+        """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
+        height, width = self.layout.size
+        widest = np.zeros(4)
+        for index in range(len(self.starts)):
+            if index in motion.faults:
+                continue
+            x, y = source_map(self.track(motion, index).motion, self.restorer.timing_of(0), self.layout.size)
+            sides = [-y[0].min(), y[-1].max() - (height - 1), -x[:, 0].min(), x[:, -1].max() - (width - 1)]
+            widest = np.maximum(widest, sides)
+        return self.layout.margins(Margins(*(math.ceil(side + 0.5) if side > 0.01 else 0 for side in widest)))
 
-    def _with_tracks(self, found: BinaryIO) -> Generator[tuple[FrameTrack, Frame | str], None, None]:
-        """Every frame with its track from a file."""
-        found.seek(0)
-        with closing(prefetched(self._decoded(), _AHEAD)) as decoded:
-            for _, _, _, frame in decoded:
-                yield pickle.load(found), frame  # written by this process to a file without a name
+    # Verdict and record of a part
 
-    def margins(self, found: BinaryIO, progress: Callable[[], None]) -> Margins:
-        """The widest margins of all frames, from a pass that only follows the motion and writes the tracks."""
-        widest = Margins()
-        with closing(self.tracked()) as tracks:
-            for track, _ in tracks:
-                pickle.dump(track, found)
-                if track.known and track.fault is None:
-                    (visible,) = self.restorer.visible(track, luma_only=True)
-                    widest = widest.widest(Margins.of(torch.from_numpy(visible)))
-                progress()
-        return self.layout.margins(widest)
+    def add_shaking(self, shaking: Shaking, motion: VideoMotion, first: int, frames: list[Frame]) -> None:
+        """Compare the shaking of frames of the output, the first of which has a number, with that of the input."""
+        before: list[tuple[Array, float]] = []
+        after: list[tuple[Array, float]] = []
+        follower = CornerFollower(self.job.timing)
+        for number, frame in enumerate(frames, first):
+            corners, raw = follower.next(self.layout.grey(frame), self.starts[number]), motion.shakes.get(number - 1)
+            if number > first:
+                if raw is None or corners is None:
+                    break
+                before.append(raw)
+                after.append(shake(corners))
+        if len(before) > 1:
+            shaking.add(before, after)
 
     def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
@@ -131,43 +215,79 @@ class VideoPasses:
         assert start is not None
         starts = (float(start[0]), float(start[0]) + frames[1][0].time - first.time)
         prepared = prepare_frames(images, replace(timing, frame_start_times=starts), channels="first")
-        motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift))
-        if not bool(motion.moving_axes().any()):
+        motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
+        if not bool((motion.amplitude > 0).any()):
             return None
         with suppress(TooLittleInCommonError), torch.no_grad():
             restored = restore_prepared(prepared, motion, self.restorer.options)
             return judge_prepared(prepared, restored, motion, most_pairs=1)
         return None
 
-    def record(self, part: int, tracks: list[FrameTrack], verdict: RestorationVerdict | None) -> dict[str, Any]:
+    def record(
+        self, part: int, tracks: list[FrameTrack], motion: VideoMotion, verdict: RestorationVerdict | None
+    ) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a part of the video."""
-        reported = next((track for track in reversed(tracks) if track.detection is not None), None)
-        found = None if reported is None else reported.detection
-        known = [track for track in tracks if track.known and track.fault is None]
+        detection = self._detection(motion, tracks)
         faults = {str(track.index): track.fault for track in tracks if track.fault is not None}
-        unknown = len(tracks) - len(known) - len(faults)
+        moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
+        left = [
+            Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
+            for name, why in zip(AXIS_NAMES, detection.reasons, strict=False)
+            if why
+        ]
         return {
             "window": part,
             "first": tracks[0].index,
             "last": tracks[-1].index,
-            "start_time": (reported or tracks[0]).time,
+            "start_time": tracks[0].time,
             "written": len(tracks),
-            "frames": "restored" if any(track.motion.moving_axes().any() for track in known) else "as taken",
-            "detection": plain_values(found and DetectedVibration.of(found)),
-            "left_alone": plain_values(_left_alone(known, found)),
+            "frames": "restored" if moved else "as taken",
+            "detection": plain_values(detection),
+            "left_alone": plain_values(left),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,
             "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            "error": f"the motion of {number_of(unknown, 'frame')} is not known" if unknown else None,
+            "error": None,
             "bad_frames": faults,
         }
 
+    def _detection(self, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:
+        """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
+        window = motion.path.nearest(float(motion.times[tracks[len(tracks) // 2].index]))
+        tones = [tone.at(tracks[0].time - window.origin) for tone in window.tones]
+        amplitude, frequency, phase = tone_tables(tones, 2)
+        size, rate = (np.full_like(amplitude, math.inf) for _ in range(2))
+        for axis in (0, 1):
+            of_axis = sorted((tone for tone in tones if tone.axis == axis), key=lambda tone: -abs(tone.coefficient))
+            size[axis, : len(of_axis)] = [tone.amplitude_std for tone in of_axis]
+            rate[axis, : len(of_axis)] = [tone.frequency_std for tone in of_axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            phase_std = np.where(amplitude > 0, size / amplitude, math.inf)
+            period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
+        unknown = np.full(2, math.inf)
+        values = (size, rate, period_std, phase_std, unknown, unknown)
+        index = tracks[0].index
+        vibration = Vibration(amplitude, frequency, phase, motion.velocity[index, :2], motion.acceleration[index, :2])
+        found = [any(tone.axis == axis for tone in tones) for axis in (0, 1)]
+        return DetectedVibration(
+            vibration=vibration,
+            std=VibrationStd(*(torch.from_numpy(np.array(value)) for value in values)),
+            gain=vibration.gain(self.job.timing.frame_period),
+            residual=torch.full((2,), window.residual, dtype=torch.float64),
+            reliable=torch.tensor(found),
+            findings=tuple(() if good else (Reason("no_tone", AXIS_NAMES[axis]),) for axis, good in enumerate(found)),
+            assumptions=(),
+        )
 
-def _left_alone(tracks: list[FrameTrack], detection: DetectionResult | None) -> list[Reason]:
-    """A reason for each axis whose vibration is removed from none of the frames."""
-    notes = []
-    for axis, name in enumerate(AXIS_NAMES[:2]):
-        if tracks and not any(bool((track.motion.amplitude[axis] > 0).any()) for track in tracks):
-            why = "; ".join(() if detection is None else detection.reasons[axis]) or "not known"
-            notes.append(Reason("axis_not_reliable", name, details={"action": "restored", "why": why}))
-    return notes
+
+def tone_tables(tones: list[Tone], axes: int) -> tuple[Array, Array, Array]:
+    """Amplitude (px), frequency (Hz) and phase (rad) of ``Vibration``, (axes, K), of tones, the largest first."""
+    of_axes = [[tone for tone in tones if tone.axis == axis] for axis in range(axes)]
+    amplitude, frequency, phase = np.zeros((3, axes, max(1, *map(len, of_axes))))
+    for axis, of_axis in enumerate(of_axes):
+        for number, tone in enumerate(sorted(of_axis, key=lambda tone: -abs(tone.coefficient))):
+            amplitude[axis, number], frequency[axis, number] = abs(tone.coefficient), tone.frequency
+            phase[axis, number] = (
+                np.angle(tone.coefficient) + 0.5 * math.pi
+            )  # Re c exp(i a) = |c| sin(a + arg c + pi/2)
+    return amplitude, frequency, phase

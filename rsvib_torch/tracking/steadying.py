@@ -1,85 +1,70 @@
-"""Steady videos: every frame is moved to the mean of the path around it."""
+"""Steady videos: a smooth path near the path of the camera, and the margins that the frames lose."""
 
-from collections import deque
-from collections.abc import Iterator
-from typing import Protocol, Self, TypeVar
+import math
 
-import torch
-from torch import Tensor
+import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-_ROUNDING = 1e-6  # s, of frame times
+from rsvib_torch.core.tables import Array
 
-
-class PlacedFrame(Protocol):
-    """A frame whose place on the path is known, such as ``TrackedFrame``."""
-
-    @property
-    def time(self) -> float:
-        """Exposure start of its first row in s."""
-
-    @property
-    def path(self) -> Tensor:
-        """Place (2,) on the path in px; NaN if it is not known."""
-
-    def moved_to(self, place: Tensor) -> Self:
-        """The frame with its content at another place."""
+_HALVINGS = 5  # of the time over which the path is averaged, where the frame would be moved too far
 
 
-Placed = TypeVar("Placed", bound=PlacedFrame)
-Item = TypeVar("Item")
+def steady_places(times: Array, places: Array, duration: float, size: tuple[int, int], limit: float) -> Array:
+    """A smooth path along the path of a camera, which keeps slow motion.
 
-
-def steadied(frames: Iterator[tuple[Placed, Item]], duration: float) -> Iterator[tuple[Placed, Item]]:
-    """Frames moved to the mean of the path over ``duration`` s around them, so that slow motion is kept.
-
-    Near both ends of the video the interval is shorter, and stays symmetric. Frames without path stay.
+    Each place is the value of a straight line that fits the path around it, with the weights of a Hann window whose
+    width at half of its height is ``duration``: oscillations of that period vanish. Where the frame would be moved by
+    more than ``limit``, the window is shorter.
 
     Args:
-        frames: Tracked frames in order, each with anything that belongs to it.
-        duration: s; 0: all frames stay.
-
-    Yields:
-        The frames, as soon as those half of ``duration`` behind them are known.
+        times: (N,) s, increasing.
+        places: (N, 4) path: x, y (px), roll (rad), zoom.
+        duration: s; 0: the path itself.
+        size: (height, width) of the frames in px.
+        limit: Largest displacement of a corner of the frame, in parts of its width (x) and height (y).
 
     Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=8)
-        >>> tracker = rsv.VibrationTracker(timing, window=4, wobble=True)
-        >>> tracked = ((tracker.update(frame), number) for number, frame in enumerate(frames))
-        >>> [number for _, number in steadied(tracked, 0.05)]
-        [0, 1, 2, 3, 4, 5, 6, 7]
+        >>> times = np.arange(90) / 30.0
+        >>> shaken = np.stack([20 * times + np.sin(2 * np.pi * 3 * times), 0 * times, 0 * times, 0 * times], -1)
+        >>> steady = steady_places(times, shaken, 1 / 3, (480, 640), 0.1)
+        >>> bool(np.abs(steady[20:-20, 0] - 20 * times[20:-20]).max() < 0.01)
+        True
     """
-    if duration == 0:
-        yield from frames
-        return
-    around: deque[Placed] = deque()  # frames whose place counts for those to yield
-    items: deque[Item] = deque()  # what belongs to the frames to yield
-    half = 0.5 * duration
+    if duration == 0 or len(times) < 3:
+        return places
+    # 1. The path with shorter and shorter windows; the last level is the path itself.
+    levels = [*(_local_lines(times, places, duration / 2**level) for level in range(_HALVINGS + 1)), places]
+    far = [largest_displacement(places - level, size) for level in levels]
+    # 2. The longest window of every frame that keeps the limit; it changes slowly along the video.
+    needed = np.argmax(np.array(far) <= limit, axis=0).astype(np.float64)
+    around = 2 * math.ceil(duration * (len(times) - 1) / (times[-1] - times[0])) + 1
+    needed = uniform_filter1d(maximum_filter1d(needed, around), around, mode="nearest")
+    # 3. Between two levels, their mean.
+    first = np.minimum(needed.astype(int), len(levels) - 2)
+    share, stacked, every = (needed - first)[:, None], np.stack(levels), np.arange(len(times))
+    mixed: Array = (1 - share) * stacked[first, every] + share * stacked[first + 1, every]
+    return mixed
 
-    def interval() -> float:
-        return (around[-1].time - around[0].time) / max(len(around) - 1, 1) or 1.0
 
-    def placed() -> tuple[Placed, Item]:
-        frame, paths = around[len(around) - len(items)], torch.stack([other.path for other in around])
-        known = torch.isfinite(paths).all(1)
-        if not bool(torch.isfinite(frame.path).all()):
-            return frame, items.popleft()
-        # the same distance on both sides, so that a uniform motion is kept at the ends as well
-        reach = min(half, frame.time - around[0].time, around[-1].time - frame.time)
-        distances = paths.new_tensor([abs(other.time - frame.time) for other in around])
-        # a frame stands for the time of one interval; half of it counts at the end of the time around the frame
-        weights = ((reach - distances) / interval() + 0.5).clamp(0.0, 1.0)[known]
-        return frame.moved_to((weights[:, None] * paths[known]).sum(0) / weights.sum()), items.popleft()
+def _local_lines(times: Array, places: Array, duration: float) -> Array:
+    """Values of straight lines that fit the path around every time, with the weights of a Hann window."""
+    lines = np.empty_like(places)
+    firsts, ends = np.searchsorted(times, times - duration), np.searchsorted(times, times + duration, "right")
+    for number, (first, end) in enumerate(zip(firsts, ends, strict=True)):
+        apart = times[first:end] - times[number]
+        weight = np.cos(0.5 * math.pi * apart / duration) ** 2 + 1e-9
+        weight /= weight.sum()
+        mean, centre = weight @ places[first:end], weight @ apart
+        spread = weight @ (apart - centre) ** 2
+        slope = (weight * (apart - centre)) @ places[first:end] / spread if spread > 0 else 0.0
+        lines[number] = mean - centre * slope
+    return lines
 
-    for latest, item in frames:
-        around.append(latest)
-        items.append(item)
-        while len(items) > 1 and (around[len(around) - len(items)].time + half + interval() <= latest.time + _ROUNDING):
-            yield placed()
-        while around[0].time < around[len(around) - len(items)].time - half - 2.0 * interval():
-            around.popleft()
-    while items:
-        yield placed()
+
+def largest_displacement(shift: Array, size: tuple[int, int]) -> Array:
+    """(N,) displacement of the corners of a frame by components (N, 4), in parts of its width or height."""
+    height, width = size
+    x, y, roll, zoom = np.abs(shift).T
+    along = (x + 0.5 * height * roll) / width + 0.5 * zoom
+    return np.maximum(along, (y + 0.5 * width * roll) / height + 0.5 * zoom)

@@ -43,10 +43,15 @@ GOALS = {"exact": 0.6, "dewarp": 0.16}  # s of a processor per frame: 3 and 12 f
 BEFORE = {"exact": 3.68, "dewarp": 0.98}
 # Parts of the work: functions whose processor time is measured, without that of the others within them.
 PARTS: dict[str, list[tuple[str, str]]] = {
-    "tracking": [("rsvib_torch.stacks.video_tracks", "_tracked")],
+    "motion": [
+        ("rsvib_torch.tracking.camera_path", "CornerFollower.next"),
+        ("rsvib_torch.tracking.camera_path", "fit_window"),
+    ],
     "restoration": [
         ("rsvib_torch.stacks.video_frames", "restore_prepared"),
         ("rsvib_torch.stacks.video_frames", "prepare_frames"),
+        ("rsvib_torch.stacks.video_frames", "source_map"),
+        ("rsvib_torch.stacks.video_frames", "moved_back"),
     ],
     "conversion of counts": [
         ("rsvib_torch.stacks.video_frames", "counts_to_frames"),

@@ -20,7 +20,7 @@ CAMERA = ("--row-time", "150us", "--exposure", "0.6ms", "--frame-rate", "30")
 VIBRATION = Motion((2.1, 1.6), (52.0, 71.0), (0.5, 1.0))
 TIMES = np.arange(COUNT) / RATE
 PART = 32  # frames
-OPTIONS = {"restoration": {"method": "dewarp"}, "columns": None, "workers": 2}
+OPTIONS = {"restoration": {"method": "dewarp"}, "workers": 2}
 
 
 class Shaken:
@@ -246,7 +246,7 @@ def test_an_axis_without_vibration_is_left_as_taken(tmp_path):
 def test_a_video_without_a_common_motion_is_refused(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
     write(tmp_path / "noise.mp4", noise)
-    with pytest.raises(ValueError, match="no vibration was found that the rows of the frames have in common"):
+    with pytest.raises(ValueError, match="no motion was found that the corners of the frames have in common"):
         process_video(tmp_path / "noise.mp4", tmp_path / "still.mp4", TIMING, **OPTIONS)
     assert [path.name for path in tmp_path.iterdir()] == ["noise.mp4"]
 
