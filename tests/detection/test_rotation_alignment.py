@@ -1,6 +1,7 @@
 """Alignment of a gyroscope with frames of an independent camera: axes, bias, clock, focal length, row time."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from truth import draw_scene
 
 import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.recorded.corner_tracks import CornerTracks, corner_tracks
 from rsvib_torch.detection.recorded.rotation_alignment import align_rates
@@ -159,6 +161,38 @@ def test_dashboard_is_excluded():
     assert float((found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs().max()) < 0.02
 
 
+def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 7e-5\nexposure_rows = 11.4\nframe_rows = 480\n")
+    rsv.write_stack(tmp_path / "frames.tif", frames)
+    rates = recorded("ZXY")
+    rows = [
+        ",".join(f"{v:.12g}" for v in (t, *w)) for t, w in zip(rates.times.tolist(), rates.rates.tolist(), strict=True)
+    ]
+    (tmp_path / "rates.csv").write_text("time,gx_rad_s,gy_rad_s,gz_rad_s\n" + "\n".join(rows))
+    arguments = [
+        "known",
+        "frames.tif",
+        "out.tif",
+        "--config",
+        "camera.toml",
+        "--motion",
+        "rates.csv",
+        "--focal-length",
+        "380",
+    ]
+    arguments = [str(tmp_path / one) if "." in one else one for one in arguments] + ["--device", "cpu"]
+    assert run_command([*arguments, "--fit-row-time", "--offsets", "0.3", "0.4"]) == 0
+    printed = capsys.readouterr().out
+    assert "time 0 of the frames is 0.35" in printed
+    assert 78 < float(re.search(r"row time ([\d.]+)", printed).group(1)) < 82
+    restored = rsv.read_stack(tmp_path / "out.tif")
+    before, after = (float((one[1:] - one[:-1])[..., 20:-20, 20:-20].square().mean()) for one in (frames, restored))
+    assert after < 0.1 * before
+    assert run_command([*arguments, "--offsets", "0.36", "0.4", "--overwrite"]) == 2
+    assert run_command([*arguments, "--offsets", "0.3", "0.4", "--offset", "0.35", "--overwrite"]) == 2
+    assert "give one of them" in capsys.readouterr().err
+
+
 def test_mirrored_axes_are_refused(tracks):
     found = aligned(tracks, recorded(mirrored=-1.0))
     assert not found.reliable
@@ -172,6 +206,13 @@ def test_recording_of_another_motion_is_refused(tracks):
     found = aligned(tracks, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
     assert not found.reliable
     assert "recording_incomplete" in {reason.code for reason in found.findings}
+
+
+def test_offset_outside_the_given_ones_is_refused(tracks):
+    options = {"fit_scale": True, "fit_focal_length": False, "fit_row_time": False}
+    limits = (OFFSET + 0.004, OFFSET + 0.01)
+    found = align_rates(tracks, (COUNT, *SIZE), TIMING, recorded(), rsv.Camera(FOCAL_LENGTH), offsets=limits, **options)
+    assert "offset_outside" in {reason.code for reason in found.findings}
 
 
 def test_rest_is_refused():

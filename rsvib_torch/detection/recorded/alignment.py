@@ -21,7 +21,7 @@ from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.core.validation import Extensible, Number
 from rsvib_torch.core.validation import options as option_group
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.recorded.clock_range import offset_range
+from rsvib_torch.detection.recorded.clock_range import offset_range, outside
 from rsvib_torch.detection.recorded.corner_tracks import corner_tracks
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
@@ -141,7 +141,8 @@ class AlignOptions(BandOptions, MaskedInputOptions):
     offsets: tuple[Number, Number] | None = Field(
         default=None,
         strict=False,
-        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames.",
+        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames. "
+        "A result outside them is refused.",
     )
     fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
     fit_gain: bool = Field(
@@ -277,6 +278,7 @@ def align_motion(
     offset_std = float(np.sqrt(np.maximum(gradient @ covariance[:2, :2] @ gradient, 0.0)))
     rest = measured.unexplained(residual)[0]
     reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
+    reasons += outside(clock.offset, offset_std, options.offsets)
     drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
     gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
     in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))

@@ -10,7 +10,7 @@ from torch import Tensor
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.detection.recorded.clock_range import offset_range
+from rsvib_torch.detection.recorded.clock_range import offset_range, outside
 from rsvib_torch.detection.recorded.corner_tracks import CornerTracks
 from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
 from rsvib_torch.detection.recorded.rotation_search import (
@@ -196,7 +196,7 @@ def align_rates(
     axes = [start.orientation for start in again.starts if start.orientation != fit.model.orientation]
     axes = [start.orientation for start in again.starts if start.orientation in axes and explains(start)]
     other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
-    return _result(fit, again, axes, other, free, starts, height)
+    return _result(fit, again, axes, other, free, starts, height, offsets)
 
 
 def _result(
@@ -207,6 +207,7 @@ def _result(
     free: list[bool],
     starts: Tensor,
     height: int,
+    offsets: tuple[float, float] | None,
 ) -> RotationAlignment:
     model, radius = fit.model, fit.model.tracks.radius
     values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
@@ -214,6 +215,7 @@ def _result(
     at, scale, focal_length, row_time = (values[name] for name in ("at", "scale", "focal length", "row time"))
     gradient = torch.zeros(7, dtype=torch.float64)
     gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
+    offset, offset_std = at - scale * model.middle, float(gradient @ fit.covariance @ gradient) ** 0.5
     middles = starts + 0.5 * (height - 1) * row_time + 0.5 * model.exposure_time
     predicted = components_of(
         model.rates, model.orientation, fit.parameters, torch.stack([middles[:-1], middles[1:]], -1), model.middle
@@ -229,7 +231,7 @@ def _result(
         reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
     if axes:
         reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
-    reasons += _uncertain(fit, free, std)
+    reasons += _uncertain(fit, free, std) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
     longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
@@ -242,8 +244,8 @@ def _result(
     return RotationAlignment(
         motion=_motion(fit, clock),
         orientation=model.orientation,
-        offset=at - scale * model.middle,
-        offset_std=float(gradient @ fit.covariance @ gradient) ** 0.5,
+        offset=offset,
+        offset_std=offset_std,
         scale=scale,
         scale_std=float(std[4]),
         bias=fit.parameters[:3],

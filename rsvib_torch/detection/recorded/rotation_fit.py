@@ -32,9 +32,9 @@ _ROUNDS = 12  # of weights and variances; the clock changes by less than 0.1 of 
 # wrong by 0.09 % (rms), of one with 216 x 200 px by 0.8 %; the row time by 0.25 % (rms).
 _GAIN_ERROR = 3e-3
 _ROW_ERROR = 0.5  # rows, of all corners in common; of the same clips, the offset was wrong by 0.03 ms, 0.6 rows (rms)
-# Standard deviations of the noise, whose median has a relative one of about 1 / sqrt(M), by which a fit with a
+# Relative standard deviations, about 1 / sqrt(M), of the median of the residuals of M corners, by which a fit with a
 # translation must have smaller residuals.
-_SIGNIFICANT = 4.0
+_SIGNIFICANT = 8.0
 _STEPS = 5  # of Gauss-Newton with fixed weights from the start values of a search; it converges within 4
 _CUT = 4.7  # standard deviations beyond which a residual has no weight; efficiency of 95 % for normal errors (biweight)
 _BIAS = (
@@ -87,7 +87,7 @@ class RotationModel:
 
     def _displaced(self, components: Tensor, parameters: Tensor) -> Tensor:
         camera = replace(self.camera, focal_length=float(parameters[5]))
-        return camera.displacement(components, *self.tracks.place.unbind(-1))
+        return camera.displacement_of_rays(components, *camera.rays(*self.tracks.place.unbind(-1)))
 
     def slopes(self, parameters: Tensor, free: Sequence[bool]) -> tuple[Tensor, Tensor]:
         """(M, 2, 7) derivatives of ``predicted``, 0 for parameters that are not free, and (M, 2, 3) by components."""

@@ -184,7 +184,7 @@ def _sample_times(parts: list[_Part]) -> Array:
     (STMP) starts anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the
     samples up to the end of a packet were taken until then, and the gyroscope is regular: a straight line. The first
     packet may begin late, and the last may end early. Ticks (TICK) are not used: they are times of the operating
-    system (gpmf-parser issue 63), and their clock differs by 0.3 % from that of the frames in a recording.
+    system (gpmf-parser issue 63), in ms.
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)
