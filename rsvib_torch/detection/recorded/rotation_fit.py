@@ -28,7 +28,7 @@ from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 NAMES = ("bias x", "bias y", "bias z", "at", "scale", "focal length", "row time")
 _ROUNDS = 12  # of weights and variances; the clock changes by less than 0.1 of its std after 8 on the phone
-# Relative error of displacements by OpenCV, which interpolates linearly: of 25 simulated clips, the focal length was
+# Relative error of displacements by OpenCV, which interpolates linearly: of 20 simulated clips, the focal length was
 # wrong by 0.09 % (rms), of one with 216 x 200 px by 0.8 %; the row time by 0.25 % (rms).
 _GAIN_ERROR = 3e-3
 _ROW_ERROR = 0.5  # rows, of all corners in common; of the same clips, the offset was wrong by 0.03 ms, 0.6 rows (rms)
