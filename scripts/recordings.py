@@ -183,13 +183,12 @@ def phone(folder: Path) -> None:
 def print_differences(found: rsv.RotationAlignment) -> None:
     """Print the differences between frames and gyroscope."""
     rest = (found.measured - found.predicted).square().mean(0).sqrt().tolist()
-    rows = found.unexplained_rows.tolist()
     r = [float(torch.corrcoef(torch.stack([found.measured[:, k], found.predicted[:, k]]))[0, 1]) for k in range(3)]
     print(f"  rms difference frame by frame: {rest[0]:.3f} px, {rest[1]:.3f} px, roll {1e3 * rest[2]:.3f} mrad")
-    print(f"  rms difference of single bands: {rows[0]:.3f} px, {rows[1]:.3f} px")
+    print(f"  standard deviation of a corner {found.corner_std:.3f} px")
     print(f"  correlation frame by frame: {r[0]:.4f}, {r[1]:.4f}, roll {r[2]:.4f}")
-    along = ", ".join(f"{value:.3f}" for value in found.translation.tolist())
-    print(f"  translation along ({along}), parallax {found.parallax:.4f}\n", flush=True)
+    along = ", ".join(f"{value:.4f}" for value in found.translation.mean(0).tolist())
+    print(f"  mean translation between frames over distance ({along})\n", flush=True)
 
 
 def drone(folder: Path) -> None:

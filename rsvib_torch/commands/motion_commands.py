@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -177,8 +178,21 @@ def known(
             show_default="estimated from the frames",
         ),
     ] = None,
+    offsets: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="Smallest and largest time of the recording, in s, at the exposure start of the first row of frame 0, "
+            "between which it is estimated.",
+            show_default="all for which the recording covers the frames",
+        ),
+    ] = None,
     fit_gain: Annotated[
         bool, typer.Option("--fit-gain", help="Estimate the focal length from the frames as well.")
+    ] = False,
+    fit_row_time: Annotated[
+        bool,
+        typer.Option("--fit-row-time", help="With a gyroscope: estimate the row time from the frames as well."),
     ] = False,
     force: Annotated[
         bool,
@@ -198,6 +212,10 @@ def known(
     the restored frames are judged no better than the input, the input is written unchanged, unless --force is given.
     """
     check_new(io.stack_files(restored), overwrite, [*io.stack_files(frames), settings.path, motion])
+    if offset is not None and offsets is not None:
+        raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
+    if unit is not None and fit_row_time:
+        raise ValueError("--fit-row-time is for a gyroscope, without --unit")
     from rsvib_torch.motion.spline import FreeMotion  # noqa: PLC0415
 
     recorded: FreeMotion | AngularRates
@@ -225,11 +243,21 @@ def known(
     stack = load(frames, settings, full_scale, device, options)
     if offset is None or not isinstance(recorded, FreeMotion):
         with working("aligning the recording"):
-            found = detection.align_motion(stack.frames, stack.timing, recorded, camera=camera, fit_gain=fit_gain)
+            found = detection.align_motion(
+                stack.frames,
+                stack.timing,
+                recorded,
+                camera=camera,
+                offsets=offsets,
+                fit_gain=fit_gain,
+                fit_row_time=fit_row_time,
+            )
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curve(found)
         _refuse(motion, found.reasons, force)
         placed = found.motion
+        if fit_row_time and isinstance(found, detection.RotationAlignment):
+            stack = replace(stack, timing=_with_row_time(stack.timing, found.row_time))
     else:
         placed = recorded.retimed(offset)
         starts = stack.timing.row_starts(len(stack.frames), stack.frames.shape[int(stack.timing.scan_axis)])
@@ -249,6 +277,14 @@ def known(
     results["Restoration"] = restoration_lines(result, len(stack.frames))
     data["restoration"] = restoration_data(result)
     return Answer(results, data, [restored])
+
+
+def _with_row_time(timing: SensorTiming, row_time: float) -> SensorTiming:
+    """The timing with another row time, and the same exposure and frame period in seconds."""
+    rows = timing.row_time / row_time
+    return replace(
+        timing, row_time=row_time, exposure_rows=rows * timing.exposure_rows, frame_rows=rows * timing.frame_rows
+    )
 
 
 def _refuse(path: Path, reasons: tuple[str, ...], force: bool) -> None:

@@ -327,6 +327,11 @@ _RECORDED = {
     ),
     "recording_explains_nothing": _of_result("the recording does not explain the frames"),
     "motion_repeats": _of_result("an offset of {offset:.6g} s explains the frames as well: the motion repeats"),
+    "offset_outside": _of_result(
+        "the frames begin at {value:.6g} s of the recording, outside offsets",
+        compares="offset of the best fit, outside the given ones by more than 4 standard deviations",
+        unit="s",
+    ),
     "axes_mirrored": _of_result(
         "the mirrored axes {axes} fit better than every rotation: the frames are mirrored, or the recording has "
         "left-handed axes",

@@ -99,7 +99,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     rates = rsv.read_gyroscope(rates_file, unit="rad/s")
     unit = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     pairs = torch.zeros(2, 3, dtype=torch.float64)
-    values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, unit, 0.01, unit, unit[:2], unit[:2])
+    values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, pairs, unit, 0.01, unit[:2])
     rotation = rsv.RotationAlignment(recorded, "YxZ", *values, pairs, pairs, True, ())
     rsv.write_vibration(folder / "vibration.json", detected)
     options: dict[str, Any] = {

@@ -1,6 +1,7 @@
 """Alignment of a gyroscope with frames of an independent camera: axes, bias, clock, focal length, row time."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,11 @@ from scipy.spatial.transform import Rotation
 from truth import draw_scene
 
 import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.detection.recorded.band_vectors import band_vectors
+from rsvib_torch.detection.recorded.corner_tracks import CornerTracks, corner_tracks
 from rsvib_torch.detection.recorded.rotation_alignment import align_rates
 from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
-from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.options import OffsetOptions, RegistrationOptions
 
 FOCAL_LENGTH, SIZE, COUNT = 380.0, (200, 216), 4
 BIAS, OFFSET = (0.012, -0.02, 0.008), 0.35
@@ -80,16 +80,15 @@ def make_frames():
     return take(TIMING)
 
 
-@pytest.fixture(scope="module", name="vectors")
-def make_vectors(frames):
-    options = RegistrationOptions(registration="phase")
-    return band_vectors(grey_frames(frames, TIMING, OffsetOptions()), TIMING, options)
+@pytest.fixture(scope="module", name="tracks")
+def make_tracks(frames):
+    return corner_tracks(((frame, None) for frame in frames), TIMING)
 
 
-def aligned(vectors, rates, camera=None):
-    """``align_motion`` of frames that were registered before."""
+def aligned(tracks, rates, camera=None):
+    """``align_motion`` of frames whose corners were followed before."""
     options = {"offsets": None, "fit_scale": True, "fit_focal_length": camera is None, "fit_row_time": False}
-    return align_rates(vectors, (COUNT, *SIZE), TIMING, rates, camera, **options)
+    return align_rates(tracks, (COUNT, *SIZE), TIMING, rates, camera, **options)
 
 
 def check(found, orientation, *, limit=4.0):
@@ -135,23 +134,24 @@ def test_other_readout(options):
     )
 
 
-def test_search_finds_all_24_orientations(vectors):
+def test_search_finds_all_24_orientations(tracks):
     assert len(ORIENTATIONS) == 24
     for name in ORIENTATIONS:
         limits = (OFFSET - 0.02, OFFSET + 0.02)
+        information = torch.eye(2, dtype=torch.float64).expand(len(tracks.pair), 2, 2)
         found = search_orientations(
-            vectors, vectors.weight, recorded(name), TIMING.row_time, TIMING.exposure_time, limits, None
+            tracks, information, recorded(name), TIMING.row_time, TIMING.exposure_time, limits, None
         )
-        assert found.names[0] == name
-        assert abs(found.offsets[0] - OFFSET) < 2e-3
-        assert found.costs[1] > 4 * found.costs[0]
+        assert found.starts[0].orientation == name
+        assert abs(found.starts[0].offset - OFFSET) < 2e-3
+        assert found.starts[1].cost > 4 * found.starts[0].cost
         assert found.mirrored is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ORIENTATIONS)
-def test_all_24_orientations(vectors, name):
-    check(aligned(vectors, recorded(name)), name, limit=5.0)
+def test_all_24_orientations(tracks, name):
+    check(aligned(tracks, recorded(name)), name, limit=5.0)
 
 
 def test_dashboard_is_excluded():
@@ -161,19 +161,58 @@ def test_dashboard_is_excluded():
     assert float((found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs().max()) < 0.02
 
 
-def test_mirrored_axes_are_refused(vectors):
-    found = aligned(vectors, recorded(mirrored=-1.0))
+def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 7e-5\nexposure_rows = 11.4\nframe_rows = 480\n")
+    rsv.write_stack(tmp_path / "frames.tif", frames)
+    rates = recorded("ZXY")
+    rows = [
+        ",".join(f"{v:.12g}" for v in (t, *w)) for t, w in zip(rates.times.tolist(), rates.rates.tolist(), strict=True)
+    ]
+    (tmp_path / "rates.csv").write_text("time,gx_rad_s,gy_rad_s,gz_rad_s\n" + "\n".join(rows))
+    arguments = [
+        "known",
+        "frames.tif",
+        "out.tif",
+        "--config",
+        "camera.toml",
+        "--motion",
+        "rates.csv",
+        "--focal-length",
+        "380",
+    ]
+    arguments = [str(tmp_path / one) if "." in one else one for one in arguments] + ["--device", "cpu"]
+    assert run_command([*arguments, "--fit-row-time", "--offsets", "0.3", "0.4"]) == 0
+    printed = capsys.readouterr().out
+    assert "time 0 of the frames is 0.35" in printed
+    assert 78 < float(re.search(r"row time ([\d.]+)", printed).group(1)) < 82
+    restored = rsv.read_stack(tmp_path / "out.tif")
+    before, after = (float((one[1:] - one[:-1])[..., 20:-20, 20:-20].square().mean()) for one in (frames, restored))
+    assert after < 0.1 * before
+    assert run_command([*arguments, "--offsets", "0.36", "0.4", "--overwrite"]) == 2
+    assert run_command([*arguments, "--offsets", "0.3", "0.4", "--offset", "0.35", "--overwrite"]) == 2
+    assert "give one of them" in capsys.readouterr().err
+
+
+def test_mirrored_axes_are_refused(tracks):
+    found = aligned(tracks, recorded(mirrored=-1.0))
     assert not found.reliable
     assert Reason("axes_mirrored", details={"axes": "xYZ"}) in found.findings
 
 
-def test_recording_of_another_motion_is_refused(vectors):
+def test_recording_of_another_motion_is_refused(tracks):
     rates = recorded()
     random = np.random.default_rng(4).standard_normal((len(rates.times), 3))
     smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in random.T], -1)
-    found = aligned(vectors, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
+    found = aligned(tracks, rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
     assert not found.reliable
     assert "recording_incomplete" in {reason.code for reason in found.findings}
+
+
+def test_offset_outside_the_given_ones_is_refused(tracks):
+    options = {"fit_scale": True, "fit_focal_length": False, "fit_row_time": False}
+    limits = (OFFSET + 0.004, OFFSET + 0.01)
+    found = align_rates(tracks, (COUNT, *SIZE), TIMING, recorded(), rsv.Camera(FOCAL_LENGTH), offsets=limits, **options)
+    assert "offset_outside" in {reason.code for reason in found.findings}
 
 
 def test_rest_is_refused():
@@ -182,17 +221,17 @@ def test_rest_is_refused():
     assert "recorded_motion_too_small" in {reason.code for reason in found.findings}
 
 
-def test_one_axis_alone_leaves_the_others_open(vectors):
+def test_one_axis_alone_leaves_the_others_open(tracks):
     # the camera turns about its y axis only: the assignment of x and z, and their signs, are not determined
     rates = recorded()
     alone = torch.zeros_like(rates.rates)
     alone[:, 1] = rates.rates[:, 1] - BIAS[1]
     shifted = rsv.AngularRates(rates.times - OFFSET, alone)
-    first, last = vectors.times(TIMING.row_time).unbind(-1)
+    first, last = tracks.times(TIMING.row_time).unbind(-1)
     half = 0.5 * TIMING.exposure_time
     yaw = shifted.rotation(first + half, last + half)[:, 1]
     noise = 0.01 * torch.randn(len(yaw), 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    only_x = replace(vectors, offsets=torch.stack([-FOCAL_LENGTH * yaw, 0 * yaw], -1) + noise)
+    only_x = replace(tracks, offsets=torch.stack([-FOCAL_LENGTH * yaw, 0 * yaw], -1) + noise)
     found = aligned(only_x, rsv.AngularRates(rates.times, alone), rsv.Camera(FOCAL_LENGTH))
     assert not found.reliable
     assert "axes_ambiguous" in {reason.code for reason in found.findings}
@@ -207,8 +246,9 @@ def test_arguments(frames):
         rsv.align_motion(frames, TIMING, rates.rates)
     with pytest.raises(ValueError, match=r"the recording of 0\.01 s is shorter than the frames"):
         rsv.align_motion(frames, TIMING, rsv.AngularRates(rates.times[:11], rates.rates[:11]))
-    with pytest.raises(ValueError, match="rows of 150 px are too short to measure roll"):
-        rsv.align_motion(frames[..., :150], TIMING, rates)
+    ramp = torch.linspace(0, 1, frames.shape[-1]).expand_as(frames) + 0.01 * torch.arange(COUNT)[:, None, None]
+    with pytest.raises(ValueError, match="only 0 of 3 pairs of frames have 12 corners"):
+        rsv.align_motion(ramp, TIMING, rates)
     with pytest.raises(ValueError, match="times must increase"):
         rsv.AngularRates(rates.times.flip(0), rates.rates)
 
@@ -224,31 +264,61 @@ def test_rotation_is_composed_of_small_ones():
     assert np.allclose(rates.attitude(0.1005).numpy(), truth, atol=1e-6)
 
 
-@pytest.mark.parametrize("parallax", [0.0, 0.02])
-def test_translation_of_the_camera_is_allowed(vectors, parallax):
-    # each part at a distance of its own; a third of the places are fixed to the camera
-    direction = np.array([0.1, -0.05, 0.99])
-    first, last = (times.numpy() + 0.5 * TIMING.exposure_time for times in vectors.times(TIMING.row_time).unbind(-1))
-    place = vectors.place.numpy()
-    ray = np.concatenate([place, np.full((len(place), 1), FOCAL_LENGTH)], -1)
-    ray = (attitude(first).inv() * attitude(last)).inv().apply(ray)
+def shaken(times):
+    """Attitude that is larger than that of ``attitude``, of a vehicle on a rough road."""
+    return attitude(times, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("axes", "speed"), [("zxY", (0.0, 0.0, 0.0)), ("XYZ", (0.1, -0.05, 0.6)), ("yZx", (0.4, 0.1, 0.0))]
+)
+def test_translation_of_the_camera_is_no_bias(axes, speed):
+    # Corners of a pinhole camera at random distances, two fifths of them near, a quarter fixed to the camera.
     random = np.random.default_rng(3)
-    lines = direction[2] * place - FOCAL_LENGTH * direction[:2]
-    near = parallax * random.uniform(0, 2, (len(place), 1))
-    moved = FOCAL_LENGTH * ray[:, :2] / ray[:, 2:] - place + near * lines
-    fixed = vectors.row.numpy() >= 0.7 * vectors.num_rows
-    moved[fixed] = 0.0
-    moved += 0.02 * random.standard_normal(moved.shape)
-    scene = replace(vectors, offsets=torch.from_numpy(moved))
-    found = aligned(scene, recorded("zxY"))
-    assert found.orientation == "zxY"
-    assert abs(found.offset - OFFSET) < 4 * found.offset_std < 4e-3
-    assert abs(found.focal_length - FOCAL_LENGTH) < min(4 * found.focal_length_std, 0.1 * FOCAL_LENGTH)
+    pairs, corners, row_time = 20, 240, 5e-5  # s
+    timing = rsv.SensorTiming(row_time, 1, 660)
+    pair = np.repeat(np.arange(pairs), corners)
+    place = random.uniform((-320, -240), (320, 240), (len(pair), 2))
+    distance = np.where(
+        random.random(len(pair)) < 0.4, random.uniform(1, 3, len(pair)), random.uniform(6, 60, len(pair))
+    )
+    ray = np.concatenate([place / 500.0, np.ones((len(pair), 1))], -1)
+    start = pair * timing.frame_period
+    moved = place.copy()
+    for _ in range(5):  # the row in the later frame depends on the displacement
+        t = np.stack(
+            [start + (place[:, 1] + 239.5) * row_time, start + timing.frame_period + (moved[:, 1] + 239.5) * row_time]
+        )
+        first, last = (shaken(one + 0.5 * timing.exposure_time) for one in t)
+        point = first.apply(ray * distance[:, None]) - (t[1] - t[0])[:, None] * first.apply(np.array(speed))
+        seen = last.inv().apply(point)
+        moved = 500.0 * seen[:, :2] / seen[:, 2:]
+    rows = np.stack([place[:, 1], moved[:, 1]], -1) + 239.5
+    offsets = moved - place + 0.03 * random.standard_normal(place.shape)
+    fixed = place[:, 1] > 120
+    offsets[fixed] = 0.03 * random.standard_normal(place.shape)[fixed]
+    starts = np.stack([start, start + timing.frame_period], -1)
+    cell = ((place[:, 1] + 240) // 80 * 8 + (place[:, 0] + 320) // 80).astype(int)
+    tables = (torch.from_numpy(values) for values in (pair, cell, starts, rows, place, offsets))
+    tracks = CornerTracks(*tables, num_pairs=pairs, radius=230.0)
+    times, step = np.arange(-0.04, 0.8, 1e-3), 1e-6
+    rates = (shaken(times - step).inv() * shaken(times + step)).as_rotvec() / (2 * step)
+    own = np.zeros_like(rates)
+    for axis, letter in enumerate(axes):
+        own[:, "xyz".index(letter.lower())] = rates[:, axis] * (1.0 if letter.isupper() else -1.0)
+    recording = rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
+    options = {"offsets": None, "fit_scale": True, "fit_focal_length": True, "fit_row_time": True}
+    found = align_rates(tracks, (pairs + 1, 480, 640), replace(timing, row_time=4.5e-5), recording, None, **options)
+    assert found.reliable, found.reasons
+    assert found.orientation == axes
+    assert abs(found.offset - OFFSET) < min(4 * found.offset_std, 3e-4)
+    assert abs(found.focal_length - 500.0) < min(4 * found.focal_length_std, 5.0)
+    assert abs(found.row_time - row_time) < min(4 * found.row_time_std, 1e-6)
     error = (found.bias - torch.tensor(BIAS, dtype=torch.float64)).abs()
-    assert bool((error < 4 * found.bias_std).all())
-    if parallax:
-        assert 0.5 * parallax < found.parallax < 2 * parallax
-        unit = torch.from_numpy(direction / np.linalg.norm(direction))
-        assert float((found.translation @ unit).abs()) > 0.99
+    assert bool((error < (4 * found.bias_std).clamp(max=5e-3)).all()), (error, found.bias_std)
+    mean = found.translation.mean(0).numpy()
+    if any(speed):
+        unit = np.array(speed) / np.linalg.norm(speed)
+        assert mean @ unit > 0.97 * np.linalg.norm(mean)
     else:
-        assert found.parallax < 1e-3
+        assert np.abs(mean).max() < 1e-4

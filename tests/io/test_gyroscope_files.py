@@ -1,5 +1,6 @@
 """Angular rates from gyroflow logs, GPMF tracks and CSV files, written here byte by byte."""
 
+import itertools
 import math
 import struct
 
@@ -72,13 +73,13 @@ def entry(key, kind, size, count, content):
     return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
 
 
-def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, tick=None):
+def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None):
     accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
+    if first is not None:
+        accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
     parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
     if stamp is not None:
         parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
-    if tick is not None:
-        parts.append(entry(b"TICK", b"L", 4, 1, struct.pack(">I", tick)))
     parts.append(entry(b"SCAL", b"s", 2, 1, struct.pack(">h", scale)))
     if orientation:
         parts.append(entry(b"ORIN", b"c", 1, 3, orientation))
@@ -113,7 +114,7 @@ def mp4(path, packets, *, duration=300, timescale=1000, kind=b"gpmd", count=None
 
 
 def packets_of(size=20, **options):
-    """Packets of the rates, at 200 Hz; ``stamp`` and ``tick`` are their first times on another clock."""
+    """Packets of the rates, at 200 Hz; ``stamp`` and ``first`` are times of it and of another sensor."""
     parts = []
     for number, at in enumerate(range(0, len(RATES), size)):
         own = {name: value(number) for name, value in options.items() if callable(value)}
@@ -130,16 +131,22 @@ def test_gopro_video(tmp_path):
     assert np.allclose(turned.numpy(), np.stack([-RATES[:, 2], RATES[:, 0], -RATES[:, 1]], -1), atol=1e-9)
 
 
-def test_gopro_times_follow_the_clock_of_the_camera(tmp_path):
-    # packets are 0.11 s long in the video, but their samples began 0.1 s apart
-    ticks = rsv.read_gyroscope(mp4(tmp_path / "tick.mp4", packets_of(tick=lambda n: 7000 + 100 * n), duration=110))
-    assert ticks.sample_rate == pytest.approx(200.0, rel=1e-9)
-    stamps = rsv.read_gyroscope(
-        mp4(tmp_path / "stamp.mp4", packets_of(stamp=lambda n: (0, 100_000, 210_000)[n]), duration=110)
-    )
-    assert float(stamps.times[20]) == pytest.approx(0.1)
-    assert float(stamps.times[40]) == pytest.approx(0.21)
-    assert float(stamps.times[30]) == pytest.approx(0.155)
+def test_gopro_times_are_those_of_the_video(tmp_path):
+    # the clock of the stamps starts anywhere: the first one of any sensor is time 0 of the video
+    def stamp(number):
+        return 5_020_000 + (0, 100_000, 210_000)[number]
+
+    packets = packets_of(stamp=stamp, first=lambda n: 5_000_000 + 100_000 * n)
+    stamps = rsv.read_gyroscope(mp4(tmp_path / "stamp.mp4", packets, duration=100))
+    assert stamps.times[[0, 20, 30, 40]].tolist() == pytest.approx([0.02, 0.12, 0.175, 0.23])
+
+
+def test_gopro_gyroscope_that_starts_late_and_ends_early(tmp_path):
+    # the first packet has 13 of 20 samples, the last one 4: their ends are those of the video nevertheless
+    counts = np.cumsum([0, 13, 20, 20, 4])
+    packets = [packet(RATES[a:b], total=b) for a, b in itertools.pairwise(counts)]
+    found = rsv.read_gyroscope(mp4(tmp_path / "late.mp4", packets, duration=100))
+    assert found.times[[0, 13, 33, 56]].tolist() == pytest.approx([0.035, 0.1, 0.2, 0.315])
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ from rsvib_torch.core.text import measured_text, wrapped
 from rsvib_torch.core.validation import Extensible, Number
 from rsvib_torch.core.validation import options as option_group
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.recorded.band_vectors import band_vectors
-from rsvib_torch.detection.recorded.clock_range import offset_range
+from rsvib_torch.detection.recorded.clock_range import offset_range, outside
+from rsvib_torch.detection.recorded.corner_tracks import corner_tracks
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
@@ -130,10 +130,10 @@ class FittedClock:
 
 @option_group
 class AlignOptions(BandOptions, MaskedInputOptions):
-    """Options of ``align_motion``; bands are those of the start."""
+    """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
 
     registration: Annotated[Registration, Extensible] | None = Field(
-        default=None, description='Method of the bands; by default "ncc" for a motion, "phase" for angular rates.'
+        default=None, description='Method of the bands, for a motion; by default "ncc".'
     )
     camera: Camera | None = Field(
         default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
@@ -141,7 +141,8 @@ class AlignOptions(BandOptions, MaskedInputOptions):
     offsets: tuple[Number, Number] | None = Field(
         default=None,
         strict=False,
-        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames.",
+        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames. "
+        "A result outside them is refused.",
     )
     fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
     fit_gain: bool = Field(
@@ -154,10 +155,10 @@ class AlignOptions(BandOptions, MaskedInputOptions):
         description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
     )
 
-    def bands(self, default: Registration) -> RegistrationOptions:
-        """The row bands, with the default method of registration."""
+    def bands(self) -> RegistrationOptions:
+        """The row bands."""
         return RegistrationOptions(
-            registration=self.registration or default,
+            registration=self.registration or "ncc",
             band_rows=self.band_rows,
             band_step=self.band_step,
             search=self.search,
@@ -193,11 +194,11 @@ def align_motion(
     first at many offsets with those of row bands, then by least squares with those measured on the images around it. A
     uniform drift of each axis is fitted as well.
 
-    **Angular rates** (``read_gyroscope``). The displacements of parts of the row bands between consecutive frames are
-    compared with the rotation of the camera, for all 24 assignments of the axes and all offsets. Bias, clock and,
-    without a camera, the focal length are fitted. Robust weights exclude places that move by themselves or are fixed to
-    the camera. A camera that also translates in one direction (a vehicle) displaces content along lines from one point;
-    displacements along these lines count less, as much as the scene has parallax.
+    **Angular rates** (``read_gyroscope``). Corners are followed between consecutive frames, and compared with the
+    rotation of the camera between the exposures of their rows, for all 24 assignments of the axes and all offsets.
+    Bias, clock and, without a camera, the focal length are fitted. Robust weights exclude what moves by itself or is
+    fixed to the camera. Every pair of frames has a translation of its own: if the scene has parallax, only
+    displacements across its lines (epipolar lines) determine the rotation.
 
     Args:
         frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
@@ -241,10 +242,10 @@ def align_motion(
     timing = stack.timing
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
-    grey = stack.images
+    grey, valid = stack.images, None if stack.valid is None else stack.valid[0]
     if isinstance(recorded, AngularRates):
         return align_rates(
-            band_vectors(stack, timing, options.bands("phase")),
+            corner_tracks(((frame, None if valid is None else valid[i]) for i, frame in enumerate(grey[0])), timing),
             grey.shape[1:],
             timing,
             recorded,
@@ -254,7 +255,7 @@ def align_motion(
             fit_focal_length=options.camera is None or options.fit_gain,
             fit_row_time=options.fit_row_time,
         )
-    bands = options.bands("ncc")
+    bands = options.bands()
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = recorded.to_row_order(timing).to("cpu")
     low, high = offset_range(turned, first, last, options.offsets)
@@ -277,6 +278,7 @@ def align_motion(
     offset_std = float(np.sqrt(np.maximum(gradient @ covariance[:2, :2] @ gradient, 0.0)))
     rest = measured.unexplained(residual)[0]
     reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
+    reasons += outside(clock.offset, offset_std, options.offsets)
     drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
     gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
     in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))

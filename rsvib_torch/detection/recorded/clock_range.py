@@ -1,8 +1,9 @@
-"""Offsets between two clocks for which a recording covers the frames."""
+"""Offsets between two clocks: those for which a recording covers the frames, and limits."""
 
 from typing import Protocol
 
 from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.reason import Reason
 
 
 class _Recording(Protocol):
@@ -32,3 +33,10 @@ def offset_range(
             )
         low, high = max(low, bounds[0]), min(high, bounds[1])
     return low, high
+
+
+def outside(offset: float, std: float, limits: tuple[float, float] | None) -> list[Reason]:
+    """The reason against an offset in s outside ``limits`` by more than 4 standard deviations."""
+    if limits is None or limits[0] - 4 * std <= offset <= limits[1] + 4 * std:
+        return []
+    return [Reason("offset_outside", None, offset, limits[0] if offset < limits[0] else limits[1])]

@@ -1,7 +1,4 @@
-"""Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time.
-
-Invariant: the displacement depends on the row only (docs/architecture.md), in parts of the columns.
-"""
+"""Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time."""
 
 import math
 from collections.abc import Sequence
@@ -13,16 +10,26 @@ from torch import Tensor
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.detection.recorded.band_vectors import BandVectors
-from rsvib_torch.detection.recorded.clock_range import offset_range
+from rsvib_torch.detection.recorded.clock_range import offset_range, outside
+from rsvib_torch.detection.recorded.corner_tracks import CornerTracks
 from rsvib_torch.detection.recorded.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
-from rsvib_torch.detection.recorded.rotation_search import OrientationSearch, orientation_matrix, search_orientations
+from rsvib_torch.detection.recorded.rotation_search import (
+    OrientationSearch,
+    Start,
+    orientation_matrix,
+    search_orientations,
+)
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 
+_CERTAIN = 25.0  # chi-square by which other axes or offsets fit worse: 5 standard deviations of one parameter
+# Starts that are worse by less than this factor are fitted, at most three: with a dashboard and parallax, other axes
+# were better by 1 % in a simulated clip; without both, the second ones are worse by 16 % and more.
+_NEAR_COST = 1.05
+_MAX_COST, _MOST_OTHERS = 4.0, 5  # starts that are worse by this factor in the search, and further ones, are not fitted
 _MAX_FOCAL_LENGTH_STD, _MAX_ROW_TIME_STD = 0.05, 0.2  # of the value; less accurate ones are not determined
 
 
@@ -38,15 +45,14 @@ class RotationAlignment(
         "focal_length_std": "px",
         "row_time": "s",
         "row_time_std": "s",
-        "unexplained_rows": "px",
+        "corner_std": "px",
         "times": "s",
     },
     shapes={
         "bias": "3",
         "bias_std": "3",
-        "translation": "3",
+        "translation": "P 3",
         "unexplained": "3",
-        "unexplained_rows": "2",
         "times": "P",
         "measured": "P 3",
         "predicted": "P 3",
@@ -68,11 +74,11 @@ class RotationAlignment(
         focal_length_std: Its standard deviation; 0 if it was not fitted.
         row_time: s.
         row_time_std: Its standard deviation; 0 if it was not fitted.
-        translation: (3,) unit vector along the translation of the camera whose parallax the fit allows, camera axes.
-        parallax: Standard deviation of translation / distance between frames, in parts of bands; 0: no parallax.
+        translation: (P, 3) translation of the camera between consecutive frames over the mean distance of the content,
+            camera axes.
         unexplained: (3,) px, px, rad: standard deviation of X, Y and roll from frame to frame that the gyroscope does
             not explain, beyond the noise of the measurements.
-        unexplained_rows: (2,) px, rms difference of X and Y of single bands.
+        corner_std: px, standard deviation of the place of a corner across the line of its parallax.
         times: (P,) s, mid-times of consecutive frames.
         measured: (P, 3) px, px, rad: X, Y and roll between consecutive frames, from the images.
         predicted: (P, 3) The same by the gyroscope.
@@ -110,9 +116,8 @@ class RotationAlignment(
     row_time: float
     row_time_std: float
     translation: Tensor
-    parallax: float
     unexplained: Tensor
-    unexplained_rows: Tensor
+    corner_std: float
     times: Tensor
     measured: Tensor
     predicted: Tensor
@@ -145,7 +150,7 @@ class RotationAlignment(
 
 
 def align_rates(
-    vectors: BandVectors,
+    tracks: CornerTracks,
     shape: Sequence[int],
     timing: SensorTiming,
     rates: AngularRates,
@@ -156,7 +161,7 @@ def align_rates(
     fit_focal_length: bool,
     fit_row_time: bool,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the ``band_vectors`` of a stack of ``shape`` (T, H, W)."""
+    """``align_motion`` for angular rates, from the ``corner_tracks`` of a stack of ``shape`` (T, H, W)."""
     count, height, width = shape
     if camera is not None:
         camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
@@ -164,47 +169,79 @@ def align_rates(
     last = float(starts[-1]) + height * timing.row_time + timing.exposure_time
     limits = offset_range(rates, float(starts[0]), last, offsets)
     middle = 0.5 * (float(starts[0]) + last)
-    known = None if camera is None or fit_focal_length else camera.focal_length
+    known = None if fit_focal_length else camera
+    free = [True, True, True, True, fit_scale, fit_focal_length, fit_row_time]
 
-    def searched(weight: Tensor, row_time: float) -> OrientationSearch:
-        return search_orientations(vectors, weight, rates, row_time, timing.exposure_time, limits, known)
+    def parameters(start: Start, row_time: float) -> Tensor:
+        values = [0.0, 0.0, 0.0, start.offset + middle, 1.0, start.focal_length, row_time]
+        return torch.tensor(values, dtype=torch.float64)
 
-    free = [True, True, True, True, fit_scale, known is None, fit_row_time]
+    # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
+    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, timing.exposure_time, limits, known)
+    lens = camera or Camera(search.starts[0].focal_length)
+    first = search.starts[0]
+    near = [first, *(start for start in search.starts[1:3] if start.cost < _NEAR_COST * first.cost)]
+    model = RotationModel(tracks, rates, first.orientation, lens, timing.exposure_time, middle)
+    fits = [
+        fit_robustly(replace(model, orientation=start.orientation), parameters(start, timing.row_time), free)
+        for start in near
+    ]
+    fit = min(fits, key=lambda one: one.errors.sigma / float((one.errors.weight > 0).double().mean()))
+    first = near[fits.index(fit)]
 
-    def fitted(found: OrientationSearch) -> RotationFit:
-        lens = camera or Camera(found.focal_lengths[0])
-        model = RotationModel(vectors, rates, found.names[0], lens, timing.exposure_time, middle)
-        start = [0.0, 0.0, 0.0, found.offsets[0] + middle, 1.0, known or found.focal_lengths[0], timing.row_time]
-        return fit_robustly(model, torch.tensor(start, dtype=torch.float64), free)
+    # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
+    row_time = float(fit.parameters[6])
+    lens = replace(lens, focal_length=float(fit.parameters[5]))
+    again = search_orientations(tracks, fit.information(), rates, row_time, timing.exposure_time, limits, lens)
+    best = again.starts[0]
+    if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
+        model = replace(model, orientation=best.orientation)
+        fit = fit_robustly(model, parameters(best, timing.row_time), free)
 
-    search = searched(vectors.weight, timing.row_time)
-    fit = fitted(search)
-    # with the weights of the fit, what does not follow the gyroscope does not contribute
-    again = searched(fit.errors.weight, float(fit.parameters[6]))
-    if again.names[0] != search.names[0] or abs(again.offsets[0] - search.offsets[0]) > 5 / rates.sample_rate:
-        fit = fitted(again)
-    return _result(fit, again, free, starts, height)
+    # 3. Other axes and offsets that explain the frames as well.
+    def explains(start: Start) -> bool:
+        near = start.cost < _MAX_COST * best.cost
+        return near and fit.significance(start.orientation, parameters(start, row_time), free) < _CERTAIN
+
+    others = [start for start in again.starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
+    axes = [start.orientation for start in others if explains(start)]
+    other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
+    return _result(fit, again, axes, other, free, starts, height, offsets)
 
 
 def _result(
-    fit: RotationFit, search: OrientationSearch, free: list[bool], starts: Tensor, height: int
+    fit: RotationFit,
+    search: OrientationSearch,
+    axes: list[str],
+    other: float | None,
+    free: list[bool],
+    starts: Tensor,
+    height: int,
+    offsets: tuple[float, float] | None,
 ) -> RotationAlignment:
-    model, vectors = fit.model, fit.model.vectors
+    model, radius = fit.model, fit.model.tracks.radius
     values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
     std = fit.covariance.diagonal().clamp(min=0.0).sqrt()
     at, scale, focal_length, row_time = (values[name] for name in ("at", "scale", "focal length", "row time"))
     gradient = torch.zeros(7, dtype=torch.float64)
     gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
+    offset, offset_std = at - scale * model.middle, float(gradient @ fit.covariance @ gradient) ** 0.5
     middles = starts + 0.5 * (height - 1) * row_time + 0.5 * model.exposure_time
     predicted = components_of(
         model.rates, model.orientation, fit.parameters, torch.stack([middles[:-1], middles[1:]], -1), model.middle
     )
-    units = torch.tensor([1.0, 1.0, 1 / vectors.radius], dtype=torch.float64)
-    moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
-    unexplained = fit.errors.spread * units
+    units = torch.tensor([1.0, 1.0, 1 / radius], dtype=torch.float64)
+    unexplained = fit.errors.effects[:3] * units
     first, last = float(middles[0]) - 0.5 * height * row_time, float(middles[-1]) + 0.5 * height * row_time
-    reasons = _reasons(fit, search, free, moved, unexplained, std)
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
+
+    moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
+    reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
+    if search.mirrored is not None:
+        reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
+    if axes:
+        reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
+    reasons += _uncertain(fit, free, std) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
     longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
@@ -213,11 +250,12 @@ def _result(
     readout, shortest = row_time * height, float(starts.diff().amin())
     if readout > shortest:
         reasons.append(Reason("readout_too_long", None, readout, shortest, {"rows": height}))
+    translation = fit.translation + fit.effects[:, 3:]
     return RotationAlignment(
         motion=_motion(fit, clock),
         orientation=model.orientation,
-        offset=at - scale * model.middle,
-        offset_std=float(gradient @ fit.covariance @ gradient) ** 0.5,
+        offset=offset,
+        offset_std=offset_std,
         scale=scale,
         scale_std=float(std[4]),
         bias=fit.parameters[:3],
@@ -226,16 +264,31 @@ def _result(
         focal_length_std=float(std[5]),
         row_time=row_time,
         row_time_std=float(std[6]),
-        translation=fit.errors.direction,
-        parallax=fit.errors.parallax,
+        translation=translation / torch.tensor([-focal_length, -focal_length, radius], dtype=torch.float64),
         unexplained=unexplained,
-        unexplained_rows=fit.rows_rms()[:2],
+        corner_std=fit.errors.sigma,
         times=0.5 * (middles[:-1] + middles[1:]),
-        measured=predicted + fit.effects * units,
+        measured=predicted + fit.unshrunk() * units,
         predicted=predicted,
         reliable=not reasons,
         findings=tuple(reasons),
     )
+
+
+def _uncertain(fit: RotationFit, free: list[bool], std: Tensor) -> list[Reason]:
+    """Reasons against parameters that are not determined."""
+    reasons = []
+    focal_length, row_time = fit.parameters[5:7].tolist()
+    focal_length_std, row_time_std = std[5:7].tolist()
+    allowed = _MAX_FOCAL_LENGTH_STD * focal_length
+    if focal_length_std > allowed:
+        details = {"focal_length": focal_length}
+        reasons.append(Reason("focal_length_uncertain", None, focal_length_std, allowed, details))
+    if free[6] and row_time_std > _MAX_ROW_TIME_STD * row_time:
+        reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
+    if not math.isfinite(float(std.sum())):
+        reasons.append(Reason("fit_not_converged"))
+    return reasons
 
 
 def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
@@ -251,48 +304,3 @@ def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
     recorded_times = (part.times - parameters[3]) / parameters[4] + model.middle
     camera = replace(model.camera, focal_length=focal_length)
     return FreeMotion.from_samples(recorded_times, moved, spacing=float(recorded_times.diff().median()), camera=camera)
-
-
-def _reasons(
-    fit: RotationFit,
-    search: OrientationSearch,
-    free: list[bool],
-    moved: Tensor,
-    unexplained: Tensor,
-    std: Tensor,
-) -> list[Reason]:
-    """Reasons against an alignment."""
-    reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), search.other_offset)
-    if search.mirrored is not None:
-        reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
-    others = _other_axes(fit, search, free)
-    if others:
-        reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(others)}))
-    focal_length, row_time = fit.parameters[5:7].tolist()
-    focal_length_std, row_time_std = std[5:7].tolist()
-    if focal_length_std > _MAX_FOCAL_LENGTH_STD * focal_length:
-        allowed = _MAX_FOCAL_LENGTH_STD * focal_length
-        reasons.append(
-            Reason("focal_length_uncertain", None, focal_length_std, allowed, {"focal_length": focal_length})
-        )
-    if free[6] and row_time_std > _MAX_ROW_TIME_STD * row_time:
-        reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
-    if not math.isfinite(float(std.sum())):
-        reasons.append(Reason("fit_not_converged"))
-    return reasons
-
-
-def _other_axes(fit: RotationFit, search: OrientationSearch, free: list[bool], *, certain: float = 25.0) -> list[str]:
-    """Other assignments of the axes, whose best fits have a chi-square that is larger by less than ``certain``."""
-    others = []
-    for index, name in enumerate(search.names):
-        if name == fit.model.orientation or search.costs[index] > 4.0 * search.costs[0]:
-            continue
-        start = fit.parameters.clone()
-        start[:3] = 0.0
-        start[3] = search.offsets[index] + fit.model.middle
-        if free[5]:
-            start[5] = search.focal_lengths[index]
-        if fit.cost_with(name, start, free) < fit.cost + certain:
-            others.append(name)
-    return others

@@ -90,8 +90,8 @@ class _Part:
         rates: (N, 3) rad/s.
         start: Time of the packet in s.
         duration: Its duration in s.
-        stamp: Time of the first sample in s, exact to 1 us (STMP); None if the packet does not state it.
-        tick: The same on the clock of the camera, exact to 1 ms (TICK); None if the packet does not state it.
+        stamp: Time of the first sample in s on the clock of the camera (STMP); None if the packet does not state it.
+        earliest: The earliest time that any stream of the packet states; None if none states one.
         total: Samples up to the end of the packet that it states; None if it states none.
         orientation: Axes in the order of the file; empty if they are not stated.
     """
@@ -100,7 +100,7 @@ class _Part:
     start: float
     duration: float
     stamp: float | None
-    tick: float | None
+    earliest: float | None
     total: int | None
     orientation: str
 
@@ -142,14 +142,23 @@ def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
             number = next((content for name, *_, content in _entries(device) if name == b"DVID"), b"")
             if chosen is not None and number != chosen:
                 continue
-            part = next(filter(None, (_part(s, packet) for name, *_, s in _entries(device) if name == b"STRM")), None)
+            streams = [content for name, *_, content in _entries(device) if name == b"STRM"]
+            stamps = [stamp for stamp in map(_stamp, streams) if stamp is not None]
+            earliest = min(stamps, default=None)
+            part = next(filter(None, (_part(stream, packet, earliest) for stream in streams)), None)
             if part is not None:
                 chosen = number
                 yield part
                 break
 
 
-def _part(stream: bytes, packet: _Packet) -> _Part | None:
+def _stamp(stream: bytes) -> float | None:
+    """Time of the first sample of a stream in s on the clock of the camera; None if it is not stated."""
+    found = next(((kind, size, content) for key, kind, size, _, content in _entries(stream) if key == b"STMP"), None)
+    return None if found is None else float(_values(*found)[0, 0]) * 1e-6
+
+
+def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | None:
     """Samples of a stream; None if it has no angular rates."""
     found = {key: (kind, size, content) for key, kind, size, _, content in _entries(stream)}
     if b"GYRO" not in found:
@@ -163,19 +172,19 @@ def _part(stream: bytes, packet: _Packet) -> _Part | None:
     if len(scale) not in (1, 3) or not (scale != 0).all():
         raise IndexError("GYRO with a wrong SCAL")
     letters = found[b"ORIN"][2].decode("latin-1").strip("\0 ") if b"ORIN" in found else ""
-    stamp = float(_values(*found[b"STMP"])[0, 0]) * 1e-6 if b"STMP" in found else None
-    tick = float(_values(*found[b"TICK"])[0, 0]) * 1e-3 if b"TICK" in found else None
     total = int(_values(*found[b"TSMP"])[0, 0]) if b"TSMP" in found else None
     orientation = check_orientation(letters) if letters else ""
-    return _Part(rates / scale, packet.start, packet.duration, stamp, tick, total, orientation)
+    return _Part(rates / scale, packet.start, packet.duration, _stamp(stream), earliest, total, orientation)
 
 
 def _sample_times(parts: list[_Part]) -> Array:
     """Times (N,) in s of the samples of all packets.
 
-    If packets state the times of their first samples to 1 us, samples in between are at equal distances. Otherwise the
-    clock of the gyroscope is regular: a straight line through the times of the packets on the clock of the camera, or
-    in the video, in which the camera puts those samples that it has.
+    As in ``GetGPMFSampleRate`` of gpmf-parser, the reference implementation of the manufacturer: the clock of stamps
+    (STMP) starts anywhere, and the earliest stamp of the first packet is the start of that packet. Without stamps, the
+    samples up to the end of a packet were taken until then, and the gyroscope is regular: a straight line. The first
+    packet may begin late, and the last may end early. Ticks (TICK) are not used: they are times of the operating
+    system (gpmf-parser issue 63), in ms.
     """
     counts = np.array([len(part.rates) for part in parts])
     ends = np.cumsum(counts)
@@ -187,13 +196,11 @@ def _sample_times(parts: list[_Part]) -> Array:
     starts = np.array([part.start for part in parts])
     duration = parts[-1].start + parts[-1].duration - starts[0]
     stamps = np.array([np.nan if part.stamp is None else part.stamp for part in parts])
-    ticks = np.array([np.nan if part.tick is None else part.tick for part in parts])
     if len(parts) < 3:
         return np.asarray(starts[0] + duration / ends[-1] * number)
     if (np.diff(stamps) > 0).all():
         step = (stamps[-1] - stamps[0]) / firsts[-1]
-        known = np.append(stamps, stamps[-1] + step * counts[-1])
+        known = np.append(stamps, stamps[-1] + step * counts[-1]) - (parts[0].earliest or 0.0) + starts[0]
         return np.asarray(np.interp(number, np.append(firsts, ends[-1]), known))
-    clock = ticks if (np.diff(ticks) > 0).all() else starts
-    slope, first = np.polyfit(firsts, clock - clock.mean(), 1)
-    return np.asarray(first + starts.mean() + slope * number)
+    slope, first = np.polyfit(ends[:-1], starts[1:], 1)
+    return np.asarray(first + slope * number)

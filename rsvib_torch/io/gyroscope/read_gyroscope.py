@@ -54,8 +54,8 @@ def read_gyroscope(
     * gyroflow ``.gcsv``: rates times ``gscale`` in rad/s about the axes of the line ``orientation`` (``YxZ``: the rates
       about y, minus x and z of the sensor; a small letter is a negative axis), times times ``tscale`` in s.
     * GoPro ``.mp4`` with a track of GPMF data (``gpmd``): the entries ``GYRO`` divided by ``SCAL``, about the axes of
-      ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the packets, with samples at
-      equal distances.
+      ``ORIN`` if there is one, otherwise in the order of the file. Times are those of the video: of the stamps of the
+      camera, or of the ends of the packets with samples at equal distances.
     * CSV: a first line with the names of the columns: a time (``t``, ``time``, ``timestamp``) and three rates (``x``,
       ``gx``, ``gyro_x``, ``wx`` ...). The unit of the rates must be part of the names (``gx_rad_s``, ``x (deg/s)``) or
       be given; that of the time is s unless it is part of the name (``time_ms``) or given.
