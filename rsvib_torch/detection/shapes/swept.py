@@ -151,7 +151,8 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If they cannot be registered, see ``detect_motion``, or an option is out of range.
+        ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or three frames
+            cover more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 
     Note:
         A result of two frames is never reliable: decay, sweep and frequency replace each other there.
@@ -341,6 +342,12 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
     times = banded.exposure_starts[0] + 0.5 * banded.exposure_time  # (N, 2)
     middle, span = 0.5 * (times.max() + times.min()), np.ptp(times)
     times = times - middle
+    if _STARTS * (span * highest) ** 2 > 10 * _MAX_STARTS:
+        longest = math.sqrt(10 * _MAX_STARTS / _STARTS) / highest
+        raise ValueError(
+            f"frames cover {span:.3g} s; starts of the swept model up to {highest:.4g} Hz are searched in "
+            f"at most {longest:.3g} s: pass larger band_rows for lower frequencies, or frames at shorter intervals"
+        )
     # 1. The grid, with sweeps that change the frequency by up to 75 % from the middle to the ends.
     frequencies = 0.5 / span * np.arange(1, max(2, math.ceil(2 * span * highest)))
     most = max(1, round(0.375 * len(frequencies)))
