@@ -10,7 +10,8 @@ from torch import Tensor
 from rsvib_torch.core.chunking import gathered
 from rsvib_torch.core.splines import bspline_coefficient_rows
 
-_PHASE_STEP = 64  # frequencies per entry of the coarse table of phases
+# frequencies per entry of the coarse table of phases; 169 and 1057 frequencies take 0.75 and 0.92 of the time with 64
+_PHASE_STEP = 32
 
 
 def fast_length(minimum: int) -> int:
@@ -90,7 +91,7 @@ def shift_phases(shift: Tensor, length: int, frequencies: slice, dtype: torch.dt
 
 
 def phase_tables(shift: Tensor, length: int, frequencies: slice, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Phase factors at every 64th frequency (..., n), and those of 0 ... 63 steps of the frequency (..., 64).
+    """Phase factors at every 32nd frequency (..., n), and those of 0 ... 31 steps of the frequency (..., 32).
 
     Arguments as in ``shift_phases``; ``phase_products`` has all frequencies.
     """

@@ -307,6 +307,11 @@ _SHAPES = {
         "use more frames, or a steady tone (detect_vibration)",
         "number of frames, below 3",
     ),
+    "tone_of_chance": ReasonKind(
+        "the best of so many tones explains as much of noise with a probability of {value:.2g}, {limit:g} is allowed",
+        _MORE_FRAMES,
+        "probability that noise in the offsets of row bands is explained as well, above 0.01",
+    ),
     "other_swept_tone": ReasonKind(
         "another tone fits the rows as well: {frequency:.4g} Hz with a decay of {decay:.3g} /s in the middle of the "
         "record",

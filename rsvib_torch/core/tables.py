@@ -21,7 +21,11 @@ Stacks = TypeVar("Stacks", bound="DataclassInstance")
 
 def table(values: Tensor) -> Array:
     """A tensor as an array on the CPU; one on the CPU shares its memory."""
-    array: Array = values.detach().resolve_conj().cpu().numpy()
+    if values.requires_grad:
+        values = values.detach()
+    if values.is_conj():
+        values = values.resolve_conj()
+    array: Array = (values if values.device.type == "cpu" else values.cpu()).numpy()
     return array
 
 

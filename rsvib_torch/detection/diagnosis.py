@@ -220,7 +220,7 @@ def period_factor(
     def fits(factors: Array, rows: int, frequencies: Array | None = None) -> tuple[Array, Array]:
         """Square of the residual of one tone along each axis and its frequency, for each factor."""
         every = max(1, measurements.exposure_starts.shape[1] // rows)
-        trial = measurements.thinned(every).repeated(len(factors))
+        trial = measurements.of_rows(slice(None, None, every)).repeated(len(factors))
         frame = np.maximum(np.searchsorted(starts, trial.exposure_starts, side="right"), 1) - 1
         moved = (factors[:, None, None] - 1.0) * (starts - starts[0])[frame]
         trial = replace(trial, exposure_starts=trial.exposure_starts + moved)

@@ -146,10 +146,10 @@ class Measurements:
         """Every stack ``count`` times in a row."""
         return take_stacks([self], np.arange(len(self.exposure_starts)).repeat(count))
 
-    def thinned(self, every: int) -> "Measurements":
-        """Every n-th row."""
+    def of_rows(self, rows: slice) -> "Measurements":
+        """The measurements of some rows."""
         names = ("exposure_starts", "displacements", "visible", "information")
-        return replace(self, **{name: getattr(self, name)[:, ::every] for name in names})
+        return replace(self, **{name: getattr(self, name)[:, rows] for name in names})
 
     def only(self, counts: Array) -> "Measurements":
         """The measurements with information 0 in the rows where ``counts`` (B, N) is False."""

@@ -86,6 +86,10 @@ class RowGradients:
         """The gradients of some stacks; they are copied."""
         return RowGradients(*(values[index] for values in vars(self).values()))
 
+    def without_images(self) -> "RowGradients":
+        """The gradients without their images, which take most of the memory and serve further rounds."""
+        return replace(self, images=self.images.new_empty(0))
+
 
 def row_gradients(
     spectra: _WarpedRows,

@@ -94,7 +94,9 @@ def _correlate_bands(
     ).flatten(0, 1)
     lags_y, lags_x = 2 * reach[0] + 1, 2 * reach[1] + 1
     cross = template.new_zeros(len(template), lags_y, lags_x)
-    step = 8  # rows of templates per product: in products of more, most row pairs belong to no lag
+    # Rows of templates per product. For many lags, all: 45 templates of 32 x 66 px take 8 ms instead of 26 ms with 8
+    # rows, of 32 x 500 px as long. For few lags, most row pairs of such a product belong to none: 8 take half the time.
+    step = height if lags_y > height else 8
     for top in range(0, height, step):
         rows = template[:, top : top + step]
         searched = search[:, top : top + rows.shape[1] + lags_y - 1]

@@ -6,6 +6,7 @@ offset over its whole width.
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.chunking import at_once, chunks
+from rsvib_torch.core.chunking import at_once, chunks, runs
 from rsvib_torch.core.fourier import fast_length
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.progress import steps
@@ -179,15 +180,44 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
         A batch of B offset curves, axes (x, y) in row order.
     """
     check_choice("registration", options.registration, tuple(BAND_METHODS))
-    band_rows, search = options.band_rows, options.search
+    band_rows = options.band_rows
     batch, num_frames, num_rows, width = grey.shape
     timing.check_rows(num_rows)
     check_frame_size(num_rows, width, options)
+    tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
+    advance, bytes_of_frame = steps(batch * (num_frames - 1), "pairs"), 3 * num_rows * width * grey.element_size()
+    parts = [
+        _bands_of_pairs(grey[:, pairs.start : pairs.stop + 1], tops, options, advance)
+        for pairs in runs(num_frames - 1, at_once(batch * bytes_of_frame, grey.device, cpu_bytes=2**26))
+    ]
+    offsets, quality = (torch.cat(values, 1) for values in zip(*parts, strict=True))
+    rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
+    starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
+    index = torch.arange(num_frames, device=grey.device)
+    return OffsetCurve(
+        pairs=torch.stack([index[:-1], index[1:]], dim=-1),
+        rows=rows,
+        times=starts[:-1],
+        later_times=starts[1:],
+        offsets=offsets,
+        quality=quality,
+        heights=(band_rows, band_rows),
+    )
+
+
+def _bands_of_pairs(
+    grey: Tensor, tops: Tensor, options: RegistrationOptions, advance: Callable[..., None]
+) -> tuple[Tensor, Tensor]:
+    """Offsets (B, T - 1, N, 2) of bands with first rows ``tops`` in frames (B, T, H, W), and their quality.
+
+    ``advance`` is called with the number of pairs that are done.
+    """
+    band_rows, search = options.band_rows, options.search
+    batch, num_frames, _, width = grey.shape
     # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise;
     # contiguous images are filtered 14 times faster
     sigma = torch.ones(1, 2, dtype=grey.dtype, device="cpu")  # px; from numbers Kornia makes it on the default device
     grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
-    tops = torch.arange(0, num_rows - band_rows + 1, options.band_step, device=grey.device)
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     # Pairs at a time: their transforms (2.5 MB each), and below their windows, stay in the cache of a CPU.
     parts = chunks(num_frames - 1, batch * 2**21, grey.device)
@@ -202,7 +232,6 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
     together = at_once(bytes_of_pair, grey.device, cpu_bytes=2**24)
     offsets = grey.new_full((len(first), len(tops), 2), torch.nan, dtype=torch.float64)
     quality = offsets.new_zeros(offsets.shape[:2])
-    advance = steps(len(first), "pairs")
     for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(together)]:
         task = BandTask(first[pairs], second[pairs], coarse[pairs], tops, band_rows, search)
         measured, correlation = BAND_METHODS[options.registration](task)
@@ -210,18 +239,8 @@ def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions)
         offsets[pairs] = torch.where(good[..., None], measured, torch.nan).double()
         quality[pairs] = torch.where(good, correlation, 0.0).double()
         advance(len(correlation))
-    rows = tops.to(torch.float64) + 0.5 * (band_rows - 1)
-    starts = timing.frame_starts(num_frames, grey.device)[:, None] + rows * timing.row_time
-    index = torch.arange(num_frames, device=grey.device)
-    return OffsetCurve(
-        pairs=torch.stack([index[:-1], index[1:]], dim=-1),
-        rows=rows,
-        times=starts[:-1],
-        later_times=starts[1:],
-        offsets=offsets.unflatten(0, (batch, num_frames - 1)),
-        quality=quality.unflatten(0, (batch, num_frames - 1)),
-        heights=(band_rows, band_rows),
-    )
+    shape = (batch, num_frames - 1)
+    return offsets.unflatten(0, shape), quality.unflatten(0, shape)
 
 
 def _without_row_means(images: Tensor) -> Tensor:

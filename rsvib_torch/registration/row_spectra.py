@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks, gathered
+from rsvib_torch.core.chunking import at_once, chunks, gathered, runs
 from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases, squared_modulus
 from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
 
@@ -38,11 +38,19 @@ class RowSpectra:
     ) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly
-        pieces = (
-            (rows, torch.fft.rfft(extend_rows(coefficients.sub_(level).div_(contrast), self.length, hold=0.0)))
-            for rows, coefficients in bspline_coefficient_rows(frames, DEGREE)
-        )
-        self.values = gathered(pieces, self.height, frames.ndim - 2)
+        # Frames at a time, so that copies of few need memory, and rows of these at a time, which stay in the cache.
+        bytes_of_frame = 4 * frames[:, 0].numel() * frames.element_size()
+        level, contrast = (torch.as_tensor(x).expand(*frames.shape[:2], 1, 1) for x in (level, contrast))
+
+        def transformed(part: slice) -> Tensor:
+            rows_of_frames = (
+                (rows, extend_rows(coefficients.sub_(level[:, part]).div_(contrast[:, part]), self.length, hold=0.0))
+                for rows, coefficients in bspline_coefficient_rows(frames[:, part], DEGREE)
+            )
+            return gathered(((rows, torch.fft.rfft(values)) for rows, values in rows_of_frames), self.height, 2)
+
+        parts = runs(frames.shape[1], at_once(bytes_of_frame, frames.device, cpu_bytes=2**26))
+        self.values = gathered(((part, transformed(part)) for part in parts), frames.shape[1], 1)
         self._index_rows()
         self.frequencies = torch.fft.rfftfreq(self.length, dtype=torch.float64, device=frames.device)
         self._band = slice(0, len(self.frequencies))

@@ -118,7 +118,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.psf_figure(rsv.Vibration(1e6, 50.0), TIMING, 96), "point spread functions of 24 rows"),
         (
             lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, band_rows=16, band_step=8, search=6),
-            "frames cover 2.01 s; starts of the swept model .* at most .* s: pass fewer frames",
+            "frames cover 2.01 s; starts of the swept model .* at most .* s: pass larger band_rows",
         ),
         (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, method="banded", half_rows=10**9), "half_rows must be at most"),
         (

@@ -118,6 +118,26 @@ def test_noise_that_hides_the_scene_is_refused(scene, contrast):
         assert "the offsets of row bands differ" in str(free)
 
 
+@pytest.mark.parametrize("seed", [600, 602, 603])  # without the probability of chance, 7 of 10 axes were reliable
+def test_tones_that_noise_explains_as_well_are_refused(seed):
+    noise = 0.5 + 0.02 * torch.randn(6, 256, 160, generator=torch.Generator().manual_seed(seed))
+    found = rsv.detect_swept_tone(noise, TIMING)
+    assert not found.reliable.any()
+    assert "tone_of_chance" in {reason.code for of_axis in found.findings for reason in of_axis}
+
+
+def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):
+    # starts are searched in 67 of these 90 frames
+    timing = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=110)
+    swept = tone(2.5, 83.0, decay=8.0, chirp=20.0, phase=0.4)
+    small = scene[: 100 + 2 * MARGIN, : 128 + 2 * MARGIN]
+    frames = torch.from_numpy(take_frames(small, timing, swept, 90, 0.004, samples=8)).float()
+    found = rsv.detect_swept_tone(frames, timing)
+    assert found.reliable.all()
+    for name, true in (("amplitude", 2.5), ("frequency", 83.0), ("decay", 8.0), ("chirp", 20.0)):
+        assert ((getattr(found, name) - true).abs() < 4 * found.std[name] + 0.002 * true).all(), name
+
+
 def test_columns_read_in_reverse(frames, found):
     timing = rsv.SensorTiming(6e-5, 20, 270, scan_axis=-1, readout_direction="reverse")
     other = rsv.detect_swept_tone(frames.flip(-2).transpose(-2, -1), timing)

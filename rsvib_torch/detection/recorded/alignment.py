@@ -267,7 +267,9 @@ def align_motion(
     clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
-        measured, _ = measure_groups(groups, rowwise, clock.motion(turned).expanded(1).to(grey.device))
+        measured, _ = measure_groups(
+            groups, rowwise, clock.motion(turned).expanded(1).to(grey.device), keep_images=False
+        )
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
         clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     aligned = clock.motion(turned)

@@ -10,14 +10,18 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
+from scipy import linalg
 
+from rsvib_torch.core.progress import steps
 from rsvib_torch.core.splines import bspline_weights
+from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces
 from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
+from rsvib_torch.detection.shapes.free import normal_bands
 
 DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
+_GRID_FRAMES = 24  # frames whose minima over the grid of row times are refined with all frames
 GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wider for motions that are accepted
 
 
@@ -49,13 +53,17 @@ def row_time_of_splines(
     ``places`` are rows from the top of the image; readout directions are 1.0 and -1.0.
     """
     problem = _Problem.of(places, num_rows, high)
+    coarse_problem = _Problem.of(places.of_first_frames(_GRID_FRAMES), num_rows, high)
     count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
     sizes = [low * (high / low) ** (i / count) for i in range(count + 1)]
     grid = sorted(direction * size for direction in directions for size in sizes)
     period, spacing = places.period, places.period
     blank = period - num_rows * high
     while spacing > max(0.7 * blank, 0.1 * period):
-        costs = [problem.evaluate(tried, spacing).chi_square for tried in grid]
+        advance, costs = steps(len(grid), "row times"), []
+        for tried in grid:
+            costs.append(coarse_problem.evaluate(tried, spacing).chi_square)
+            advance()
         minima = [i for i, cost in enumerate(costs) if cost <= min(costs[max(i - 1, 0) : i + 2])]
         lowest = sorted(minima, key=costs.__getitem__)[:6]
         found = sorted((problem.refined(grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
@@ -99,29 +107,28 @@ class _Problem:
 
     def evaluate(self, row_time: float, spacing: float) -> _Evaluation:
         """Splines of both axes at a row time, with knots about ``spacing`` apart."""
-        first_record = self.records[0]
-        times = first_record.frames * self.period + first_record.rows * row_time
-        first, last = float(times.amin()), float(times.amax())
+        # 1. The coefficients that each row depends on.
+        record = self.records[0]
+        rows, seen = table(record.rows), table(record.visible)
+        times = table(record.frames) * self.period + rows * row_time
+        first, last = float(times.min()), float(times.max())
         cells = max(1, math.ceil((last - first) / spacing))
-        basis, slope = _basis(times, first, (last - first) / cells, cells)
-        basis = first_record.relative(basis)
+        index, basis, slope = _basis(times, first, (last - first) / cells, cells)
+        weights = np.stack([table(one.weights) for one in self.records])
+        bands = normal_bands(index, basis, seen, weights, cells + DEGREE)
         cost, step, information = 0.0, 0.0, 0.0
-        for record in self.records:
-            root = record.weights.sqrt()[:, None]
-            columns = (root[..., None] * basis).flatten(0, 1)
-            values = (root * record.values).flatten()
-            gram = columns.mT @ columns
-            gram = gram + (1e-10 * gram.diagonal().mean() + 1e-300) * torch.eye(len(gram)).to(gram)
-            factor = torch.linalg.cholesky(gram)
-            solution = torch.cholesky_solve((columns.mT @ values)[:, None], factor)[:, 0]
-            residual = values - columns @ solution
-            by_row_time = (root * record.relative((slope @ solution) * record.rows)).flatten()
-            unexplained = (
-                by_row_time - columns @ torch.cholesky_solve((columns.mT @ by_row_time)[:, None], factor)[:, 0]
-            )
-            cost += float(residual.square().sum()) * float(record.independent)
-            step += float(unexplained @ residual) * float(record.independent)
-            information += float(unexplained @ unexplained) * float(record.independent)
+        for one, weight, band in zip(self.records, weights[..., None], bands, strict=True):
+            # 2. The spline.
+            band[0] += 1e-10 * band[0].mean() + 1e-300
+            factor = linalg.cholesky_banded(band, lower=True, check_finite=False)
+            solution, residual = _fitted(table(one.values), one, index, basis, factor)
+            # 3. The change of the displacements by the row time that no change of the coefficients cancels.
+            by_row_time = table(one.relative(tensor((slope * solution[index]).sum(-1) * rows)))
+            _, unexplained = _fitted(by_row_time, one, index, basis, factor)
+            independent = float(one.independent)
+            cost += float((weight * np.square(residual)).sum()) * independent
+            step += float((weight * unexplained * residual).sum()) * independent
+            information += float((weight * np.square(unexplained)).sum()) * independent
         information = max(information, 1e-300)
         return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
 
@@ -138,13 +145,27 @@ class _Problem:
         return Candidate(sign * size, found.information**-0.5, found.chi_square)
 
 
-def _basis(times: Tensor, first: float, width: float, cells: int) -> tuple[Tensor, Tensor]:
-    """B-splines of degree ``DEGREE`` at times (...), (..., cells + DEGREE), and their derivatives."""
+def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor: Array) -> tuple[Array, Array]:
+    """Coefficients of a spline that is fitted to displacements (N, G) of a record, and its residual (N, G).
+
+    Args:
+        values: The displacements.
+        record: Weights of the rows.
+        index: (N, G, M) coefficients that the displacements depend on.
+        basis: (N, G, M) their factors.
+        factor: Banded Cholesky factor of the normal matrix.
+    """
+    weighted = table(record.weights)[:, None, None] * values[..., None]
+    right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
+    solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)
+    return solution, values - table(record.relative(tensor((basis * solution[index]).sum(-1))))
+
+
+def _basis(times: Array, first: float, width: float, cells: int) -> tuple[Array, Array, Array]:
+    """The B-splines of degree ``DEGREE`` that are not 0 at times (...), (..., 8), their values and derivatives."""
     place = (times - first) / width
-    cell = place.floor().clamp(0.0, cells - 1.0)
-    index = cell.to(torch.int64)[..., None] + torch.arange(DEGREE + 1, device=times.device)
-    lower = bspline_weights(place - cell, DEGREE - 1)
-    pad = torch.nn.functional.pad
-    slopes = (pad(lower, (1, 0)) - pad(lower, (0, 1))) / width
-    empty = torch.zeros(*times.shape, cells + DEGREE, dtype=times.dtype, device=times.device)
-    return empty.scatter(-1, index, bspline_weights(place - cell, DEGREE)), empty.scatter(-1, index, slopes)
+    cell = np.clip(np.floor(place), 0.0, cells - 1.0)
+    index = cell.astype(np.int64)[..., None] + np.arange(DEGREE + 1)
+    values, lower = (table(bspline_weights(tensor(place - cell), degree)) for degree in (DEGREE, DEGREE - 1))
+    none = np.zeros_like(lower[..., :1])
+    return index, values, (np.concatenate([none, lower], -1) - np.concatenate([lower, none], -1)) / width

@@ -30,6 +30,13 @@ class FramePlaces:
         """The measurements with the times of a row time in s."""
         return replace(self.measurements, exposure_starts=self.frames * self.period + self.rows * row_time)
 
+    def of_first_frames(self, count: int) -> "FramePlaces":
+        """The rows that were measured in the first frames only."""
+        rows = (self.frames[0] - self.frames.min()).max(-1) < max(count, 1 + np.ptp(self.frames[0, 0]))
+        measured = self.measurements.of_rows(slice(0, int(rows.argmin()) or None))
+        number = measured.visible.shape[1]
+        return FramePlaces(measured, self.rows[:, :number], self.frames[:, :number], self.period)
+
     def of_axis(self, axis: int, num_rows: int, row_time: float) -> RowRecord:
         """The displacements along one axis, for tones of independent frequencies."""
         measured = self.measurements

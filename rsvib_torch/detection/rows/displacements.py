@@ -24,9 +24,10 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing
+from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing, shown_by_tones
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.registration.gradients import (
     BLOCK,
     RowGradients,
@@ -121,10 +122,12 @@ class _Positions:
         cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
     ) -> "_Positions":
         """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
-        rows = rows_showing(scene_rows, starts, timing, motion)
-        exposure_starts = starts + rows * timing.row_time
-        shift = motion.mean_displacement(exposure_starts, timing.exposure_time)[..., 0] - columns
-        return cls(scene_rows, columns, rows, shift, exposure_starts)
+        if isinstance(motion, Vibration):
+            rows, along = shown_by_tones(scene_rows, starts, timing, motion)
+        else:
+            rows = rows_showing(scene_rows, starts, timing, motion)
+            along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
+        return cls(scene_rows, columns, rows, along - columns, starts + rows * timing.row_time)
 
     def visible(self, height: int, block: int) -> Tensor:
         """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
@@ -422,12 +425,15 @@ def measure_groups(
     timing: RowTiming,
     motion: Motion,
     gradients: list[RowGradients] | None = None,
+    *,
+    keep_images: bool = True,
 ) -> tuple[Measurements, list[RowGradients]]:
-    """``measure_group`` of all groups, the measurements as one record."""
+    """``measure_group`` of all groups, the measurements as one record; ``keep_images`` for further rounds."""
     known = [None] * len(groups) if gradients is None else gradients
     measured, advance = [], steps(sum(group.count for group in groups), "groups")
     for group, of_group in zip(groups, known, strict=True):
-        measured.append(measure_group(group, timing, motion, of_group))
+        part, of_part = measure_group(group, timing, motion, of_group)
+        measured.append((part, of_part if keep_images else of_part.without_images()))
         advance(group.count)
     count = sum(group.count for group in groups)
     measurements = joined_groups([part for part, _ in measured], timing.exposure_time, count)

@@ -101,9 +101,16 @@ class GroupedFrames:
     groups: list[FrameGroups]
     timing: RowTiming
 
-    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> MeasuredRows:
+    def measure(
+        self,
+        motion: Vibration | FreeMotion,
+        gradients: list[RowGradients] | None = None,
+        *,
+        keep_images: bool = True,
+    ) -> MeasuredRows:
         """Measurements around a motion, see ``measure_groups``."""
-        return MeasuredRows(*measure_groups(self.groups, self.timing, self.view(motion), gradients))
+        view = self.view(motion)
+        return MeasuredRows(*measure_groups(self.groups, self.timing, view, gradients, keep_images=keep_images))
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
@@ -184,13 +191,20 @@ class GroupedStrips(GroupedFrames):
     num_frames: int
     slide: float
 
-    def measure(self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None) -> MeasuredRows:
+    def measure(
+        self,
+        motion: Vibration | FreeMotion,
+        gradients: list[RowGradients] | None = None,
+        *,
+        keep_images: bool = True,
+    ) -> MeasuredRows:
         """Components of the motion of every row (B, N, G, A)."""
         known = [None] * len(self.groups) if gradients is None else gradients
         view, measured, advance = self.view(motion), [], steps(len(self.groups), "groups of strips")
         for group, of_group in zip(self.groups, known, strict=True):
             factors = self.scale.factors
-            measured.append(measure_strips(group, self.timing, motion, view, self.strips, factors, of_group))
+            part, of_part = measure_strips(group, self.timing, motion, view, self.strips, factors, of_group)
+            measured.append((part, of_part if keep_images else of_part.without_images()))
             advance()
         gradients = [of_group for _, of_group in measured]
         measurements = joined_groups([part for part, _ in measured], self.timing.exposure_time, len(self.groups))

@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import linalg
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.chunking import runs
 from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
@@ -46,6 +48,8 @@ from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
+MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
+_SECOND = (1.0, -2.0, 1.0)  # second difference
 _MAX_STD_SEEN = 0.3  # px, of the visible part of a reliable motion; frames of different scenes have more
 
 
@@ -193,16 +197,18 @@ def _detect(
     residual = residual_of_motion(measured, motion[0])
     weighed = measured.reweighted(residual)
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
-    fit = _fit_spline(replace(weighed, independent=share), spacing, record, learn=True)
-    motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     starts = rowwise.frame_starts(stack.images.shape[1])
+    rows_of_report = torch.linspace(0, scale.height - 1, min(32, scale.height), dtype=torch.float64)
+    times = starts[:, None] + rows_of_report * rowwise.row_time + 0.5 * rowwise.exposure_time
+    fit = _fit_spline(replace(weighed, independent=share), spacing, record, table(times).ravel())
+    motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
     of_middle: Motion = motion
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
     of_bands = [*bands_reasons(banded, of_middle[0]), [], []][: scale.axes]
-    report = _report(motion[0], fit, measured, timing, starts, scale, of_bands, rows.differential()[0])
+    report = _report(motion[0], fit, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
 
@@ -246,7 +252,7 @@ def _rounds(
     ``weighted`` gives objects that move by themselves less weight in the first round already.
     """
     for number in range(count):
-        measured = rows.measure(motion.to(rows.groups[0].starts.device))
+        measured = rows.measure(motion.to(rows.groups[0].starts.device), keep_images=False)
         measurements = measured.measurements
         if number or weighted:
             measurements = measurements.reweighted(residual_of_motion(measurements, motion[0]))
@@ -318,19 +324,30 @@ def _moved(measured: Measurements, motion: Motion) -> Array:
     return table(motion.mean_displacement(tensor(measured.exposure_starts), measured.exposure_time))
 
 
-def bands_reasons(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[list[Reason]]:
+def band_errors(banded: Measurements, motion: Motion, *, counted: float = 0.75) -> list[float]:
+    """Mean difference in px of the offsets of the row bands of one stack from a motion in row order, for each axis.
+
+    The best bands count, a fraction ``counted``: clouds may cover the others.
+    """
+    rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
+    errors: list[float] = np.sort(np.abs(rest), 0)[: math.ceil(counted * len(rest))].mean(0).tolist()
+    return errors
+
+
+def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
+    """(N, 2) px, offsets of the bands that were found from displacements (1, N, 2, 2)."""
+    return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
+
+
+def bands_reasons(banded: Measurements, motion: Motion) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the offsets of row bands of one stack contradict.
 
-    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it. The best
-    bands count, a fraction ``counted``: clouds may cover the others.
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it.
     """
-    used = banded.weights[0].min(-1) > 0
-    values, rest = (x[0, used, 1] - x[0, used, 0] for x in (banded.displacements, residual_of_motion(banded, motion)))
+    values = _offsets_of_bands(banded, banded.displacements)
     size = np.abs(values - values.mean(0)).mean(0).tolist()
-    count = math.ceil(counted * len(rest))
-    residual = np.sort(np.abs(rest), 0)[:count].mean(0).tolist()
-    allowed = [max(0.1, 0.3 * axis) for axis in size]  # px; smaller ones are errors of registration, as for tones
-    compared = zip(AXIS_NAMES, residual, allowed, strict=False)
+    allowed = [max(MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
+    compared = zip(AXIS_NAMES, band_errors(banded, motion), allowed, strict=False)
     return [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
 
 
@@ -342,13 +359,13 @@ def unexplained_reasons(axis: str, residual: float, moved: float, model: str) ->
 
 def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) -> FreeMotion:
     """The spline as a batch of one motion; a drift by more than ``largest_drift`` px becomes its image motion."""
-    knots = fit.knots
+    coefficients, knots = tensor(fit.coefficients), tensor(fit.knots)
     centred = knots - knots.mean()
-    speed = (fit.coefficients * centred).sum(-1) / centred.square().sum()
+    speed = (coefficients * centred).sum(-1) / centred.square().sum()
     large = speed[:2].abs() * float(knots[-1] - knots[0]) > speed.new_tensor(largest_drift)
     speed = torch.where(functional.pad(large, (0, len(speed) - 2)), speed, 0.0)  # none of roll and zoom
     drift = Vibration(torch.zeros_like(speed)[None, :, None], 0.0, 0.0, speed[None])
-    return FreeMotion((fit.coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
+    return FreeMotion((coefficients - speed[:, None] * knots)[None], fit.start, fit.spacing, drift)
 
 
 # --- Spline fit ---
@@ -358,107 +375,204 @@ def _motion(fit: "_SplineFit", largest_drift: tuple[float, float] = (0.0, 0.0)) 
 class _SplineFit:
     """Cubic spline ``sum_n c_n B((t - start) / spacing - n + 1)`` of each axis."""
 
-    coefficients: Tensor  # (A, N) float64 px
-    covariance: Tensor  # (A, N, N) float64 px^2 of each axis
+    coefficients: Array  # (A, N) float64 px, with mean 0
     start: float  # time of the first knot in seconds
     spacing: float  # seconds between knots
+    # (K, W, W) float64 px^2 of each axis, covariances of W coefficients from the ``step`` k-th on; none while iterating
+    covariances: list[Array]
+    step: int = 1
 
     @property
-    def knots(self) -> Tensor:
+    def knots(self) -> Array:
         """(N,) s, times of the coefficients."""
-        count = self.coefficients.shape[-1]
-        places = torch.arange(count, dtype=torch.float64, device=self.coefficients.device) - 1.0
-        return self.start + places * self.spacing
+        return self.start + (np.arange(self.coefficients.shape[-1]) - 1.0) * self.spacing
 
-    def columns(self, times: Tensor) -> Tensor:
-        """Derivatives (S, N) of the motion at times (S,) by the coefficients."""
-        count = self.coefficients.shape[-1]
-        place = ((times - self.start) / self.spacing).clamp(0.0, count - 3.0)
-        cell = place.floor().clamp(max=count - 4.0)
-        index = cell.to(torch.int64)[..., None] + torch.arange(4, device=times.device)
-        columns = torch.zeros(len(times), count, dtype=torch.float64, device=times.device)
-        return columns.scatter(-1, index, bspline_weights(place - cell, 3))
+    def variances(self, index: Array, weights: Array) -> Array:
+        """Variances (S, F, A) of linear functions of the coefficients.
+
+        Args:
+            index: (S, M) coefficients of the functions, at most ``step`` apart.
+            weights: (S, F, M) their factors; the sum of a function is 1 or 0.
+        """
+        part = np.minimum(index.min(1) // self.step, len(self.covariances[0]) - 1)
+        place = index - self.step * part[:, None]
+        parts = [values[part[:, None, None], place[:, :, None], place[:, None]] for values in self.covariances]
+        variances = [((weights @ of_axis) * weights).sum(-1) for of_axis in parts]
+        return np.maximum(np.stack(variances, -1), 0.0)
+
+
+def _taps(times: Array, start: float, spacing: float, count: int) -> tuple[Array, Array]:
+    """The four coefficients of ``count`` that a spline at times (...) depends on, (..., 4), and their factors."""
+    place = np.clip((times - start) / spacing, 0.0, count - 3.0)
+    cell = np.minimum(np.floor(place), count - 4.0)
+    return cell.astype(np.int64)[..., None] + np.arange(4), table(bspline_weights(tensor(place - cell), 3))
 
 
 def _fit_spline(
-    measurements: Measurements, spacing: float, record: tuple[float, float], *, learn: bool = False
+    measurements: Measurements, spacing: float, record: tuple[float, float], report_times: Array | None = None
 ) -> _SplineFit:
     """Fit a spline with knots at a spacing in seconds to the measurements of one stack (B = 1), each axis by itself.
 
-    Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood. With ``learn``,
-    the power spectrum of the motion is estimated, for splines of up to 800 knots.
+    Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood. Rows are
+    compared within groups of frames only, so that the normal matrix is banded.
+
+    Args:
+        measurements: The displacements.
+        spacing: Seconds between knots.
+        record: Start and end of the record in seconds.
+        report_times: Times (S,) in s over which the motion has mean 0, if its uncertainty is asked for. The power
+            spectrum of the motion is then estimated as well, for splines of up to 800 knots.
     """
     first, last = record
     axes = measurements.displacements.shape[-1]
     count = math.ceil((last - first) / spacing) + 3
-    shape = _SplineFit(
-        torch.zeros(axes, count, dtype=torch.float64, device="cpu"),
-        torch.zeros(axes, 0, 0, dtype=torch.float64, device="cpu"),
-        first,
-        spacing,
-    )
-    values, covariances = zip(*(_fit_axis(measurements, shape, axis, learn) for axis in range(axes)), strict=True)
-    return replace(shape, coefficients=torch.stack(values), covariance=torch.stack(covariances))
+    coefficients, covariances, step = [], [], 1
+    for axis in range(axes):
+        band, right = _normal_equations(measurements, axis, first, spacing, count)
+        values = measurements.displacements[0, ..., axis] * measurements.visible[0]
+        energy = float((measurements.inverse_variances[0, :, axis, None] * np.square(values)).sum())
+        known = max(float(measurements.num_measurements[0, axis]), 1.0)
+        mean = None
+        if report_times is not None:
+            index, weights = _taps(report_times, first, spacing, count)
+            mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
+        value, covariance, step = _solved_spline(band, right, energy, known, mean)
+        coefficients.append(value - value.mean())
+        covariances += [] if covariance is None else [covariance]
+    return _SplineFit(np.stack(coefficients), first, spacing, covariances, step)
 
 
-def _fit_axis(measurements: Measurements, shape: _SplineFit, axis: int, learn: bool) -> tuple[Tensor, Tensor]:
-    """Coefficients (N,) of one axis and their covariance (N, N)."""
-    values = tensor((measurements.displacements[..., axis] * measurements.visible)[0])
-    weight = tensor(measurements.inverse_variances[0, :, axis])  # the other axes being unknown too
-    count = shape.coefficients.shape[-1]
-    gram = torch.zeros(count, count, dtype=torch.float64, device=values.device)
-    right = torch.zeros(count, dtype=torch.float64, device=values.device)
-    for begin in range(0, len(values), 128):  # scene rows at a time: their columns are (128 G, N)
-        part = slice(begin, begin + 128)
-        design = _design(measurements, shape, axis, part)
-        used = (design != 0).flatten(0, 1).any(0).nonzero()[:, 0]
-        flat = design[..., used].flatten(0, 1)
-        weighted = flat * weight[part, None].expand(-1, design.shape[1]).flatten()[:, None]
-        gram[used[:, None], used] += flat.mT @ weighted
-        right[used] += weighted.mT @ values[part].flatten()
-    energy = (weight[:, None] * values.square()).sum()
+def _normal_equations(
+    measurements: Measurements, axis: int, start: float, spacing: float, count: int
+) -> tuple[Array, Array]:
+    """Lower band (D, N) of the normal matrix of N = ``count`` coefficients of an axis, and its right side (N,)."""
+    seen, starts = measurements.visible[0], measurements.exposure_starts[0]
+    average = measurements.average_times[min(axis, 1)] + measurements.exposure_time
+    nodes, shares = (table(values) for values in gauss_legendre(3 + math.ceil(2 * average / spacing)))
+    times = starts[..., None] + 0.5 * (measurements.exposure_time - average) + average * nodes  # (R, G, Q)
+    index, weights = _taps(times, start, spacing, count)
+    index, weights = index.reshape(*seen.shape, -1), (shares[:, None] * weights).reshape(*seen.shape, -1)
+    weighted = measurements.inverse_variances[0, :, axis, None] * measurements.displacements[0, ..., axis] * seen
+    right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
+    return normal_bands(index, weights, seen, measurements.inverse_variances[0, :, axis][None], count)[0], right
+
+
+def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
+    """Lower bands (A, D, N) of the normal matrices of N coefficients for values relative to their group.
+
+    Args:
+        index: (R, G, M) coefficients that the value of a row in a frame depends on.
+        weights: (R, G, M) their factors.
+        seen: (R, G), 1 where a frame contains the row, else 0.
+        row_weights: (A, R) weights of the rows in each matrix.
+        count: Number N of coefficients.
+    """
+    inside = seen[..., None] > 0
+    first = np.minimum(np.where(inside, index, count - 1).min((1, 2)), count - 1)
+    index = np.where(inside, index, first[:, None, None])
+    bands = np.zeros((len(row_weights), int(np.ptp(index, (1, 2)).max()) + 1, count))
+    for part in runs(len(seen), 32):  # rows at a time, with the coefficients that they depend on
+        used, place = np.unique(index[part], return_inverse=True)
+        visible = seen[part, :, None]
+        flat = len(used) * np.arange(visible.size)[:, None] + place.reshape(visible.size, -1)
+        design = np.bincount(flat.ravel(), weights[part].ravel(), len(used) * visible.size)
+        design = design.reshape(*visible.shape[:2], -1) * visible
+        design -= visible * (design.sum(1, keepdims=True) / np.maximum(visible.sum(1, keepdims=True), 1.0))
+        apart = used[:, None] - used
+        within = (apart >= 0) & (apart < bands.shape[1])
+        for band, weight in zip(bands, row_weights[:, part], strict=True):
+            gram = (design * weight[:, None, None]).reshape(visible.size, -1).T @ design.reshape(visible.size, -1)
+            band[apart[within], np.broadcast_to(used, apart.shape)[within]] += gram[within]
+    return bands
+
+
+def _solved_spline(
+    band: Array, right: Array, energy: float, known: float, mean: Array | None
+) -> tuple[Array, Array | None, int]:
+    """Coefficients (N,) of a smooth spline, their covariances and the step of these as in ``_SplineFit``.
+
+    Args:
+        band: Lower band (D, N) of the normal matrix.
+        right: (N,).
+        energy: Weighted sum of the squared displacements.
+        known: Number of independent displacements.
+        mean: (N,) function of the coefficients that has no variance; None for no covariances.
+    """
+    count = len(right)
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
-    known = max(float(measurements.num_measurements[0, axis]), 1.0)
-    scale = gram.diagonal().mean() + 1e-300
-    second = torch.eye(count, dtype=torch.float64, device=values.device).diff(n=2, dim=0)
-    bend = second.mT @ second
-    base = gram + scale * 1e-3 / count  # on every element: the undetermined mean becomes 0
+    scale = band[0].mean() + 1e-300
+    bend = np.zeros((max(3, len(band)), count))  # of the squared second differences
+    for j, factor_j in enumerate(_SECOND):
+        for i, factor_i in enumerate(_SECOND[j:]):
+            bend[i, j : j + count - 2] += factor_i * factor_j
+    base = np.pad(band, [(0, len(bend) - len(band)), (0, 0)])
+    base[0, count // 2] += scale  # the mean is undetermined
 
-    def solution(smoothness: float) -> tuple[Tensor, Tensor]:
-        """Coefficients and Cholesky factor of the normal matrix."""
-        factor = torch.linalg.cholesky(base + smoothness * scale * bend)
-        return torch.cholesky_solve(right[:, None], factor)[:, 0], factor
+    def solution(smoothness: float) -> tuple[Array, Array]:
+        """Coefficients and banded Cholesky factor of the normal matrix."""
+        factor = linalg.cholesky_banded(base + smoothness * scale * bend, lower=True, check_finite=False)
+        return linalg.cho_solve_banded((factor, True), right, check_finite=False), factor
 
-    def evidence(smoothness: float) -> Tensor:
+    def evidence(smoothness: float) -> float:
         """Logarithm of the marginal likelihood."""
         coefficients, factor = solution(smoothness)
-        residual = torch.maximum(energy - right @ coefficients, rounding) + 1e-300
-        logarithm = 2 * factor.diagonal().log().sum() - (count - 2) * math.log(smoothness)
-        return -0.5 * (known * (residual / known).log() + logarithm)
+        residual = max(energy - float(right @ coefficients), rounding) + 1e-300
+        logarithm = 2 * float(np.log(factor[0]).sum()) - (count - 2) * math.log(smoothness)
+        return -0.5 * (known * math.log(residual / known) + logarithm)
 
-    decade = max((10.0**power for power in range(-8, 5)), key=lambda tried: float(evidence(tried)))
-    thirds = (decade * 10 ** (step / 3) for step in (0, -2, -1, 1, 2))
-    smoothness = max(thirds, key=lambda tried: float(evidence(tried)))
+    decade = max((10.0**power for power in range(-8, 5)), key=evidence)
+    smoothness = max((decade * 10 ** (step / 3) for step in (0, -2, -1, 1, 2)), key=evidence)
     coefficients, factor = solution(smoothness)
-    noise = float(torch.maximum(energy - right @ coefficients, rounding) / known)
-    if learn and count <= 800 and noise > 0:  # the cost grows with knots^3, 20 times
-        return _fit_with_spectrum(gram, right, noise, smoothness * float(scale))
-    return coefficients, noise * torch.cholesky_inverse(factor)
+    noise = max(energy - float(right @ coefficients), rounding) / known
+    if mean is None:
+        return coefficients, None, 1
+    if count <= 800 and noise > 0:  # the cost grows with knots^3, 20 times
+        lower = np.zeros((count, count))
+        for apart, values in enumerate(band):
+            lower[np.arange(apart, count), np.arange(count - apart)] = values[: count - apart]
+        gram = lower + np.tril(lower, -1).T
+        solved = _fit_with_spectrum(tensor(gram), tensor(right), noise, smoothness * float(scale))
+        coefficients, covariance = map(table, solved)
+        step, covariances, of_mean = count, covariance[None], covariance @ mean
+    else:
+        step, covariances = _inverse_near_diagonal(base + smoothness * scale * bend)
+        covariances *= noise
+        of_mean = noise * linalg.cho_solve_banded((factor, True), mean, check_finite=False)
+    # the mean is taken out: c - (mean . c) instead of c
+    size = covariances.shape[1]
+    place = np.minimum(step * np.arange(len(covariances))[:, None] + np.arange(size), count - 1)
+    covariances = covariances - of_mean[place][:, None] - of_mean[place][:, :, None] + mean @ of_mean
+    return coefficients, covariances, step
 
 
-def _design(measurements: Measurements, shape: _SplineFit, axis: int, part: slice) -> Tensor:
-    """Derivatives (n, G, N) of the relative displacements of some scene rows by the coefficients of an axis."""
-    exposure_starts = tensor(measurements.exposure_starts[0, part])
-    average = measurements.average_times[axis if axis < 2 else 0] + measurements.exposure_time
-    nodes, weights = gauss_legendre(3 + math.ceil(2 * average / shape.spacing))
-    first = exposure_starts + 0.5 * (measurements.exposure_time - average)
-    columns = torch.zeros(*exposure_starts.shape, 1, dtype=torch.float64, device=exposure_starts.device)
-    for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True):
-        at = (first + average * node).flatten()
-        columns = columns + weight * shape.columns(at).unflatten(0, exposure_starts.shape)
-    seen = tensor(measurements.visible[0, part])[..., None]
-    mean = (seen * columns).sum(1, keepdim=True) / seen.sum(1, keepdim=True).clamp(min=1.0)
-    return seen * (columns - mean)
+def _inverse_near_diagonal(band: Array) -> tuple[int, Array]:
+    """Parts (K, 2 B, 2 B) of the inverse of a matrix, from the row and column k B on, and B.
+
+    Args:
+        band: Its lower band (B, N). Blocks of B rows are eliminated from the last to the first; the inverse follows
+            from the first to the last.
+    """
+    width, count = band.shape
+    blocks = max(2, -(-count // width))
+    whole = np.zeros((width, (blocks + 1) * width))
+    whole[:, :count], whole[0, count:] = band, 1.0
+    row, column = np.indices((2 * width, width))
+    apart, first = row - column, width * np.arange(blocks)[:, None, None]
+    columns = np.where((apart >= 0) & (apart < width), whole[apart % width, first + column], 0.0)
+    diagonal, below = columns[:, :width], columns[:, width:]  # (K + 1, B, B)
+    diagonal = diagonal + np.tril(diagonal, -1).swapaxes(1, 2)
+    inverses = [np.linalg.inv(diagonal[-1])]
+    for k in range(blocks - 2, -1, -1):
+        inverses.append(np.linalg.inv(diagonal[k] - below[k].T @ inverses[-1] @ below[k]))
+    inverses.reverse()
+    parts, before = np.empty((blocks - 1, 2 * width, 2 * width)), inverses[0]
+    for k, part in enumerate(parts):
+        factor = inverses[k + 1] @ below[k]
+        part[:width, :width], part[width:, :width] = before, -factor @ before
+        part[:width, width:] = part[width:, :width].T
+        part[width:, width:] = inverses[k + 1] + factor @ before @ factor.T
+        before = part[width:, width:]
+    return width, parts
 
 
 def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
@@ -507,30 +621,19 @@ def _report(
     fit: _SplineFit,
     measured: Measurements,
     timing: SensorTiming,
-    starts: Tensor,
+    times: Tensor,
     scale: FieldScale,
     of_bands: list[list[Reason]],
     apart: Array,
 ) -> MotionDetection:
-    """The motion in image axes, and its uncertainty at up to 32 rows of every frame.
+    """The motion in image axes, and its uncertainty at times (T, R) of rows of every frame.
 
     ``of_bands`` are the reasons of each axis from the row bands, ``apart`` (2,) px the rms difference of the
     displacements along a row that the motion does not explain.
     """
-    num_rows = scale.height
-    rows = torch.linspace(0, num_rows - 1, min(32, num_rows), dtype=torch.float64, device=starts.device)
-    times = starts[:, None] + rows * timing.row_time + 0.5 * timing.exposure_time
-    columns = fit.columns(times.flatten())
-    mean = columns.mean(0)
-    visible, common = _visible_and_common(fit, measured)
-
-    def variance(of: Tensor) -> Tensor:
-        """Variances (S, 2) of linear functions (S, N) of the coefficients of each axis."""
-        return torch.stack([((of @ covariance) * of).sum(-1).clamp(min=0.0) for covariance in fit.covariance], -1)
-
-    std = variance(columns - mean).sqrt().unflatten(0, times.shape)
-    std_seen = variance(visible).mean(0).sqrt()
-    unseen = variance(common - mean).mean(0).sqrt()
+    index, weights = _taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
+    std = tensor(np.sqrt(fit.variances(index, weights[:, None]))[:, 0]).unflatten(0, times.shape)
+    std_seen, unseen = map(tensor, _visible_and_common(fit, measured))
     rest = tensor(measured.unexplained(residual_of_motion(measured, motion))[0])
     value = motion.displacement(times)
     value = value - value.mean((0, 1))
@@ -558,16 +661,23 @@ def _report(
     )
 
 
-def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Tensor, Tensor]:
-    """Linear functions of the coefficients, for scene rows in several frames.
+def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:
+    """(A,) px, rms standard deviations for scene rows in several frames.
 
-    Returns:
-        (S, N), the displacement in each frame less the mean over the frames; (R, N), that mean.
+    Those of the displacement in each frame less the mean over the frames, and those of that mean.
     """
-    seen = tensor(measured.visible[0])
+    seen = measured.visible[0]
     several = seen.sum(-1) > 1
-    seen = seen[several]
-    exposure_starts = tensor(measured.exposure_starts[0])[several] + 0.5 * measured.exposure_time
-    columns = fit.columns(exposure_starts.flatten()).unflatten(0, seen.shape)
-    mean = (seen[..., None] * columns).sum(1) / seen.sum(-1)[:, None]
-    return (columns - mean[:, None])[seen > 0], mean
+    seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
+    first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
+    index, weights = _taps(np.where(seen > 0, times, first), fit.start, fit.spacing, fit.coefficients.shape[-1])
+    sums = np.zeros((2, len(fit.coefficients)))
+    for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
+        frames = seen[part].shape[1]
+        of_frames = (np.eye(frames)[:, :, None] * weights[part, None]).reshape(-1, frames, 4 * frames)  # (n, G, 4 G)
+        share = seen[part] / seen[part].sum(1, keepdims=True)
+        mean = (share[:, :, None] * of_frames).sum(1, keepdims=True)
+        indices = index[part].reshape(-1, 4 * frames)
+        of_visible = fit.variances(indices, of_frames - mean)
+        sums += np.stack([(of_visible * seen[part, :, None]).sum((0, 1)), fit.variances(indices, mean).sum((0, 1))])
+    return np.sqrt(sums[0] / seen.sum()), np.sqrt(sums[1] / len(seen))

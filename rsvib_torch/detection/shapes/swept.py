@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,11 +15,13 @@ from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.splines import gauss_legendre
-from rsvib_torch.core.tables import table, tensor
+from rsvib_torch.core.tables import Array, split_axis, table, tensor, unit_wave
 from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import (
+    MAX_BAND_ERROR,
+    band_errors,
     bands_reasons,
     residual_of_motion,
     rms_motion,
@@ -26,6 +29,7 @@ from rsvib_torch.detection.shapes.free import (
     unexplained_reasons,
 )
 from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.tones.periodogram import explained_power
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
@@ -43,8 +47,12 @@ from rsvib_torch.options import RegistrationOptions, SweptToneOptions
 # 90 Hz as 83.6 ± 1.1 Hz with a decay of 68 ± 6 /s); of 12 in three frames and 48 in four frames, none.
 _MIN_FRAMES = 3
 _MAX_STD = 5.0  # standard deviations: fits nearer to the best one in chi-square are not excluded
-_MAX_STARTS = 1_000_000  # fits of the grid of starts; 325,000 take 11 s for 16 frames of 200 rows
+_E_FOLDS = (-4.0, 0.0, 4.0, 10.0, 20.0)  # decays within the record that are tried
+_STARTS = 7.5  # starts over the squared number of periods of the highest frequency: sweeps, summed over frequencies
+_MAX_STARTS = 100_000  # the search takes 0.5 s for frames of 266 rows; a part of the record has fewer
 _F_THRESHOLD = 14.0  # decrease of chi-square per parameter: the maximum of noise over the grid of starts stays below
+# probability; of 96 axes of frames of noise, 54 were reliable without this limit and 0 of 60 with it
+_MAX_CHANCE = 0.01
 _TONE = ("amplitude", "frequency", "decay", "chirp", "phase")
 _STD_SHAPES = dict.fromkeys(("amplitude", *(f"std[{name!r}]" for name in _TONE)), "... 2")
 
@@ -128,8 +136,9 @@ class SweptTone(
 def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: SweptToneOptions) -> SweptTone:
     """Detect one tone an axis whose amplitude decays or grows exponentially and whose frequency changes linearly.
 
-    Start values come from the offsets of row bands, over a grid of frequencies, sweeps and decays. The fit is then
-    repeated with displacements measured on the images around it, row by row.
+    Start values come from the offsets of row bands, over a grid of frequencies, sweeps and decays; in long stacks from
+    the part of the record that moves most, from which the tone is followed into the rest. The fit is then repeated with
+    displacements measured on the images around it, row by row.
 
     Args:
         frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W) of at least two frames; tensor, array, list of
@@ -142,8 +151,8 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
 
     Raises:
         TypeError: If frames are not numbers.
-        ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or the frames cover
-            more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
+        ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or three frames
+            cover more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 
     Note:
         A result of two frames is never reliable: decay, sweep and frequency replace each other there.
@@ -192,9 +201,10 @@ class _Fitted:
 def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int) -> _Fitted:
     """Fit of one stack: start, then rounds of measuring and fitting."""
     rowwise, curve, record = start_curve(stack, timing, bands)
-    measured = banded = measurements_of_curve(curve, rowwise, bands.band_step)
+    banded = measurements_of_curve(curve, rowwise, bands.band_step)
     highest = 0.5 / (bands.band_rows * rowwise.row_time)
-    starts = [_start(measured, axis, record, highest) for axis in range(2)]
+    pairs = curve.quality.shape[1]
+    starts = [_start(banded, axis, pairs, record, highest) for axis in range(2)]
     fits = torch.stack([start[0] for start in starts])
 
     def motion_of(values: Tensor) -> FreeMotion:
@@ -205,7 +215,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     )
     for _ in range(iterations):
         motion = motion_of(fits)
-        measured, _ = measure_groups(groups, rowwise, motion.expanded(1).to(stack.images.device))
+        measured, _ = measure_groups(groups, rowwise, motion.expanded(1).to(stack.images.device), keep_images=False)
         weighed = measured.reweighted(residual_of_motion(measured, motion))
         solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
         starts = [one[0][:4] for one in solved]
@@ -223,7 +233,32 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     uncertain = torch.stack([_rms_std(_relative(measured, _columns(times, fits[i])), covariances[i]) for i in range(2)])
     moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
     against = bands_reasons(banded, motion)
+    chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
+    for axis, error in enumerate(band_errors(banded, motion)):
+        if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
+            against[axis].append(Reason("tone_of_chance", AXIS_NAMES[axis], chance[axis], _MAX_CHANCE))
     return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, frames)
+
+
+def _chance(banded: Measurements, motion: FreeMotion, pairs: int, candidates: float) -> list[float]:
+    """Probability for each axis that the best candidate explains as much of the offsets of row bands by chance.
+
+    Without a scene, the offsets of a frame pair scatter about a common value, because bands are searched for near it.
+    The deviations from it count. A tone leaves a fraction r of the power of n deviations of noise or less with the
+    probability ``r^((n - 2) / 2)``.
+    """
+    rest = residual_of_motion(banded, motion)
+    weight = split_axis(banded.reweighted(rest).weights[0], 0, pairs, -1)  # (P, N, 2)
+
+    def power(displacements: Array) -> Array:
+        """(2,) weighted sum of the squared deviations from the mean of each pair."""
+        offsets = split_axis(np.diff(displacements[0], axis=1)[:, 0], 0, pairs, -1)
+        mean = (weight * offsets).sum(1, keepdims=True) / np.maximum(weight.sum(1, keepdims=True), 1e-300)
+        return (weight * np.square(offsets - mean)).sum((0, 1))
+
+    left = power(rest) / np.maximum(power(banded.displacements), 1e-300)
+    freedom = np.maximum((weight > 0).sum(1) * float(banded.independent) - 1, 0).sum(0)
+    return np.minimum(candidates * left ** (0.5 * np.maximum(freedom - 2, 0)), 1.0).tolist()
 
 
 def _equally_good(
@@ -273,54 +308,90 @@ def _relative(measured: Measurements, values: Tensor) -> Tensor:
     return tensor(measured.relative(table(values)[None])[0])
 
 
-def _start(measured: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
-    """Fits (S, 6), best first, from a grid of frequencies, sweeps and decays: from the four best starts of each decay.
+def _start(banded: Measurements, axis: int, pairs: int, record: tuple[float, float], highest: float) -> Tensor:
+    """Fits (S, 6), best first, to the offsets of the row bands of a number of frame pairs.
 
     Decay, sweep and frequency replace each other within a short record, so that fits from one start end in a minimum of
-    another tone.
+    another tone. The best starts of a grid are therefore fitted, in a part of the record that bounds the number of
+    starts; the best fits follow the tone into the rest of the record.
     """
-    middle, span = 0.5 * (record[0] + record[1]), record[1] - record[0]
-    if 7.5 * (span * highest) ** 2 > _MAX_STARTS:  # sum of the numbers of sweeps over all frequencies, five decays
-        longest = math.sqrt(_MAX_STARTS / 7.5) / highest
+    # 1. The part of the record in which the offsets are largest: a tone may have decayed in the others.
+    bands, period = banded.visible.shape[1] // pairs, (record[1] - record[0]) / (pairs + 1)
+    longest = math.sqrt(_MAX_STARTS / _STARTS) / highest / period  # frame periods
+    count = min(pairs, max(_MIN_FRAMES - 1, math.floor(longest) - 1))
+    offsets, weight = np.diff(banded.displacements[0, ..., axis])[:, 0], banded.weights[0, :, axis]
+    power = weight * np.square(offsets - np.average(offsets, weights=weight + 1e-300))
+    power = np.convolve(power.reshape(pairs, bands).sum(1), np.ones(count), "valid")
+    first, end = int(power.argmax()), int(power.argmax()) + count
+    # 2. Its best starts, and their fits to a part that becomes twice as long until it is the record.
+    fits = _best_starts(banded.of_rows(slice(first * bands, end * bands)), axis, record, highest)
+    while True:
+        fits = _settle(banded.of_rows(slice(first * bands, end * bands)), axis, record, fits)[0]
+        if end - first == pairs:
+            return fits
+        more = (end - first + 1) // 2
+        first, end, fits = max(0, first - more), min(pairs, end + more), fits[:4]
+
+
+def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], highest: float) -> Tensor:
+    """Start parameters (S, 6) from a grid of frequencies, sweeps and decays: the four best of each decay.
+
+    The offset of a frame pair by a start is ``p(t') E(t') - p(t) E(t)`` with ``E = exp(2 pi i f t)`` and p of its decay
+    and sweep. All sums over the offsets are products of a matrix of p and one of E.
+    """
+    times = banded.exposure_starts[0] + 0.5 * banded.exposure_time  # (N, 2)
+    middle, span = 0.5 * (times.max() + times.min()), np.ptp(times)
+    times = times - middle
+    if _STARTS * (span * highest) ** 2 > 10 * _MAX_STARTS:
+        longest = math.sqrt(10 * _MAX_STARTS / _STARTS) / highest
         raise ValueError(
-            f"frames cover {span:.3g} s; starts of the swept model up to {highest:.4g} Hz are searched in at most "
-            f"{longest:.3g} s: pass fewer frames, or larger band_rows for lower frequencies"
+            f"frames cover {span:.3g} s; starts of the swept model up to {highest:.4g} Hz are searched in "
+            f"at most {longest:.3g} s: pass larger band_rows for lower frequencies, or frames at shorter intervals"
         )
-    grid = []
-    for frequency in torch.arange(0.5 / span, highest, 0.5 / span, dtype=torch.float32, device="cpu").tolist():
-        sweep = 1.5 * frequency / span  # Hz/s, at most
-        steps = max(1, round(sweep * span**2 / 2.0))
-        grid += [
-            (0.0, 0.0, frequency, decay / span, sweep * step / steps, 0.0)
-            for step in range(-steps, steps + 1)
-            for decay in (-4.0, 0.0, 4.0, 10.0, 20.0)  # e-folds in the record
-        ]
-    fits = torch.tensor(grid, dtype=torch.float64, device="cpu")
-    weight = tensor(measured.inverse_variances[0, :, axis])
-    values = tensor(measured.displacements[0, ..., axis] * measured.visible[0])[..., None]
-    times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - middle
-    drift = _relative(measured, times[..., None])[..., 0]
-    gains = []
-    for part in fits.split(32):  # (N, G, 32, 3) values at a time
-        cosine, sine = _waves(times[..., None], part)
-        columns = [_relative(measured, wave) for wave in (cosine, sine)] + [drift[..., None].expand_as(cosine)]
-        design = torch.stack(columns, -1)
-        gram = torch.einsum("ngcp,n,ngcq->cpq", design, weight, design)
-        right = torch.einsum("ngcp,n,ng->cp", design, weight, values[..., 0])
-        ridge = torch.diag_embed(1e-9 * gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300))
-        gains.append((right * torch.linalg.solve(gram + ridge, right[..., None])[..., 0]).sum(-1))
-    chosen: list[int] = []
-    order = torch.cat(gains).argsort(descending=True).tolist()
-    for decay in sorted({entry[3] for entry in grid}):
-        of_decay: list[int] = []
-        for place in order:
-            if len(of_decay) == 4:
-                break
-            apart = all(abs(grid[place][2] - grid[other][2]) > 0.6 / span for other in of_decay)
-            if grid[place][3] == decay and apart:
-                of_decay.append(place)
-        chosen += of_decay
-    return _settle(measured, axis, record, fits[chosen])[0]
+    # 1. The grid, with sweeps that change the frequency by up to 75 % from the middle to the ends.
+    frequencies = 0.5 / span * np.arange(1, max(2, math.ceil(2 * span * highest)))
+    most = max(1, round(0.375 * len(frequencies)))
+    steps = np.arange(-most, most + 1)
+    lowest = np.maximum(np.ceil((np.abs(steps) - 0.5) / 0.375).astype(int) - 1, 0)  # the first frequency of a sweep
+    lowest[most - 1 : most + 2] = 0
+    decays = np.array(_E_FOLDS) / span
+    # 2. Weights, values and the image motion.
+    weight, value = 0.5 * banded.inverse_variances[0, :, axis], np.diff(banded.displacements[0, ..., axis])[:, 0]
+    drift = np.diff(times)[:, 0]
+    drift_drift, drift_value = (weight * drift) @ drift + 1e-300, (weight * drift) @ value
+    earlier, later = unit_wave(2 * math.pi * times.T[..., None] * frequencies)  # (N, F)
+    squares = earlier**2, later**2, earlier * later, later * earlier.conj()
+    gains = np.full((len(decays), len(steps), len(frequencies)), -np.inf)
+    for place, step in enumerate(steps):
+        # 3. Sums over the bands for all decays: products of the wave with values, image motion and itself.
+        envelope = np.exp(
+            -decays[:, None, None] * times + 2j * math.pi * step / span**2 * np.square(times)
+        )  # (D, N, 2)
+        of_earlier, of_later, *of_squares = (wave[:, lowest[place] :] for wave in (earlier, later, *squares))
+        p, q = envelope[..., 0], envelope[..., 1]
+        linear = weight * np.stack([value, drift])[:, None]  # (2, 1, N)
+        with_value, with_drift = (linear * q) @ of_later - (linear * p) @ of_earlier
+        square = (weight * p**2) @ of_squares[0] + (weight * q**2) @ of_squares[1]
+        square -= (2 * weight * p * q) @ of_squares[2]
+        modulus = np.square(np.abs(envelope)).sum(-1) @ weight
+        modulus = modulus[:, None] - 2 * ((weight * q * p.conj()) @ of_squares[3]).real
+        gains[:, place, lowest[place] :] = explained_power(
+            square, modulus * (1 + 1e-9), with_value, with_drift, drift_value, drift_drift
+        )
+    # 4. The four best frequencies of each decay, each with its best sweep.
+    sweep, power = gains.argmax(1), gains.max(1)
+    starts = []
+    for decay, sweep_of, power_of in zip(decays, sweep, power, strict=True):
+        chosen: list[int] = []
+        for k in power_of.argsort()[::-1].tolist():
+            if len(chosen) < 4 and all(abs(k - other) > 1 for other in chosen):
+                chosen.append(k)
+        chirp = 2 * steps[sweep_of[chosen]] / span**2
+        about = 0.5 * (record[0] + record[1]) - middle
+        columns = np.zeros((len(chosen), 6))
+        columns[:, 2], columns[:, 3], columns[:, 4] = frequencies[chosen] + chirp * about, decay, chirp
+        starts.append(columns)
+    return tensor(np.concatenate(starts))
 
 
 def _settle(
@@ -365,6 +436,8 @@ def _settle(
     cost, damping = cost_of(residual), torch.full_like(fits[:, 0], 1e-3)
     settled = torch.zeros_like(cost, dtype=torch.bool)
     for _ in range(25):
+        # the opposite frequency, sweep and sine part are the same tone
+        fits = torch.where((fits[:, 2:3] < 0), fits * fits.new_tensor([1.0, -1.0, -1.0, 1.0, -1.0, 1.0]), fits)
         design = averaged(_columns, fits).flatten(1, 2)  # (S, N G, 6)
         weighted = (design * row_weight.flatten()[:, None]).mT
         gram, right = weighted @ design, weighted @ residual.flatten(1)[..., None]

@@ -75,9 +75,25 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Ar
     products = _transform(time, np.stack([of_drift, frame_weights * values], 1), grid) * attenuation
     with_drift, with_values = np.moveaxis(products, 1, 0)
 
-    # 4. Normal equations of cosine and sine after elimination of the image motion, and the decrease by their solution.
-    cosine = 0.5 * (R + Q.real) + prior - np.square(with_drift.real) / drift_drift
-    sine = 0.5 * (R - Q.real) + prior - np.square(with_drift.imag) / drift_drift
+    return explained_power(Q, R + 2 * prior, with_values, with_drift, drift_value, drift_drift)
+
+
+def explained_power(
+    Q: Array, R: Array, with_values: Array, with_drift: Array, drift_value: Array, drift_drift: Array
+) -> Array:
+    """Decrease of the weighted sum of squares by a wave and an image motion.
+
+    Args:
+        Q: Weighted sums of the square of the complex wave.
+        R: Those of its squared modulus.
+        with_values: Those of its product with the values.
+        with_drift: Those of its product with the drift by a unit image motion.
+        drift_value: Weighted sum of the products of drift and values.
+        drift_drift: That of the squares of the drift.
+    """
+    # Normal equations of cosine and sine after elimination of the image motion, and the decrease by their solution.
+    cosine = 0.5 * (R + Q.real) - np.square(with_drift.real) / drift_drift
+    sine = 0.5 * (R - Q.real) - np.square(with_drift.imag) / drift_drift
     cross = 0.5 * Q.imag - with_drift.real * with_drift.imag / drift_drift
     right = with_values - with_drift * (drift_value / drift_drift)
     decrease = sine * np.square(right.real) - 2 * cross * right.real * right.imag + cosine * np.square(right.imag)
