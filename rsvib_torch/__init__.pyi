@@ -16,6 +16,7 @@ from .calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_t
 from .detection import (
     ClockAlignment,
     DetectionResult,
+    DisplacementSpectrum,
     MotionCheck,
     MotionDetection,
     RotationAlignment,
@@ -74,8 +75,8 @@ from .report import (
     write_isd,
     write_offsets,
     write_stmap,
+    write_table,
     write_vibration,
-    write_windows,
 )
 from .restoration import (
     FixedDewarp,
@@ -98,6 +99,7 @@ __all__ = [
     "Camera",
     "ClockAlignment",
     "DetectionResult",
+    "DisplacementSpectrum",
     "FixedDewarp",
     "FreeMotion",
     "Margins",
@@ -180,7 +182,7 @@ __all__ = [
     "write_offsets",
     "write_stack",
     "write_stmap",
+    "write_table",
     "write_vibration",
-    "write_windows",
 ]
 __version__: str

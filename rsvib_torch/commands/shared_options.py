@@ -27,6 +27,16 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 _TIMES = {"row_time": "--row-time", "exposure_time": "--exposure", "frame_rate": "--frame-rate"}  # required keys
 
 _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10**6, "ns": 10**9}  # per second
+_LENGTH_UNITS = {"m": 1, "cm": 10**2, "mm": 10**3, "um": 10**6, "µm": 10**6, "μm": 10**6, "nm": 10**9}  # per metre
+
+
+def _with_unit(text: str, units: Mapping[str, int], expected: str) -> float:
+    """A number or a fraction with one of the units, which state how many of them are 1."""
+    unit = text.strip().lstrip("0123456789./eE+-")
+    try:
+        return float(Fraction(text.strip().removesuffix(unit)) / units[unit])
+    except (ValueError, ArithmeticError, KeyError) as error:
+        raise typer.BadParameter(f"expected {expected}, got {text!r}") from error
 
 
 def seconds(text: str) -> float:
@@ -36,11 +46,17 @@ def seconds(text: str) -> float:
         >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
         (1.45e-05, 0.002, 2e-05)
     """
-    number = text.strip().rstrip("smunµμ")
-    try:
-        return float(Fraction(number) / _TIME_UNITS[text.strip()[len(number) :]])
-    except (ValueError, ArithmeticError, KeyError) as error:
-        raise typer.BadParameter(f"expected a time such as 14.5us, 1/500 or 2e-5 (in s), got {text!r}") from error
+    return _with_unit(text, _TIME_UNITS, "a time such as 14.5us, 1/500 or 2e-5 (in s)")
+
+
+def metres(text: str) -> float:
+    """A length in metres: a number with a unit.
+
+    Example:
+        >>> metres("12.5um"), metres("0.3 mm")
+        (1.25e-05, 0.0003)
+    """
+    return _with_unit(text.replace(" ", ""), _LENGTH_UNITS, "a length with its unit such as 12.5um or 0.3mm")
 
 
 def rate(text: str) -> float:
@@ -136,6 +152,15 @@ _OpticsOption = Annotated[
         "--optics-sigma",
         help="Standard deviation of the Gaussian blur of the lens in px, before pixels without gaps: restored frames "
         "are sharpened to half a point of their grid. Section [restoration.optics] describes other optics.",
+    ),
+]
+PixelSizeOption = Annotated[
+    float | None,
+    typer.Option(
+        parser=metres,
+        metavar="LENGTH",
+        help="Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and "
+        "m/s².",
     ),
 ]
 ForceOption = Annotated[

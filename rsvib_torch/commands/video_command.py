@@ -45,6 +45,7 @@ def run_followed(
     output: str,
     settings: Config,
     options: dict[str, Any],
+    pixel_size: float | None,
     **others: Any,
 ) -> Answer:
     """Process a video; ``others`` are options of ``process_video``."""
@@ -61,7 +62,7 @@ def run_followed(
     stored = stacks.read_manifest(out / "manifest.json")
     drawn = draw_safely(out / "before_after.png", lambda: _followed_figure(frames, out / output, stored))
     with whole_folder(out) as folder:
-        names = [output, *drawn, "manifest.json", *write_windows(folder, out / "manifest.json")]
+        names = [output, *drawn, "manifest.json", *write_windows(folder, out / "manifest.json", pixel_size)]
     unknown = [record for record in stored.windows if record.error is not None]
     if unknown:
         first = unknown[0]
@@ -76,7 +77,7 @@ def run_followed(
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
         error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
-    vibration, lines = stored.lines()
+    vibration, lines = stored.lines(pixel_size)
     return Answer(
         {f"Vibration in {frames.name}": vibration, "Restoration": [result.summary(), *lines[1:]]},
         {"windows": stored.totals()},

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -78,24 +77,3 @@ class StackFormat:
     companions: tuple[str, ...] = ()
     compressions: tuple[str, ...] = ()
     keeps: tuple[str, ...] = ()
-
-
-def needed_package(name: str, purpose: str, extra: str) -> Any:
-    """Import an optional package.
-
-    Args:
-        name: Module to import.
-        purpose: What needs it, for the message.
-        extra: Extra of this package that installs it.
-
-    Raises:
-        ModuleNotFoundError: If it is missing, naming the extra to install.
-    """
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
-            raise
-        raise ModuleNotFoundError(
-            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
-        ) from error

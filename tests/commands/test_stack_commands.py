@@ -43,22 +43,26 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "13 frames in 4 windows, 4 restored, " in shown.out
-    names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv", "windows.json", "windows.png"]
+    names = ["before_after.png", "clear.zarr", "manifest.json", "tones.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
-    with (tmp_path / "out" / "windows.csv").open() as file:
+    with (tmp_path / "out" / "tones.csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert [line["first_frame"] for line in lines] == ["0", "3", "6", "9"]
+    # one row per window, axis and tone; the middle is that of the exposures of the frames first ... last
+    assert [(line["first_frame"], line["axis"]) for line in lines] == [(f, a) for f in "0369" for a in "xy"]
     for line in lines:
-        assert float(line["amplitude_x"]) == pytest.approx(1.2, rel=0.06)
-        assert float(line["frequency_y"]) == pytest.approx(170, rel=0.03)
-        assert line["frames"] == "restored"
+        amplitude, frequency = (1.2, 130) if line["axis"] == "x" else (0.8, 170)
+        assert float(line["amplitude_px"]) == pytest.approx(amplitude, rel=0.06)
+        assert float(line["frequency_Hz"]) == pytest.approx(frequency, rel=0.03)
+        assert (line["tone"], line["frames"], line["reliable"], line["reasons"]) == ("1", "restored", "True", "")
+        middle = 104e-4 * (int(line["first_frame"]) + int(line["last_frame"])) / 2 + 0.5 * ((HEIGHT - 1) * 1e-4 + 6e-4)
+        assert float(line["middle_time_s"]) == pytest.approx(middle)
 
 
 def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     options = ("--config", place / "camera.toml")
     assert rsvib("detect", place / "frames.tif", *options, "--out", tmp_path / "found", "--memory", "1GB") == 0
-    names = ["manifest.json", "windows.csv", "windows.json", "windows.png"]
+    names = ["manifest.json", "tones.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "found").iterdir()) == names
     manifest = tmp_path / "found" / "manifest.json"
     assert rsvib("restore", place / "frames.tif", tmp_path / "r.tif", *options, "--vibration", manifest) == 0
