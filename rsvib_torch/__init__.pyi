@@ -91,7 +91,15 @@ from .restoration import (
     trusted_vibration,
     visible_pixels,
 )
-from .stacks import StackReport, iterate_stack, process_stack, process_video, read_manifest, restore_block
+from .stacks import (
+    StackReport,
+    VibrationCorrector,
+    iterate_stack,
+    process_stack,
+    process_video,
+    read_manifest,
+    restore_block,
+)
 from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 
 __all__ = [
@@ -125,6 +133,7 @@ __all__ = [
     "TimingWarning",
     "TrackedFrame",
     "Vibration",
+    "VibrationCorrector",
     "VibrationDetector",
     "VibrationRestorer",
     "VibrationStd",

@@ -43,8 +43,8 @@ FIRST_NAMES = (
     *(
         "detect_vibration",
         "DetectionResult",
-        "DisplacementSpectrum",
         "VibrationDetector",
+        "DisplacementSpectrum",
         "detect_motion",
         "MotionDetection",
     ),
