@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -72,10 +73,68 @@ def rate(text: str) -> float:
         raise typer.BadParameter(f"expected a number such as 29.97 or 30000/1001, got {text!r}") from error
 
 
-FramesArgument = Annotated[
-    Path,
-    typer.Argument(help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."),
+def _range_of_frames(text: str) -> str:
+    """START:END, as it was given."""
+    if re.fullmatch(r"\d*:\d*", text) is None:
+        raise typer.BadParameter(f"expected START:END such as 100:200, 100: or :200, got {text!r}")
+    return text
+
+
+RangeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--frames",
+        parser=_range_of_frames,
+        metavar="START:END",
+        help="Use only the frames START to END - 1, counted from 0; times count from the first of them.",
+        show_default="all frames",
+    ),
 ]
+
+
+def some_frames(
+    frames: Annotated[
+        Path,
+        typer.Argument(
+            help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."
+        ),
+    ],
+    *,
+    frame_range: RangeOption = None,
+) -> Path:
+    """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
+    return frames if frame_range is None else frames.with_name(f"{frames.name}[{frame_range}]")
+
+
+def _some_of_each(
+    frames: Annotated[list[Path], typer.Argument(help="One or more stacks of frames: TIFF, PNG, video ...")],
+    *,
+    frame_range: RangeOption = None,
+) -> list[Path]:
+    """The paths of several stacks, as ``some_frames``."""
+    return [some_frames(path, frame_range=frame_range) for path in frames]
+
+
+def _some_of_source(
+    source: Annotated[
+        str,
+        typer.Argument(help="Number or URL of a camera, - for raw frames on standard input, or a file with frames."),
+    ],
+    *,
+    frame_range: RangeOption = None,
+) -> str:
+    """A source of frames, or the frames that are used of a file."""
+    if frame_range is None:
+        return source
+    file = file_of_source(source)
+    if file is None:
+        raise ValueError(f"--frames goes with a file, not with {source}; --num-frames ends a session")
+    return str(some_frames(file, frame_range=frame_range))
+
+
+FramesArgument = Annotated[Path, MadeBy(some_frames)]
+StacksArgument = Annotated[list[Path], MadeBy(_some_of_each)]
+SourceArgument = Annotated[str, MadeBy(_some_of_source)]
 RestoredArgument = Annotated[
     Path,
     typer.Argument(
@@ -187,6 +246,7 @@ def _read_camera(
         dict[str, Any], MadeBy(group_arguments(SensorSection, sensor_forms("from the configuration, or ")))
     ],
     frames: Path | None = None,
+    frame_range: str | None = None,
     source: str | None = None,
     full_scale: float | None = None,
 ) -> Config:
@@ -208,6 +268,12 @@ def _read_camera(
             "a file and explains its values)"
         )
     settings = read_config(config, sensor=sensor)
+    starts = settings.timing.frame_start_times
+    if frame_range is not None and starts is not None:  # those of the file are read with its frames
+        first, _, end = frame_range.partition(":")
+        used = list(starts)[int(first or 0) : int(end) if end else None]
+        relative = tuple(float(start - used[0]) for start in used)
+        settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative or starts))
     arguments = [] if config is None else ["--config", str(config)]
     for name, value in sensor.items():
         option = _TIMES.get(name, f"--{name.replace('_', '-')}")
@@ -241,7 +307,7 @@ def file_of_source(source: str) -> Path | None:
     """
     if source == "-" or source.isdecimal() or "://" in source:
         return None
-    if not Path(source).exists():
+    if not io.stack_files(source)[0].exists():
         raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
     return Path(source)
 

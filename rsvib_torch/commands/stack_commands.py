@@ -590,7 +590,7 @@ def _video_name(frames: Path, output: str) -> str:
     """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
     if output != "restored.tif":
         raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-    ending = frames.suffix.lower()
+    ending = frames.suffix.lower().partition("[")[0]  # of frames[START:END]
     return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
 
 

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 def is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
     """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
-    from rsvib_torch.io.video import ENDINGS  # noqa: PLC0415 - loads PyTorch, which other commands do not need
+    from rsvib_torch.io.stack_format import split_range  # noqa: PLC0415 - loads PyTorch, which others do not need
+    from rsvib_torch.io.video import ENDINGS  # noqa: PLC0415
 
-    return requested or (frames.suffix.lower() in ENDINGS and count > window)
+    return requested or (split_range(frames)[0].suffix.lower() in ENDINGS and count > window)
 
 
 def check_followed(given: Mapping[str, Any], options: Mapping[str, Any]) -> None:

@@ -226,7 +226,8 @@ class Offsets:
         energy = 2 * (self.weights.sum() - intervals(self.weights)[2:].real)
         energy = np.maximum(energy, 1e-12 * energy.max())
         response = np.abs(attenuation) * np.sqrt(energy)
-        visible, searched = (response >= gain * response.max() for gain in (BLIND_GAIN, _SEARCHED_GAIN))
+        visible, shown = (response >= gain * response.max() for gain in (BLIND_GAIN, _SEARCHED_GAIN))
+        searched = shown
         # Noise of averages over overlapping rows falls with frequency as their displacement does.
         colour = np.square(np.sinc(frequency * self.band_time)) if self.overlapping else np.ones_like(frequency)
         threshold = math.log(len(frequency) / 2 / _FALSE_ALARM)
@@ -241,8 +242,15 @@ class Offsets:
             excess = np.where(searched, power / np.maximum(level * colour, 1e-300), 0.0)
             if excess.max() < threshold or len(lines) == most_lines:
                 break
-            # The line that is most significant, then all lines together.
-            lines = self._refined(np.concatenate([lines, [[frequency[excess.argmax()], 0.0]]]), span)
+            # The line that is most significant, then all lines together. A line beside another one, or at a frequency
+            # that the offsets do not show, is an error of the others.
+            peak = frequency[excess.argmax()]
+            refined = self._refined(np.concatenate([lines, [[peak, 0.0]]]), span)
+            at = np.sort(refined[:, 0].real)
+            if (np.diff(at) < 0.25 / span).any() or not np.interp(at, frequency, shown.astype(float)).all():
+                searched = searched & (np.abs(frequency - peak) > 0.5 / span)
+            else:
+                lines = refined
         complex_amplitude = sums / (0.5 * np.where(visible, attenuation, np.inf) * energy)
         lines = np.concatenate([known, lines])
         for at, line in lines:
@@ -267,21 +275,24 @@ class Offsets:
         drift = [self.later - self.earlier, 0.5 * (np.square(self.later) - np.square(self.earlier))]
         return np.concatenate([offset.real, -offset.imag, slope.real, np.stack(drift, -1)], 1)
 
-    def _solved(self, design: Array) -> Array:
-        """Weighted least-squares parameters of a design."""
+    def _solved(self, design: Array, count: int) -> Array:
+        """Weighted least-squares parameters of a design of ``count`` lines; combinations that it hardly shows are 0."""
         root = np.sqrt(self.weights)[:, None]
-        scale = np.maximum(np.linalg.norm(root * design, axis=0), 1e-300)
+        scale = np.linalg.norm(root * design, axis=0)
+        # columns of one unit have one scale, so that a line without response is not enlarged
+        for part in (slice(0, 2 * count), slice(2 * count, design.shape[1] - 2)):
+            scale[part] = scale[part].max(initial=0.0)
+        scale = np.maximum(scale, 1e-300)
         scaled = root * design / scale
-        solution: Array = (
-            np.linalg.lstsq(scaled.T @ scaled, scaled.T @ (root[:, 0] * self.values), rcond=1e-12)[0] / scale
-        )
+        normal, right = scaled.T @ scaled, scaled.T @ (root[:, 0] * self.values)
+        solution: Array = np.linalg.lstsq(normal, right, rcond=1e-7)[0] / scale
         return solution
 
     def _refined(self, lines: Array, span: float) -> Array:
         """Lines after three Gauss-Newton steps of all amplitudes and frequencies; the first sets new amplitudes."""
         count = len(lines)
         for _ in range(3):
-            real, imaginary, shift = self._solved(self._design(lines))[: 3 * count].reshape(3, count)
+            real, imaginary, shift = self._solved(self._design(lines), count)[: 3 * count].reshape(3, count)
             frequency = lines[:, 0].real + np.clip(shift, -0.25 / span, 0.25 / span)  # within the main lobe
             lines = np.stack([np.maximum(frequency, 0.5 / span), real + 1j * imaginary], -1)
         return lines
@@ -290,7 +301,7 @@ class Offsets:
         """Offsets (N,) without the lines and the drift."""
         design = self._design(lines)
         kept = np.r_[: 2 * len(lines), 3 * len(lines) : design.shape[1]]
-        rest: Array = self.values - design[:, kept] @ self._solved(design[:, kept])
+        rest: Array = self.values - design[:, kept] @ self._solved(design[:, kept], len(lines))
         return rest
 
 

@@ -16,6 +16,7 @@ from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joi
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.result_files import decode
 from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
+from rsvib_torch.io.stack_format import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import StackJob
@@ -249,6 +250,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: in
         steps = min(count, most)
         return sorted({round(i * (count - 1) / max(1, steps - 1)) for i in range(steps)})
 
+    name, (path, _) = path.name, split_range(path)
     if path.is_dir():
         members = sorted(file for file in path.rglob("*") if file.is_file())
     else:
@@ -263,7 +265,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: in
             for index in spread(-(-sizes[number] // block), blocks):
                 opened.seek(index * block)
                 digest.update(opened.read(block))
-    return {"name": path.name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
+    return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> dict[str, Any]:
