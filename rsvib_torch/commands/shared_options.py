@@ -245,6 +245,14 @@ def _read_camera(
     sensor: Annotated[
         dict[str, Any], MadeBy(group_arguments(SensorSection, sensor_forms("from the configuration, or ")))
     ],
+    readout_time: Annotated[
+        float | None,
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time.",
+        ),
+    ] = None,
     frames: Path | None = None,
     frame_range: str | None = None,
     source: str | None = None,
@@ -256,6 +264,11 @@ def _read_camera(
     commands that follow.
     """
     frames = frames if source is None else file_of_source(source)
+    if readout_time is not None:
+        if config is not None or "row_time" in sensor or frames is None:
+            raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
+        shape = io.read_stack_info(frames).shape
+        sensor = sensor | {"row_time": readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
     missing = [option for name, option in _TIMES.items() if name not in sensor]
     if config is None and missing == ["--frame-rate"] and frames is not None:
         frame_rate = stated_rate(io.read_stack_info(frames))

@@ -15,7 +15,8 @@ from program import rsvib
 from small_config import CAMERA
 from small_stack import HEIGHT, WIDTH, write_small
 
-from rsvib_torch import read_stack_info
+from rsvib_torch import read_stack_info, write_stack
+from rsvib_torch.evaluation import example_frames
 
 FRAMES = 13
 CONFIG = f"""{CAMERA}
@@ -151,3 +152,18 @@ def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options
     assert message in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_readout_time_replaces_the_row_time(tmp_path, capsys):
+    frames, timing, _ = example_frames()
+    write_stack(tmp_path / "frames.npy", frames)
+    readout = f"{1e3 * timing.row_time * frames.shape[-2]}ms"
+    camera = ("--exposure", timing.exposure_time, "--frame-rate", timing.frame_rate, "--readout-time", readout)
+    detect = ("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "found")
+    assert rsvib(*detect) == 0
+    stored = json.loads((tmp_path / "found" / "vibration.json").read_text())["timing"]
+    assert stored["row_time"] == pytest.approx(timing.row_time)
+    capsys.readouterr()
+    assert rsvib(*detect, "--row-time", "100us", "--overwrite") == 2
+    message = "--readout-time replaces --row-time of frames in a file, and goes without --config"
+    assert message in capsys.readouterr().err
