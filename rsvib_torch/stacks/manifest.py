@@ -184,8 +184,12 @@ class StackManifest(Result, file_format="rsvib stack"):
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
             restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
+        still = self._has_no_tone()
+        if still:
+            text = "the camera stands still, or moves uniformly or by less than the noise"
+            vibration.append(wrapped(f"no window has a significant tone: {text}"))
         for name, notes in data["left_alone"].items():
-            if notes:
+            if notes and not still:
                 window, note = next(iter(notes.items()))
                 restoration.append(
                     wrapped(
@@ -197,6 +201,15 @@ class StackManifest(Result, file_format="rsvib stack"):
             failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
             vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
+
+    def _has_no_tone(self) -> bool:
+        """Whether all windows were measured, and nothing else than missing tones is stated against any axis."""
+        codes = [
+            one.codes((axis,)) if one is not None else "failed"
+            for one in self.detections()
+            for axis in range(2 if one is None else one.vibration.num_axes)
+        ]
+        return bool(codes) and set(codes) == {"no_tone"}
 
     def detections(self) -> list[DetectedVibration | None]:
         """The detection of every window; None where it failed."""

@@ -135,5 +135,7 @@ def test_timing_in_seconds_is_that_in_rows():
 def test_times_in_another_unit_are_refused_with_the_right_one():
     with pytest.raises(ValueError, match=r"exposure_rows=0.002 .* \(0.002 s are exposure_rows=100\)"):
         SensorTiming(row_time=20e-6, exposure_rows=0.002, frame_rows=1700)
-    with pytest.raises(ValueError, match=r"exposure 410 s, frame period 0.03333 s; 410 us is 410us on the command line"):
+    with pytest.raises(
+        ValueError, match=r"exposure 410 s, frame period 0.03333 s; 410 us is 410us on the command line"
+    ):
         SensorTiming.from_seconds(row_time=20e-6, exposure_time=410, frame_rate=30)

@@ -3,6 +3,7 @@
 import csv
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from detections import detection_of, result_of
 
 import rsvib_torch as rsv
+from rsvib_torch.core.reason import Reason
 from rsvib_torch.stacks.manifest import StackManifest, WindowRecord
 
 TIMING = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
@@ -102,6 +104,16 @@ def test_all_tones_are_followed_over_the_windows():
     assert tones == [(3, 2.0, 100.2), (2, pytest.approx(1.45), pytest.approx(102.2)), (1, 0.3, 310.0)]
     text = manifest_of(*windows).summary()
     assert all(f"{windows} of 4" in text for windows in (3, 2, 1))
+
+
+def test_a_camera_that_stands_still_is_said_to_stand_still():
+    still, without = rsv.Vibration.still(), ((Reason("no_tone", "x"),), (Reason("no_tone", "y"),))
+    quiet = [replace(detection_of(still, reliable=(False, False)), findings=without)] * 2
+    records = [replace(window(number, still), detection=found) for number, found in enumerate(quiet)]
+    text = " ".join(manifest_of(*records).summary().split())
+    assert "no window has a significant tone: the camera stands still" in text
+    assert "stands still" not in manifest_of(window(0, TWO_TONES), records[1]).summary()
+    assert "stands still" not in manifest_of(records[0], window(1, None)).summary()
 
 
 def test_a_batch_prints_and_tabulates_every_tone():
