@@ -158,9 +158,11 @@ def displacement_spectrum(
     earlier, later = (table(times[good]) + 0.5 * timing.exposure_time for times in (curve.times, curve.later_times))
     centre = 0.5 * (earlier.min() + later.max())
     span = float(later.max() - earlier.min())
-    step_rows = float(curve.rows.diff().median()) if len(curve.rows) > 1 else timing.frame_rows
+    # Rows of bands that overlap are averaged: above the rate of separate bands, their errors would be amplified.
+    spacing = float(curve.rows.diff().median()) if len(curve.rows) > 1 else timing.frame_rows
+    spacing = max(spacing, *curve.heights)
     step = 0.5 / span
-    frequency = step * np.arange(2, max(math.floor(0.5 / (step_rows * timing.row_time) / step), 8) + 1)
+    frequency = step * np.arange(2, max(math.floor(0.5 / (spacing * timing.row_time) / step), 8) + 1)
     found = []
     for axis in range(offsets.shape[-1]):
         height = curve.heights[axis % 2 if axis < 2 else 0]
@@ -171,7 +173,6 @@ def displacement_spectrum(
             quality / np.square(std[:, axis]),
             timing.exposure_time,
             height * timing.row_time,
-            overlapping=step_rows < height,
         )
         found.append(record.spectrum(frequency, span, _lines_of(vibration, axis, centre)))
     amplitudes, noises, lines, responses = zip(*found, strict=True)
@@ -198,7 +199,6 @@ class Offsets:
         weights: (N,) px^-2, inverse variances up to a factor.
         exposure_time: s.
         band_time: s, time over which the rows of one offset are exposed.
-        overlapping: Whether neighbouring offsets have rows in common, whose noise they share.
     """
 
     earlier: Array
@@ -207,7 +207,6 @@ class Offsets:
     weights: Array
     exposure_time: float
     band_time: float
-    overlapping: bool = False
 
     def spectrum(
         self, frequency: Array, span: float, known: Array, most_lines: int = _MAX_LINES
@@ -228,8 +227,6 @@ class Offsets:
         response = np.abs(attenuation) * np.sqrt(energy)
         visible, shown = (response >= gain * response.max() for gain in (BLIND_GAIN, _SEARCHED_GAIN))
         searched = shown
-        # Noise of averages over overlapping rows falls with frequency as their displacement does.
-        colour = np.square(np.sinc(frequency * self.band_time)) if self.overlapping else np.ones_like(frequency)
         threshold = math.log(len(frequency) / 2 / _FALSE_ALARM)
         lines = np.zeros((0, 2), complex)
         while True:
@@ -238,8 +235,8 @@ class Offsets:
             parts = self.weights * residual
             sums = (later(parts) - earlier(parts))[2:]
             power = np.square(np.abs(sums)) / energy
-            level = float(np.median((power / np.maximum(colour, 1e-6))[visible])) / math.log(2)  # exponential
-            excess = np.where(searched, power / np.maximum(level * colour, 1e-300), 0.0)
+            level = float(np.median(power[visible])) / math.log(2)  # the power of white noise is exponential
+            excess = np.where(searched, power / max(level, 1e-300), 0.0)
             if excess.max() < threshold or len(lines) == most_lines:
                 break
             # The line that is most significant, then all lines together. A line beside another one, or at a frequency
@@ -258,7 +255,7 @@ class Offsets:
             complex_amplitude = complex_amplitude + line * np.exp(
                 -0.5 * np.pi * np.square((frequency - at.real) * span)
             )
-        noise = 2 * np.sqrt(level * colour / energy) / np.maximum(np.abs(attenuation), 1e-12)
+        noise = 2 * np.sqrt(level / energy) / np.maximum(np.abs(attenuation), 1e-12)
         return np.abs(complex_amplitude), noise, lines, response
 
     def _attenuation(self, frequency: Array) -> Array:

@@ -11,6 +11,7 @@ from detections import result_of
 from truth import Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
+from rsvib_torch.evaluation import example_frames
 
 TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=25, frame_rows=1 / (60 * 4e-5))
 TONES = ((0.8, 137.0, 0.3), (0.05, 411.3, 1.0), (0.02, 266.0, 2.0))  # px, Hz, rad
@@ -107,6 +108,15 @@ def test_spectrum_of_frames_has_a_tone_that_the_detection_left_out():
     assert spectrum.lines.amplitude[0, :2].tolist() == pytest.approx([0.8, 0.1], rel=0.15)  # errors of up to 13 %
     assert spectrum.lines.frequency[0, :2].tolist() == pytest.approx([880 / 2 / math.pi, 2530 / 2 / math.pi], abs=0.2)
     assert spectrum.lines.amplitude[1, 0] == pytest.approx(0.3, rel=0.05)
+
+
+def test_overlapping_bands_have_no_lines_of_amplified_errors():
+    """Bands of 32 rows average tones above their rate out; half of it is the highest frequency."""
+    frames, timing, truth = example_frames(num_frames=6)
+    spectrum = rsv.detect_vibration(frames, timing, method="bands").spectrum()
+    assert float(spectrum.frequency[-1]) <= 0.5 / (32 * timing.row_time)
+    torch.testing.assert_close(spectrum.lines.amplitude[:, :1], truth.amplitude, rtol=0.05, atol=0)
+    assert (spectrum.lines.amplitude[:, 1:] < 0.1).all()
 
 
 def test_spectrum_as_table_and_figure(tmp_path):
