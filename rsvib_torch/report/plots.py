@@ -716,22 +716,16 @@ def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
     """Draw amplitude spectrum and power spectral density of each axis, their noise, and the blind bands in grey."""
     axes = len(result.amplitude)
     figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True)
-    frequency, blind = result.frequency.cpu().numpy(), result.blind.cpu().numpy()
+    frequency, half = result.frequency.cpu().numpy(), 0.25 * result.resolution  # half of a step
+    blind = np.diff(result.blind.cpu().numpy().astype(int), prepend=0, append=0)
+    spans = list(zip(np.flatnonzero(blind > 0), np.flatnonzero(blind < 0), strict=True))  # blind neighbours
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         unit, colour = AXIS_UNITS[axis], _AXIS_COLOURS.get(name, _INK)
         curves = ((result.amplitude, result.noise, unit), (result.psd, result.noise_psd, f"{unit}²/Hz"))
         for panel, (of_axes, of_noise, unit_of_panel) in zip(panels[:, axis], curves, strict=True):
             values, noise = of_axes[axis].cpu().numpy(), of_noise[axis].cpu().numpy()
-            panel.fill_between(
-                frequency,
-                0,
-                1,
-                where=blind,
-                step="mid",
-                color="#ececec",
-                linewidth=0,
-                transform=panel.get_xaxis_transform(),
-            )
+            for first, behind in spans:
+                panel.axvspan(frequency[first] - half, frequency[behind - 1] + half, color="#ececec", linewidth=0)
             panel.plot(frequency, values, color=colour, linewidth=0.8)
             panel.plot(frequency, noise, color=_INK, linewidth=0.9, linestyle="--")
             panel.set(xscale="log", yscale="log", xlim=(frequency[0], frequency[-1]))
@@ -740,11 +734,14 @@ def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
                 panel.set_ylim(bottom, 5 * max(float(np.nanmax(values)), 10 * bottom))
             quantity = "amplitude" if panel is panels[0, axis] else "PSD"
             plain_axes(panel, "" if quantity == "amplitude" else "frequency (Hz)", f"{quantity} ({unit_of_panel})")
-        panels[0, axis].set_title(f"Displacement along {name}" if axis < 2 else name, loc="left", fontweight="bold")
+        panels[0, axis].set_title(
+            f"Displacement along {name}" if axis < 2 else name.capitalize(), loc="left", fontweight="bold"
+        )
         labelled: list[float] = []
+        label_width = 0.09 * math.log(frequency[-1] / frequency[0])  # 9 % of the panel
         lines = result.lines.amplitude[axis].tolist(), result.lines.frequency[axis].tolist()
         for amplitude, at in zip(*lines, strict=True):  # the strongest first
-            apart = all(abs(math.log(at / other)) > 0.3 for other in labelled if at > 0)  # labels cover each other
+            apart = all(abs(math.log(at / other)) > label_width for other in labelled if at > 0)
             if amplitude > SMALLEST_SHOWN * lines[0][0] and apart and len(labelled) < _LABELLED_LINES:
                 text = f"{measured_text(at)} Hz\n{measured_text(amplitude, digits=3)} {unit}"
                 place = {"textcoords": "offset points", "fontsize": 8, "ha": "center"}
