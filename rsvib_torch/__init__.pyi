@@ -16,6 +16,7 @@ from .calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_t
 from .detection import (
     ClockAlignment,
     DetectionResult,
+    DisplacementSpectrum,
     MotionCheck,
     MotionDetection,
     RotationAlignment,
@@ -74,8 +75,8 @@ from .report import (
     write_isd,
     write_offsets,
     write_stmap,
+    write_table,
     write_vibration,
-    write_windows,
 )
 from .restoration import (
     FixedDewarp,
@@ -90,7 +91,15 @@ from .restoration import (
     trusted_vibration,
     visible_pixels,
 )
-from .stacks import StackReport, iterate_stack, process_stack, process_video, read_manifest, restore_block
+from .stacks import (
+    StackReport,
+    VibrationCorrector,
+    iterate_stack,
+    process_stack,
+    process_video,
+    read_manifest,
+    restore_block,
+)
 from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 
 __all__ = [
@@ -98,6 +107,7 @@ __all__ = [
     "Camera",
     "ClockAlignment",
     "DetectionResult",
+    "DisplacementSpectrum",
     "FixedDewarp",
     "FreeMotion",
     "Margins",
@@ -123,6 +133,7 @@ __all__ = [
     "TimingWarning",
     "TrackedFrame",
     "Vibration",
+    "VibrationCorrector",
     "VibrationDetector",
     "VibrationRestorer",
     "VibrationStd",
@@ -180,7 +191,7 @@ __all__ = [
     "write_offsets",
     "write_stack",
     "write_stmap",
+    "write_table",
     "write_vibration",
-    "write_windows",
 ]
 __version__: str

@@ -40,7 +40,14 @@ PACKAGES = (
 # Names with which the page of a package begins; others follow in alphabetical order.
 FIRST_NAMES = (
     *("SensorTiming", "Vibration", "VibrationStd", "FreeMotion", "read_motion", "AngularRates"),
-    *("detect_vibration", "DetectionResult", "VibrationDetector", "detect_motion", "MotionDetection"),
+    *(
+        "detect_vibration",
+        "DetectionResult",
+        "VibrationDetector",
+        "DisplacementSpectrum",
+        "detect_motion",
+        "MotionDetection",
+    ),
     *(
         "detect_swept_tone",
         "SweptTone",
@@ -57,7 +64,7 @@ FIRST_NAMES = (
     *("read_stack", "write_stack", "read_stack_info", "StackInfo", "open_stack"),
     *("process_stack", "process_video", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
     *("slanted_edge_mtf", "MtfCurve", "find_slanted_edges", "SlantedEdge", "psnr", "ssim"),
-    *("read_vibration", "write_vibration", "write_offsets", "write_windows", "save_figure"),
+    *("read_vibration", "write_vibration", "write_offsets", "write_table", "save_figure"),
     *("sampling_map", "write_stmap", "write_gcsv", "write_isd", "camera_isd"),
 )
 # Sections of the site and the order of their pages; pages that are missing here are added to the last section.
@@ -71,6 +78,7 @@ SECTIONS = {
     "Guides": (
         "quickstart.md",
         "concepts.md",
+        "tables.md",
         "your_own_camera.md",
         "roll_and_zoom.md",
         "finer_grid.md",

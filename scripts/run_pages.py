@@ -127,7 +127,7 @@ def notebook_text(cells: nbformat.NotebookNode) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    default = [*sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("notebooks/*.ipynb"))]
+    default = [*sorted(DOCS.glob("tutorials/*.md")), DOCS / "tables.md", *sorted(DOCS.glob("notebooks/*.ipynb"))]
     parser.add_argument("pages", nargs="*", type=Path, default=default, help="pages and notebooks (default: all)")
     for page in parser.parse_args(arguments).pages:
         print(page)

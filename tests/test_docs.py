@@ -68,6 +68,20 @@ def test_reference_pages_are_up_to_date():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is out of date: make pages"
 
 
+def test_page_on_tables_runs_and_prints_what_it_shows(tmp_path):
+    """Its simulated tones are in every table."""
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    pages = runpy.run_path(str(ROOT / "scripts" / "run_pages.py"))
+    page = ROOT / "docs" / "tables.md"
+    text, names = pages["run_page"](page, tmp_path)
+    assert not pages["differing_lines"](page.read_text(encoding="utf-8"), text), "out of date: make pages"
+    assert names["tones"].frequency_Hz.tolist() == pytest.approx([137.0, 411.0, 90.5], abs=0.05)
+    assert names["tones"].amplitude_um.tolist() == pytest.approx([15.0, 5.0, 8.75], rel=0.02)
+    written = {path.name for path in (tmp_path / "found").iterdir()}
+    assert written == {"vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png"}
+
+
 def test_every_command_and_key_is_in_the_reference():
     commands = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     for command in ("init", "simulate", "detect", "restore", "run", "report", "calibrate", "motion", "known", "live"):

@@ -30,6 +30,7 @@ LAYERS = (
 )
 INNER_LAYERS = {
     "detection": (
+        {"spectrum"},
         {"measurements", "result"},
         {"strips"},
         {"tones"},
@@ -66,7 +67,7 @@ def layer_of(part, layers):
 
 
 # Modules that import what their callers name; the names are read where they are stated (``packaged_format``).
-IMPORT_BY_NAME = {"rsvib_torch.io.stack_format", "rsvib_torch.io.formats"}
+IMPORT_BY_NAME = {"rsvib_torch.core.checks", "rsvib_torch.io.formats"}
 
 
 def imported_modules(source, module):

@@ -11,6 +11,7 @@ from rsvib_torch.core.text import number_of, printable, wrapped
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
     from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.restoration import RestorationVerdict
     from rsvib_torch.stacks import RestoredFrames
 
@@ -35,6 +36,13 @@ def _shell_word(text: str) -> str:
 def detection_data(result: DetectionResult) -> dict[str, Any]:
     """A detection without its offset curve."""
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
+
+
+def in_metres(result: DetectedVibration, pixel_size: float | None) -> dict[str, list[str]]:
+    """A result of an answer with the tones in units of length, if the size of a pixel in m is given."""
+    if pixel_size is None:
+        return {}
+    return {f"For pixels of {1e6 * pixel_size:.6g} µm": [result.physical_summary(pixel_size)]}
 
 
 def restoration_lines(result: RestoredFrames, count: int) -> list[str]:

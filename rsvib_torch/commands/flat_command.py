@@ -68,7 +68,7 @@ def flat_command(name: str, command: Callable[..., Answer]) -> Callable[..., Non
         with output_of(as_json=given["as_json"], quiet=given["quiet"]):
             show_answer(name, _called(command, given))
 
-    parameters = [*_options_of(command), *_options_of(_common)]
+    parameters = sorted([*_options_of(command), *_options_of(_common)], key=lambda parameter: parameter.kind)
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     flat.__doc__ = command.__doc__

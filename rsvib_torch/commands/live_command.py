@@ -20,6 +20,7 @@ from rsvib_torch.commands.shared_options import (
     CameraSettings,
     OverwriteOption,
     ScaleOption,
+    SourceArgument,
     check_new,
     file_of_source,
 )
@@ -38,10 +39,7 @@ PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 
 
 def live_session(
-    source: Annotated[
-        str,
-        typer.Argument(help="Number or URL of a camera, - for raw frames on standard input, or a file with frames."),
-    ],
+    source: SourceArgument,
     *,
     settings: CameraSettings,
     out: Annotated[

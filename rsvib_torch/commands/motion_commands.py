@@ -23,6 +23,7 @@ from rsvib_torch.commands.shared_options import (
     OverwriteOption,
     RestoredArgument,
     ScaleOption,
+    StacksArgument,
     check_new,
     planned_restoration,
     restored_shape,
@@ -322,7 +323,7 @@ def _check_motion(
 
 
 def calibrate(
-    frames: Annotated[list[Path], typer.Argument(help="One or more stacks of frames: TIFF, PNG, video ...")],
+    frames: StacksArgument,
     *,
     frequency: Annotated[
         float | None,

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -27,6 +28,16 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 _TIMES = {"row_time": "--row-time", "exposure_time": "--exposure", "frame_rate": "--frame-rate"}  # required keys
 
 _TIME_UNITS = {"": 1, "s": 1, "ms": 10**3, "us": 10**6, "µs": 10**6, "μs": 10**6, "ns": 10**9}  # per second
+_LENGTH_UNITS = {"m": 1, "cm": 10**2, "mm": 10**3, "um": 10**6, "µm": 10**6, "μm": 10**6, "nm": 10**9}  # per metre
+
+
+def _with_unit(text: str, units: Mapping[str, int], expected: str) -> float:
+    """A number or a fraction with one of the units, which state how many of them are 1."""
+    unit = text.strip().lstrip("0123456789./eE+-")
+    try:
+        return float(Fraction(text.strip().removesuffix(unit)) / units[unit])
+    except (ValueError, ArithmeticError, KeyError) as error:
+        raise typer.BadParameter(f"expected {expected}, got {text!r}") from error
 
 
 def seconds(text: str) -> float:
@@ -36,11 +47,17 @@ def seconds(text: str) -> float:
         >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
         (1.45e-05, 0.002, 2e-05)
     """
-    number = text.strip().rstrip("smunµμ")
-    try:
-        return float(Fraction(number) / _TIME_UNITS[text.strip()[len(number) :]])
-    except (ValueError, ArithmeticError, KeyError) as error:
-        raise typer.BadParameter(f"expected a time such as 14.5us, 1/500 or 2e-5 (in s), got {text!r}") from error
+    return _with_unit(text, _TIME_UNITS, "a time such as 14.5us, 1/500 or 2e-5 (in s)")
+
+
+def metres(text: str) -> float:
+    """A length in metres: a number with a unit.
+
+    Example:
+        >>> metres("12.5um"), metres("0.3 mm")
+        (1.25e-05, 0.0003)
+    """
+    return _with_unit(text.replace(" ", ""), _LENGTH_UNITS, "a length with its unit such as 12.5um or 0.3mm")
 
 
 def rate(text: str) -> float:
@@ -56,10 +73,68 @@ def rate(text: str) -> float:
         raise typer.BadParameter(f"expected a number such as 29.97 or 30000/1001, got {text!r}") from error
 
 
-FramesArgument = Annotated[
-    Path,
-    typer.Argument(help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."),
+def _range_of_frames(text: str) -> str:
+    """START:END, as it was given."""
+    if re.fullmatch(r"\d*:\d*", text) is None:
+        raise typer.BadParameter(f"expected START:END such as 100:200, 100: or :200, got {text!r}")
+    return text
+
+
+RangeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--frames",
+        parser=_range_of_frames,
+        metavar="START:END",
+        help="Use only the frames START to END - 1, counted from 0; times count from the first of them.",
+        show_default="all frames",
+    ),
 ]
+
+
+def some_frames(
+    frames: Annotated[
+        Path,
+        typer.Argument(
+            help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."
+        ),
+    ],
+    *,
+    frame_range: RangeOption = None,
+) -> Path:
+    """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
+    return frames if frame_range is None else frames.with_name(f"{frames.name}[{frame_range}]")
+
+
+def _some_of_each(
+    frames: Annotated[list[Path], typer.Argument(help="One or more stacks of frames: TIFF, PNG, video ...")],
+    *,
+    frame_range: RangeOption = None,
+) -> list[Path]:
+    """The paths of several stacks, as ``some_frames``."""
+    return [some_frames(path, frame_range=frame_range) for path in frames]
+
+
+def _some_of_source(
+    source: Annotated[
+        str,
+        typer.Argument(help="Number or URL of a camera, - for raw frames on standard input, or a file with frames."),
+    ],
+    *,
+    frame_range: RangeOption = None,
+) -> str:
+    """A source of frames, or the frames that are used of a file."""
+    if frame_range is None:
+        return source
+    file = file_of_source(source)
+    if file is None:
+        raise ValueError(f"--frames goes with a file, not with {source}; --num-frames ends a session")
+    return str(some_frames(file, frame_range=frame_range))
+
+
+FramesArgument = Annotated[Path, MadeBy(some_frames)]
+StacksArgument = Annotated[list[Path], MadeBy(_some_of_each)]
+SourceArgument = Annotated[str, MadeBy(_some_of_source)]
 RestoredArgument = Annotated[
     Path,
     typer.Argument(
@@ -138,6 +213,15 @@ _OpticsOption = Annotated[
         "are sharpened to half a point of their grid. Section [restoration.optics] describes other optics.",
     ),
 ]
+PixelSizeOption = Annotated[
+    float | None,
+    typer.Option(
+        parser=metres,
+        metavar="LENGTH",
+        help="Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and "
+        "m/s².",
+    ),
+]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Write the restored frames even if they are judged no better than the input.")
 ]
@@ -161,7 +245,16 @@ def _read_camera(
     sensor: Annotated[
         dict[str, Any], MadeBy(group_arguments(SensorSection, sensor_forms("from the configuration, or ")))
     ],
+    readout_time: Annotated[
+        float | None,
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time.",
+        ),
+    ] = None,
     frames: Path | None = None,
+    frame_range: str | None = None,
     source: str | None = None,
     full_scale: float | None = None,
 ) -> Config:
@@ -171,6 +264,11 @@ def _read_camera(
     commands that follow.
     """
     frames = frames if source is None else file_of_source(source)
+    if readout_time is not None:
+        if config is not None or "row_time" in sensor or frames is None:
+            raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
+        shape = io.read_stack_info(frames).shape
+        sensor = sensor | {"row_time": readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
     missing = [option for name, option in _TIMES.items() if name not in sensor]
     if config is None and missing == ["--frame-rate"] and frames is not None:
         frame_rate = stated_rate(io.read_stack_info(frames))
@@ -183,6 +281,12 @@ def _read_camera(
             "a file and explains its values)"
         )
     settings = read_config(config, sensor=sensor)
+    starts = settings.timing.frame_start_times
+    if frame_range is not None and starts is not None:  # those of the file are read with its frames
+        first, _, end = frame_range.partition(":")
+        used = list(starts)[int(first or 0) : int(end) if end else None]
+        relative = tuple(float(start - used[0]) for start in used)
+        settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative or starts))
     arguments = [] if config is None else ["--config", str(config)]
     for name, value in sensor.items():
         option = _TIMES.get(name, f"--{name.replace('_', '-')}")
@@ -216,7 +320,7 @@ def file_of_source(source: str) -> Path | None:
     """
     if source == "-" or source.isdecimal() or "://" in source:
         return None
-    if not Path(source).exists():
+    if not io.stack_files(source)[0].exists():
         raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
     return Path(source)
 

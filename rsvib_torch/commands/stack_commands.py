@@ -15,6 +15,7 @@ from rsvib_torch import report as reports
 from rsvib_torch.commands.answers import (
     command_text,
     detection_data,
+    in_metres,
     page_step,
     restoration_data,
     restoration_lines,
@@ -31,6 +32,7 @@ from rsvib_torch.commands.shared_options import (
     FramesArgument,
     MemoryOption,
     OverwriteOption,
+    PixelSizeOption,
     RestorationArguments,
     RestoredArgument,
     ScaleOption,
@@ -224,14 +226,17 @@ def detect(
     frames: FramesArgument,
     *,
     settings: CameraSettings,
-    out: Annotated[Path, typer.Option(help="Folder for vibration.json, offsets.csv and offsets.png.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for vibration.json, tables (tones, offsets, spectrum) and figures.")
+    ],
     window: Annotated[
         int | None,
         typer.Option(
-            help="Detect separately in windows of at most this number of frames; writes manifest.json and windows.csv.",
+            help="Detect separately in windows of at most this number of frames; writes manifest.json and tones.csv.",
             show_default="from the configuration, or all frames together",
         ),
     ] = None,
+    pixel_size: PixelSizeOption = None,
     memory: MemoryOption = None,
     workers: WorkersOption = None,
     device: DeviceOption = "auto",
@@ -248,10 +253,10 @@ def detect(
         stack = load(frames, settings, full_scale, device)
         result = _detect(stack, settings)
         with whole_folder(out) as folder:
-            names = write_detection(folder, result, stack.timing)
-        remove_old(out, OF_WINDOWS, names)
+            names = write_detection(folder, result, stack.timing, pixel_size)
+        remove_old(out, (*OF_DETECTION, *OF_WINDOWS), names)
         return Answer(
-            {f"Vibration in {frames.name}": [result.summary()]},
+            {f"Vibration in {frames.name}": [result.summary()], **in_metres(result, pixel_size)},
             {"detection": detection_data(result)},
             [out / name for name in names],
             steps_after_detection(result, frames, settings, out / "vibration.json"),
@@ -273,12 +278,12 @@ def detect(
                 device=str(torch_device(device)),
                 progress=progress,
             )
-        names = [*write_windows(folder, folder / "manifest.json"), "manifest.json"]
+        names = [*write_windows(folder, folder / "manifest.json", pixel_size), "manifest.json"]
     remove_old(out, OF_DETECTION, names)
     manifest = stacks.read_manifest(out / "manifest.json")
     _warn_of_failures(sum(record.error is not None for record in manifest.windows))
     return Answer(
-        {f"Vibration in {len(manifest.windows)} windows of {frames.name}": manifest.lines()[0]},
+        {f"Vibration in {len(manifest.windows)} windows of {frames.name}": manifest.lines(pixel_size)[0]},
         {"windows": manifest.totals()},
         [out / name for name in names],
         steps_after_detection(None, frames, settings, out / "manifest.json"),
@@ -437,6 +442,7 @@ def run(
     force: ForceOption = False,
     windows: Annotated[dict[str, Any], MadeBy(group_arguments(WindowOptions))],
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
+    pixel_size: PixelSizeOption = None,
     memory: MemoryOption = None,
     workers: WorkersOption = None,
     scheduler: Annotated[
@@ -482,6 +488,7 @@ def run(
             settings,
             options,
             **moved,
+            pixel_size=pixel_size,
             full_scale=scale,
             resume=resume,
             memory=memory,
@@ -531,12 +538,12 @@ def run(
             assert first.restoration is not None
             reports.write_restoration(folder / "restoration.json", first.restoration, options, result.not_kept)
             timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*write_detection(folder, first.detection, timing), "restoration.json"]
+            names += [*write_detection(folder, first.detection, timing, pixel_size), "restoration.json"]
         else:
-            names += write_windows(folder, out / "manifest.json")
+            names += write_windows(folder, out / "manifest.json", pixel_size)
     if overwrite:
         remove_old(out, results, names)
-    return _answer_of_windows(frames, info.shape[0], out, output, settings, result, first, names)
+    return _answer_of_windows(frames, info.shape[0], out, output, settings, result, first, names, pixel_size)
 
 
 def _answer_of_windows(
@@ -548,6 +555,7 @@ def _answer_of_windows(
     result: StackReport,
     first: WindowResult,
     names: list[str],
+    pixel_size: float | None,
 ) -> Answer:
     """What a run on a stack of ``count`` frames found and did, with its warnings."""
     if result.bad_frames:
@@ -563,6 +571,7 @@ def _answer_of_windows(
         return Answer(
             {
                 f"Vibration in {frames.name}": [first.detection.summary()],
+                **in_metres(first.detection, pixel_size),
                 "Restoration": restoration_lines(first.restoration, count),
             },
             {"detection": detection_data(first.detection), "restoration": restoration_data(first.restoration)},
@@ -571,7 +580,7 @@ def _answer_of_windows(
         )
     stored = stacks.read_manifest(out / "manifest.json")
     _warn_of_failures(result.failed)
-    vibration_lines, lines = stored.lines()
+    vibration_lines, lines = stored.lines(pixel_size)
     return Answer(
         {f"Vibration in {frames.name}": vibration_lines, "Restoration": [result.summary(), *lines[1:]]},
         {"windows": stored.totals()},
@@ -584,7 +593,7 @@ def _video_name(frames: Path, output: str) -> str:
     """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
     if output != "restored.tif":
         raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-    ending = frames.suffix.lower()
+    ending = frames.suffix.lower().partition("[")[0]  # of frames[START:END]
     return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
 
 

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
 def is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
     """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
-    from rsvib_torch.io.video import ENDINGS  # noqa: PLC0415 - loads PyTorch, which other commands do not need
+    from rsvib_torch.io.stack_format import split_range  # noqa: PLC0415 - loads PyTorch, which others do not need
+    from rsvib_torch.io.video import ENDINGS  # noqa: PLC0415
 
-    return requested or (frames.suffix.lower() in ENDINGS and count > window)
+    return requested or (split_range(frames)[0].suffix.lower() in ENDINGS and count > window)
 
 
 def check_followed(given: Mapping[str, Any], options: Mapping[str, Any]) -> None:
@@ -45,6 +46,7 @@ def run_followed(
     output: str,
     settings: Config,
     options: dict[str, Any],
+    pixel_size: float | None,
     **others: Any,
 ) -> Answer:
     """Process a video; ``others`` are options of ``process_video``."""
@@ -61,7 +63,7 @@ def run_followed(
     stored = stacks.read_manifest(out / "manifest.json")
     drawn = draw_safely(out / "before_after.png", lambda: _followed_figure(frames, out / output, stored))
     with whole_folder(out) as folder:
-        names = [output, *drawn, "manifest.json", *write_windows(folder, out / "manifest.json")]
+        names = [output, *drawn, "manifest.json", *write_windows(folder, out / "manifest.json", pixel_size)]
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
@@ -71,7 +73,7 @@ def run_followed(
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
         error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
-    vibration, lines = stored.lines()
+    vibration, lines = stored.lines(pixel_size)
     for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
         if stored.shaking is not None:
             before, after = stored.shaking[name]

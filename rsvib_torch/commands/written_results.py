@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rsvib_torch.detection import DetectionResult
     from rsvib_torch.motion.timing import SensorTiming
 
-OF_DETECTION = ("vibration.json", "offsets.csv", "offsets.png")
-OF_WINDOWS = ("manifest.json", "windows.json", "windows.csv", "windows.png")
+OF_DETECTION = ("vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png")
+OF_WINDOWS = ("manifest.json", "tones.csv", "windows.json", "windows.png")
 
 
 def check_folder(
@@ -27,7 +27,7 @@ def check_folder(
 ) -> None:
     """Raise an error if results, among them a stack ``output``, exist in a folder or would replace an input."""
     stack = [] if output is None else io.stack_files(output)
-    check_new([*(folder / name for name in names), *stack], overwrite, inputs, folder=folder)
+    check_new([*(folder / name for name in dict.fromkeys(names)), *stack], overwrite, inputs, folder=folder)
     check_writable(folder, folder=True)
 
 
@@ -47,24 +47,31 @@ def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
     return [path.name]
 
 
-def write_detection(folder: Path, result: DetectionResult, timing: SensorTiming) -> list[str]:
-    """Write a detection as JSON, CSV and figure, and return the names of the files."""
+def write_detection(
+    folder: Path, result: DetectionResult, timing: SensorTiming, pixel_size: float | None = None
+) -> list[str]:
+    """Write a detection as JSON, tables and figures, and return the names of the files."""
     with working("drawing the offset curve"):
         reports.write_vibration(folder / "vibration.json", result, timing)
+        reports.write_table(folder / "tones.csv", result, pixel_size=pixel_size)
         reports.write_offsets(folder / "offsets.csv", result)
         drawn = draw_safely(folder / "offsets.png", lambda: reports.offset_figure(result))
-    return [*drawn, "vibration.json", "offsets.csv"]
+    with working("computing the spectrum"):
+        spectrum = result.spectrum()
+        reports.write_table(folder / "spectrum.csv", spectrum, pixel_size=pixel_size)
+        drawn += draw_safely(folder / "spectrum.png", spectrum.plot)
+    return [*drawn, "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv"]
 
 
-def write_windows(folder: Path, path: Path) -> list[str]:
+def write_windows(folder: Path, path: Path, pixel_size: float | None = None) -> list[str]:
     """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
     manifest = stacks.read_manifest(path)
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
-        reports.write_windows(folder / "windows.csv", manifest)
+        reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
         starts = [record.start_time for record in manifest.windows]
         drawn = draw_safely(folder / "windows.png", lambda: reports.windows_figure(starts, manifest.detections()))
-    return [*drawn, "windows.json", "windows.csv"]
+    return [*drawn, "windows.json", "tones.csv"]
 
 
 def note_lost(path: Path, names: Sequence[str]) -> None:

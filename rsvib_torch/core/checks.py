@@ -1,7 +1,9 @@
-"""Checks of arguments; error messages contain the name, the value and what is expected."""
+"""Checks of arguments and optional packages; messages contain the name, the value and what is expected."""
 
 import math
+from importlib import import_module
 from numbers import Real
+from typing import Any
 
 # Largest magnitude of numbers and pixels of public functions: squares of float32 are finite up to 1.8e19, and sums of
 # squares over an image of 1e8 px up to 1.8e15. No quantity in px, s or Hz reaches it.
@@ -85,3 +87,24 @@ def check_whole_number(name: str, value: object, *, at_least: int, at_most: int 
         bound = f"at least {at_least}" if value < at_least else f"at most {at_most}"
         raise ValueError(f"{name} must be {bound}, got {described(value).removesuffix(' (int)')}")
     return value
+
+
+def needed_package(name: str, purpose: str, extra: str) -> Any:
+    """Import an optional package.
+
+    Args:
+        name: Module to import.
+        purpose: What needs it, for the message.
+        extra: Extra of this package that installs it.
+
+    Raises:
+        ModuleNotFoundError: If it is missing, naming the extra to install.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
+            raise
+        raise ModuleNotFoundError(
+            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
+        ) from error

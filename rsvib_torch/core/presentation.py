@@ -10,22 +10,26 @@ import io
 import itertools
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checked_methods
-from rsvib_torch.core.checks import described
+from rsvib_torch.core.checks import check_number, described, needed_package
 from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reason import texts
 from rsvib_torch.core.text import text_table, wrapped
 
 if TYPE_CHECKING:
+    import pandas
+    import xarray
     from matplotlib.figure import Figure
 
 # Text
@@ -102,6 +106,69 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain_values(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# Tables
+
+
+def joined_columns(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Columns of a table from its lines; a cell that a line does not have is None.
+
+    Example:
+        >>> joined_columns([{"axis": "x", "amplitude_px": 3.1}, {"axis": "y"}])
+        {'axis': ['x', 'y'], 'amplitude_px': [3.1, None]}
+    """
+    names = dict.fromkeys(name for line in lines for name in line)
+    return {name: [line.get(name) for line in lines] for name in names}
+
+
+def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict[str, float]:
+    """Amplitude A, and the amplitudes of velocity 2 pi f A and acceleration (2 pi f)^2 A, with units in the names.
+
+    Args:
+        amplitude: A in px.
+        frequency: f in Hz.
+        pixel_size: Size of a pixel in m.
+
+    Example:
+        >>> {name: round(value, 3) for name, value in physical_tone(2.0, 50.0, 10e-6).items()}
+        {'amplitude_um': 20.0, 'velocity_um_per_s': 6283.185, 'acceleration_m_per_s2': 1.974}
+    """
+    angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
+    return {
+        "amplitude_um": 1e6 * metres,
+        "velocity_um_per_s": 1e6 * angular * metres,
+        "acceleration_m_per_s2": angular**2 * metres,
+    }
+
+
+PHYSICAL_HEAD = ("amplitude (µm)", "velocity (µm/s)", "acceleration (m/s²)")  # of ``physical_tone``
+
+
+def check_pixel_size(pixel_size: float | None) -> float | None:
+    """The size of a pixel in m, which a number in another unit is not."""
+    if pixel_size is None:
+        return None
+    # a pixel of 1 km shows the Earth in 12,742 px; 1 nm is a tenth of the smallest structures of light microscopes
+    return check_number("pixel_size (in m)", pixel_size, at_least=1e-9, at_most=1e3)
+
+
+_DIMENSIONS = {"A": "axis", "F": "frequency", "K": "tone", "N": "row", "P": "pair", "R": "row", "T": "frame"}
+Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dimensions, values, attributes
+
+
+def _dimensions(stated: str, count: int, name: str) -> tuple[str, ...]:
+    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``.
+
+    Example:
+        >>> _dimensions("... A=2-4 K", 3, "amplitude"), _dimensions("P 2", 2, "pairs")
+        (('index', 'axis', 'tone'), ('pair', 'pairs_2'))
+    """
+    symbols = [entry.partition("=")[0] for entry in stated.split() if "..." not in entry]
+    batch = count - len(symbols)
+    leading = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
+    named = [_DIMENSIONS.get(symbol, f"{name}_{symbol.lower()}") for symbol in symbols]
+    return (*leading, *named)
 
 
 # Results
@@ -249,6 +316,62 @@ class Result(Summarised):
         result: Self = load_result(cls, Path(path))
         return result
 
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+        """The result as columns by name, with the unit in each name; None for unknown values.
+
+        ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file.
+
+        Args:
+            pixel_size: Size of a pixel in m, in the plane in which the motion is wanted (sensor or object); columns in
+                um, um/s and m/s^2 are added then.
+
+        Raises:
+            TypeError: If this kind of result has no table.
+        """
+        raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
+
+    def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
+        """``table`` as a ``pandas.DataFrame``; missing values are NaN.
+
+        Args:
+            pixel_size: As in ``table``.
+
+        Raises:
+            ModuleNotFoundError: If pandas is not installed, with the extra to install.
+            TypeError: If this kind of result has no table.
+        """
+        frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
+            self.table(pixel_size=pixel_size)
+        )
+        return frame
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The tensors as an ``xarray.Dataset`` with names of dimensions, units, and the coordinate ``axis``.
+
+        Tensors of a result within this one have the name of its field in front (``std_amplitude``); those of a motion
+        have their own. ``index`` counts the results of a batch.
+
+        Raises:
+            ModuleNotFoundError: If xarray is not installed, with the extra to install.
+        """
+        package = needed_package("xarray", "to_xarray", "tables")
+        variables = dict(self._variables(()))
+        axes = [values.shape[names.index("axis")] for names, values, _ in variables.values() if "axis" in names]
+        coordinates = {"axis": np.array(AXIS_NAMES[: axes[0]], object)} if axes else {}
+        dataset: xarray.Dataset = package.Dataset(variables, coordinates)
+        return dataset
+
+    def _variables(self, inside: tuple[str, ...]) -> Iterator[tuple[str, Variable]]:
+        """Names and values of the tensors for ``to_xarray``; ``inside`` names the fields around this result."""
+        for name, value in vars(self).items():
+            own = () if name in ("vibration", "motion") else (name,)
+            if isinstance(value, Result):
+                yield from value._variables((*inside, *own))
+            elif isinstance(value, Tensor) and name in self.shapes:
+                full = "_".join(dict.fromkeys((*inside, name)))  # offsets of the curve "offsets" are "offsets"
+                unit = {"units": self.units[name]} if name in self.units else {}
+                yield full, (_dimensions(self.shapes[name], value.ndim, full), value.detach().cpu().numpy(), unit)
+
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The same result with ``function``, which must preserve values, applied to every tensor.
 
@@ -315,3 +438,19 @@ class JudgedResult(Result):
     def reasons(self) -> tuple[Any, ...]:
         """Texts of ``findings``."""
         return texts(self.findings)
+
+    def codes(self, place: Sequence[int]) -> str:
+        """Codes of the reasons at an index (..., axis) of ``reliable``, separated by spaces."""
+        against = self.findings
+        for index in place:
+            against = against[index]
+        return " ".join(reason.code for reason in against)
+
+    def _variables(self, inside: tuple[str, ...]) -> Iterator[tuple[str, Variable]]:
+        for name, (dimensions, values, attributes) in super()._variables(inside):
+            yield name, (dimensions, values, attributes)
+            if name == "reliable" and dimensions[-1:] == ("axis",):
+                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object).reshape(
+                    values.shape
+                )
+                yield "reasons", (dimensions, codes, {})

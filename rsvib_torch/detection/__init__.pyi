@@ -7,10 +7,12 @@ from .result import DetectionResult
 from .row_time.by_motion import calibrate_row_time_by_motion
 from .shapes.free import MotionDetection, detect_motion
 from .shapes.swept import SweptTone, detect_swept_tone
+from .spectrum import DisplacementSpectrum
 
 __all__ = [
     "ClockAlignment",
     "DetectionResult",
+    "DisplacementSpectrum",
     "MotionCheck",
     "MotionDetection",
     "RotationAlignment",

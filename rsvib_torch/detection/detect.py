@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, ParamSpec, Protocol, overload
 
-from torch import nn
-
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, without_gradients
@@ -21,11 +19,11 @@ from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.strips import camera_in_row_order
 from rsvib_torch.detection.tones.fit import MotionModel
-from rsvib_torch.frames.entry_points import entry_point, module_options
+from rsvib_torch.frames.entry_points import TimedModule, entry_point, module_options
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import FreeMotionOptions, SweptToneOptions, VibrationOptions
 
 VibrationModel = Literal["tones", "free", "swept"]
@@ -176,7 +174,7 @@ def _checked_field(options: VibrationOptions, camera: Camera | None) -> FieldOpt
     return FieldOptions(all_columns and roll, all_columns and zoom, camera)
 
 
-class VibrationDetector(nn.Module):
+class VibrationDetector(TimedModule):
     """``detect_vibration`` with fixed timing and options as a module, for one stack or a batch of stacks.
 
     The options are those of ``detect_vibration`` for tones. It has no weights. Autocast does not affect it, and
@@ -201,11 +199,10 @@ class VibrationDetector(nn.Module):
 
     @module_options(VibrationOptions)
     def __init__(self, timing: SensorTiming, options: VibrationOptions) -> None:
-        super().__init__()
-        check_timing(timing)
-        self.timing, self.options = timing, options
+        super().__init__(timing, options)
 
     def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
+        self.check_stacks(frames)
         result: DetectionResult = detect_vibration(frames, self.timing, **vars(self.options))
         return result

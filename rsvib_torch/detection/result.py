@@ -1,8 +1,9 @@
 """Result of detection: vibration, standard deviations, verdict, and the offset curve."""
 
 import math
+import os
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -10,10 +11,14 @@ from torch.nn import functional
 
 from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
 from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.detection.spectrum import DisplacementSpectrum, displacement_spectrum
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _TONE_VALUES = ("amplitude", "frequency")
 _SENSITIVITY_SHAPES = {
@@ -94,8 +99,7 @@ class AttitudeTones(
         )
 
     def summary(self) -> str:
-        """The tones as a table; of a batch, the strongest of each axis."""
-        shown = self.amplitude[..., : 1 if self.batch_shape else None]
+        """The tones as a table."""
         rows = [
             [
                 *([", ".join(map(str, batch))] if batch else []),
@@ -104,7 +108,7 @@ class AttitudeTones(
                 measured_text(self.frequency[at], self.frequency_std[at]),
                 measured_text(self.phase[at], self.phase_std[at]),
             ]
-            for at in map(tuple, shown.nonzero().tolist())
+            for at in map(tuple, self.amplitude.nonzero().tolist())
             for *batch, axis, _ in [at]
         ]
         return text_table([*axis_head(self.batch_shape), "amplitude (mrad)", "frequency (Hz)", "phase (rad)"], rows)
@@ -162,12 +166,31 @@ class DetectionResult(
         """Tones of pitch, yaw and roll in rad; None if no focal length was given."""
         return None if self.vibration.camera is None else AttitudeTones.of(self.vibration, self.std)
 
+    def spectrum(self) -> DisplacementSpectrum:
+        """Amplitude spectrum and power spectral density of the displacement, from the offset curve.
+
+        Raises:
+            ValueError: If it is a batch, the timing is unknown, or fewer than 8 offsets were measured.
+        """
+        if self.timing is None:
+            raise ValueError("timing unknown: replace(result, timing=SensorTiming(...)) has a spectrum")
+        return displacement_spectrum(self.offsets, self.timing, self.vibration, self.fitted)
+
+    def plot_spectrum(self, path: str | os.PathLike[str] | None = None) -> "Figure":
+        """Draw ``spectrum``; ``path`` as in ``plot``."""
+        return self.spectrum().plot(path)
+
     def to_dict(self) -> dict[str, Any]:
         """All values as nested lists, numbers and texts, as in a ``vibration.json``; None for unknown numbers."""
         values = super().to_dict()
         values["period"] = plain_values(self.vibration.period)
         curve = {name: values.pop(name) for name in ("offsets", "fitted")}  # long, therefore last
         return values | curve
+
+    def _middle_time(self, batch: tuple[int, ...]) -> float | None:
+        curve, exposure_time = self.offsets, 0.0 if self.timing is None else self.timing.exposure_time
+        part = batch if curve.times.ndim > 2 else ()  # stacks of one timing have their times in common
+        return 0.5 * (float(curve.times[part].min()) + float(curve.later_times[part].max()) + exposure_time)
 
     def with_axes(self, count: int) -> "DetectionResult":
         """The result with the first axes of (x, y, roll, zoom) only."""

@@ -10,14 +10,16 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.flat_options import flat_options
 from rsvib_torch.core.precision import outside_graphs
+from rsvib_torch.core.validation import fields_of
 from rsvib_torch.io.stack_reading import FramesOrFiles, PathLike
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorTiming, check_timing
 
 P = ParamSpec("P")
 Module = TypeVar("Module")
@@ -98,6 +100,46 @@ def module_options(
 ) -> Callable[[Callable[[Module, SensorTiming, Options], None]], Callable[Concatenate[Module, SensorTiming, P], None]]:
     """Decorator of ``__init__(self, timing, options)`` of a module."""
     return lambda function: flat_options(options, function)
+
+
+class TimedModule(nn.Module):
+    """A module with a fixed timing and fixed options, which its representation states.
+
+    Attributes:
+        timing: The sensor.
+        options: The options of its function.
+    """
+
+    def __init__(self, timing: SensorTiming, options: Any) -> None:
+        super().__init__()
+        check_timing(timing)
+        self.timing, self.options = timing, options
+
+    def extra_repr(self) -> str:
+        """The timing, and the options that differ from their defaults."""
+        timing = self.timing
+        stated = [f"row_time={timing.row_time:g}", f"exposure_rows={timing.exposure_rows:g}"]
+        stated.append(f"frame_rows={timing.frame_rows:g}")
+        for name, field in fields_of(type(self.options)).items():
+            value = getattr(self.options, name)
+            if not isinstance(value, Tensor) and value != field.get_default():
+                stated.append(f"{name}={value!r}")
+        return ", ".join(stated)
+
+    def check_stacks(self, frames: FramesOrFiles) -> None:
+        """Refuse tensors (B, T, H, W): batches without a channel axis are not stacks (T, C, H, W).
+
+        Raises:
+            ValueError: If frames have 2 or more than 4 channels and the option ``channels`` does not state them.
+        """
+        if isinstance(frames, Tensor) and frames.ndim == 4 and self.options.channels is None:
+            count, channels = frames.shape[:2]
+            if channels not in (1, 3, 4) and frames.shape[-1] > 4:
+                raise ValueError(
+                    f"frames of shape {tuple(frames.shape)} are read as {count} frames of {channels} channels, "
+                    f"(T, C, H, W): pass frames[:, :, None] if they are {count} grey stacks of {channels} frames, or "
+                    f'make the module with channels="first" if they have {channels} channels'
+                )
 
 
 def entry_point(options: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None) -> Any:

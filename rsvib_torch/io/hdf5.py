@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.checks import needed_package
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.contiguous import ContiguousReader
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
 

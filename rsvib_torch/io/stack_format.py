@@ -1,8 +1,8 @@
 """The contract of a stack format: how frames are read and written, and what a format states about itself."""
 
+import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from importlib import import_module
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -24,6 +24,66 @@ class FrameReader(Protocol):
     def close(self) -> None:
         """Close the file, if it is open between frames."""
         return
+
+
+_RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
+
+
+def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
+    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them.
+
+    Example:
+        >>> split_range(Path("clip.mp4[100:200]"))
+        (PosixPath('clip.mp4'), (100, 200))
+        >>> split_range(Path("clip.mp4"))
+        (PosixPath('clip.mp4'), None)
+    """
+    found = _RANGE.fullmatch(path.name)
+    if found is None or path.exists():
+        return path, None
+    name, start, end = found.groups()
+    return path.with_name(name), (int(start or 0), int(end) if end else None)
+
+
+class PartReader:
+    """Some frames of an open stack, one after another.
+
+    Args:
+        reader: The stack.
+        start: Its first frame that is read.
+        end: The frame behind the last one; None for all.
+
+    Raises:
+        ValueError: If the stack does not have these frames.
+    """
+
+    def __init__(self, reader: FrameReader, start: int, end: int | None) -> None:
+        info, count = reader.info, reader.info.shape[0]
+        last = count if end is None else end
+        if not start < last <= count:
+            reader.close()
+            raise ValueError(
+                f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
+                f"START:END with START < END <= {count}"
+            )
+        self._reader, self._start = reader, start
+        numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
+        self.info = replace(
+            info,
+            shape=(last - start, *info.shape[1:]),
+            frame_times=None if info.frame_times is None else info.frame_times[start:last],
+            frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
+            path=None,  # the sound of a video, and metadata of all frames, are not those of a part
+            metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
+        )
+
+    def frame(self, index: int) -> Frame:
+        """As ``FrameReader.frame``; the first frame of the part is 0."""
+        return self._reader.frame(self._start + index)
+
+    def close(self) -> None:
+        """Close the stack."""
+        self._reader.close()
 
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
@@ -78,24 +138,3 @@ class StackFormat:
     companions: tuple[str, ...] = ()
     compressions: tuple[str, ...] = ()
     keeps: tuple[str, ...] = ()
-
-
-def needed_package(name: str, purpose: str, extra: str) -> Any:
-    """Import an optional package.
-
-    Args:
-        name: Module to import.
-        purpose: What needs it, for the message.
-        extra: Extra of this package that installs it.
-
-    Raises:
-        ModuleNotFoundError: If it is missing, naming the extra to install.
-    """
-    try:
-        return import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
-            raise
-        raise ModuleNotFoundError(
-            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
-        ) from error

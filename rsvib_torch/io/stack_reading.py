@@ -18,7 +18,7 @@ from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.progress import steps
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
-from rsvib_torch.io.stack_format import FrameReader
+from rsvib_torch.io.stack_format import FrameReader, PartReader, split_range
 from rsvib_torch.io.stack_info import StackInfo
 
 PathLike = str | os.PathLike[str]
@@ -54,9 +54,11 @@ def open_stack(path: PathLike) -> FrameReader:
         ((3, 64, 48), (64, 48))
         >>> reader.close()
     """
-    path = Path(path)
+    path, part = split_range(Path(path))
     reader = find_format(path).open(path)
     reader.info = replace(reader.info, path=path)
+    if part is not None:
+        reader = PartReader(reader, *part)
     if reader.info.shape[0] > _MAX_FRAMES:
         reader.close()
         raise ValueError(f"{path}: {reader.info.shape[0]} frames; a stack has at most {_MAX_FRAMES}, split the file")
@@ -103,7 +105,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
     video (``.mp4``, ``.mov``, ``.mkv``, ``.avi`` and others; grey or RGB, with 8 to 16 bits), a single ``.png`` or
     ``.jpg``, or a folder of PNG, TIFF or JPEG files in natural order (frame9 before frame10). Channels keep the order
     of the file, RGB or RGBA. Frames have the stored rows and columns: an orientation that the file states for display
-    (``read_stack_info(path).orientation``) is not applied.
+    (``read_stack_info(path).orientation``) is not applied. ``"clip.mp4[100:200]"`` are frames 100 to 199.
 
     Integers are divided by the full scale: ``full_scale`` if given, else the value stated in the file, else 255 for
     ``uint8``. The full scale of other integers is unknown (16 bits may hold 12-bit counts). Floats keep their values

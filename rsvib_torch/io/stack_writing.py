@@ -26,7 +26,7 @@ from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
 from rsvib_torch.io.formats import FORMATS, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
-from rsvib_torch.io.stack_format import StackFormat
+from rsvib_torch.io.stack_format import StackFormat, split_range
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import PathLike
 
@@ -38,7 +38,7 @@ def stack_files(path: PathLike) -> list[Path]:
         >>> [path.name for path in stack_files("frames.raw")]
         ['frames.raw', 'frames.raw.json']
     """
-    path = Path(path)
+    path, _ = split_range(Path(path))
     form = FORMATS.get(path.suffix.lower())
     return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
 

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 
 _LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")

@@ -11,7 +11,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.stack_format import FrameReader, needed_package
+from rsvib_torch.core.checks import needed_package
+from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.video import (
     CONTAINERS,

@@ -2,6 +2,7 @@
 
 import math
 import stat
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import ArrayReader
 from rsvib_torch.io.full_scale import check_dtype
-from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 _HEADER = "zarr.json"
@@ -94,18 +95,35 @@ def open_zarr(path: Path) -> ArrayReader:
         return ArrayReader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
 
 
+_DIMENSIONS = {"T": "frame", "C": "channel", "H": "y", "W": "x"}
+
+
 def write_zarr(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
-    """Write an array with one chunk per frame; arguments as in ``StackFormat.write``."""
-    array = _zarr().create_array(
-        store=str(path),
+    """Write a group with the array ``frames``, one chunk per frame, as ``xarray.open_zarr`` reads it.
+
+    Arguments as in ``StackFormat.write``.
+    """
+    group = _zarr().create_group(store=str(path), zarr_format=3)
+    array = group.create_array(
+        "frames",
         shape=info.stored_shape,
         chunks=(1, *info.stored_shape[1:]),
         dtype=info.dtype,
         fill_value=0,
-        zarr_format=3,
         config={"write_empty_chunks": True},
         attributes=attributes_of(info),
-        dimension_names=list(info.stored_axes),
+        dimension_names=[_DIMENSIONS[axis] for axis in info.stored_axes],
     )
+    if info.frame_times is not None:
+        times = np.asarray(info.frame_times)
+        group.create_array("time", data=times, dimension_names=["frame"], attributes={"units": "s"})
     for index, frame in enumerate(frames):
         array[index] = info.to_stored(frame)
+    consolidate(path)
+
+
+def consolidate(path: Path) -> None:
+    """Copy the metadata of the arrays of a group into its header; xarray warns where it reads them one by one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # other programs read the headers of the arrays, which remain
+        _zarr().consolidate_metadata(str(path))

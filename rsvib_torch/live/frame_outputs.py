@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
-from rsvib_torch.io.stack_format import needed_package
+from rsvib_torch.core.checks import needed_package
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 

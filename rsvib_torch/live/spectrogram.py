@@ -4,25 +4,27 @@ import math
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.tables import tensor
-from rsvib_torch.io.stack_format import needed_package
+from rsvib_torch.core.checks import check_number, needed_package
+from rsvib_torch.core.tables import Array
+from rsvib_torch.detection.spectrum import BLIND_GAIN, Offsets
+from rsvib_torch.io.zarr_store import consolidate
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.report.plots import plain_axes, save_figure
 from rsvib_torch.tracking import TrackedFrame
+
+_LEAST_OFFSETS = 8
+_LINES_OF_COLUMN = 5  # per axis; each takes 5 ms in a column of 0.5 s
 
 
 class Spectrogram:
     """Amplitude of the displacement over time and frequency.
 
-    For every frequency f, one tone is fitted to the offsets y between frames (weights w) of each column of the
-    spectrogram, ``C = sum w conj(h) y / sum w |h|^2`` with the response h of Eq. (4): gain and exposure are taken out.
-    Frequencies at which the response is nearly zero (blind) are NaN.
+    Every column is the amplitude spectrum of the offsets of its frames, as in ``DetectionResult.spectrum``: gain and
+    exposure are taken out, and lines have no ghosts at multiples of the frame rate beside them. Frequencies at which
+    the response is nearly zero (blind) are NaN.
 
     Args:
         timing: The sensor.
@@ -39,11 +41,11 @@ class Spectrogram:
     ) -> None:
         self._timing = timing
         self._duration = check_number("duration", duration, at_least=2 * timing.frame_period)
-        highest = check_number("max_frequency", max_frequency, above=1 / duration)
-        self.frequencies = torch.arange(1, 1 + math.floor(2 * duration * highest), dtype=torch.float64) / (2 * duration)
+        highest = check_number("max_frequency", max_frequency, above=1.5 / duration)
+        self.frequencies = np.arange(2, 1 + math.floor(2 * duration * highest)) / (2 * duration)
         self._max_columns = max_columns
-        self._columns: list[tuple[float, Tensor]] = []
-        self._sums: list[Tensor] = []
+        self._columns: list[tuple[float, NDArray[np.float32]]] = []
+        self._parts: list[tuple[Array, Array, Array]] = []  # mid-exposures (N, 2), offsets and weights (N, 2) of frames
         self._start: float | None = None
 
     def add(self, tracked: TrackedFrame) -> None:
@@ -55,39 +57,29 @@ class Spectrogram:
             self._start = tracked.time
         elif tracked.time - self._start >= self._duration:
             self._finish(tracked.time)
-        middles = tensor(record.exposure_starts[0]) + (
-            0.5 * record.exposure_time + tracked.time - self._start
-        )  # (N, 2)
-        offsets = tensor(record.displacements[0, :, 1] - record.displacements[0, :, 0])  # (N, 2)
-        # Hann window: less leakage of strong tones into other frequencies
-        window = (
-            math.sin(math.pi * (tracked.time - self._start + 0.5 * self._timing.frame_period) / self._duration) ** 2
-        )
-        weights = window * tensor(record.weights[0] * (record.num_differences[0] > 0)[:, None])
-        # the mean is image motion
-        mean = (weights * offsets).sum(0) / weights.sum(0).clamp(min=1e-300)
-        angle = 2 * math.pi * self.frequencies[:, None] * middles[:, 0]
-        wave = torch.complex(angle.cos(), angle.sin())  # (F, N)
-        turn = 2j * math.pi * self.frequencies * (middles[:, 1] - middles[:, 0]).mean()
-        response = torch.sinc(self.frequencies * record.exposure_time) * (turn.exp() - 1)
-        right = (wave.conj() @ (weights * (offsets - mean)).to(wave.dtype)) * response.conj()[:, None]
-        # real offsets: a tone of amplitude A contributes A / 2 at f and at -f
-        normal = 0.5 * weights.sum(0) * response.abs().square()[:, None]
-        parts = [right, normal]
-        self._sums = parts if not self._sums else [total + part for total, part in zip(self._sums, parts, strict=True)]
+        middles = record.exposure_starts[0] + (0.5 * record.exposure_time + tracked.time - self._start)
+        offsets = record.displacements[0, :, 1] - record.displacements[0, :, 0]
+        weights = record.weights[0] * (record.num_differences[0] > 0)[:, None]
+        used = (weights > 0).all(-1)
+        self._parts.append((middles[used], offsets[used], weights[used]))
 
     def _finish(self, time: float) -> None:
         """Complete a column; the next one begins at ``time``."""
         assert self._start is not None
-        if self._sums:
-            right, normal = self._sums
-            blind = normal < 0.01 * normal.amax(0)  # gain below a tenth of the largest one
-            amplitude = torch.where(blind, torch.nan, (right / normal).abs())
-            self._columns.append((self._start, amplitude.T.float()))
-        self._sums, self._start = [], time
+        if sum(len(offsets) for _, offsets, _ in self._parts) >= _LEAST_OFFSETS:
+            middles, offsets, weights = map(np.concatenate, zip(*self._parts, strict=True))
+            earlier, later = middles.T - 0.5 * (middles.min() + middles.max())
+            span, column = float(np.ptp(middles)), []
+            for axis in range(2):
+                of_axis = offsets[:, axis], weights[:, axis]
+                record = Offsets(earlier, later, *of_axis, self._timing.exposure_time, 0.0)
+                amplitude, _, _, response = record.spectrum(self.frequencies, span, np.zeros((0, 2)), _LINES_OF_COLUMN)
+                column.append(np.where(response < BLIND_GAIN * response.max(), np.nan, amplitude))
+            self._columns.append((self._start, np.stack(column).astype(np.float32)))
+        self._parts, self._start = [], time
         if len(self._columns) > self._max_columns:
             pairs = zip(self._columns[::2], self._columns[1::2], strict=False)
-            self._columns = [(one[0], torch.fmax(one[1], other[1])) for one, other in pairs]
+            self._columns = [(one[0], np.fmax(one[1], other[1])) for one, other in pairs]
             self._duration *= 2
 
     def result(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
@@ -95,14 +87,14 @@ class Spectrogram:
 
         Axes are (x, y) of the image. The last, incomplete column is left out, unless it is the only one.
         """
-        if self._sums and not self._columns:
+        if self._parts and not self._columns:
             self._finish(math.inf)
         times = np.array([time for time, _ in self._columns])
         empty = np.zeros((2, 0, len(self.frequencies)), np.float32)
-        amplitude = np.stack([part.numpy() for _, part in self._columns], 1) if self._columns else empty
+        amplitude = np.stack([part for _, part in self._columns], 1) if self._columns else empty
         if self._timing.scan_axis == -1:
             amplitude = amplitude[::-1]
-        return times, self.frequencies.numpy(), np.ascontiguousarray(amplitude)
+        return times, self.frequencies, np.ascontiguousarray(amplitude)
 
 
 def save_spectrogram(path: Path, spectrogram: Spectrogram) -> list[Path]:
@@ -141,8 +133,9 @@ def save_spectrogram(path: Path, spectrogram: Spectrogram) -> list[Path]:
         group = zarr.open_group(store=str(part), mode="w", zarr_format=3)
         units = {"amplitude": "px", "time": "s", "frequency": "Hz"}
         arrays = {"amplitude": amplitude, "time": times, "frequency": frequencies}
+        dimensions = {"amplitude": ["axis", "time", "frequency"]}  # axes (x, y)
         for name, values in arrays.items():
-            array = group.create_array(name, data=values)
-            array.attrs["unit"] = units[name]
-        group["amplitude"].attrs["axes"] = ["axis (x, y)", "time", "frequency"]
+            names, unit = dimensions.get(name, [name]), {"units": units[name]}
+            group.create_array(name, data=values, dimension_names=names, attributes=unit)
+        consolidate(part)
     return [picture, folder]

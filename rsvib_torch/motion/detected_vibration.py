@@ -6,9 +6,28 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from rsvib_torch.core.checks import described
-from rsvib_torch.core.presentation import JudgedResult, verdict_table
-from rsvib_torch.core.text import wrapped
-from rsvib_torch.motion.vibration import Vibration, VibrationStd, image_motion_line, tone_head, tone_rows
+from rsvib_torch.core.presentation import (
+    AXIS_NAMES,
+    PHYSICAL_HEAD,
+    JudgedResult,
+    axis_head,
+    check_pixel_size,
+    joined_columns,
+    physical_tone,
+    plain_values,
+    verdict_table,
+)
+from rsvib_torch.core.text import measured_text, text_table, wrapped
+from rsvib_torch.motion.vibration import (
+    Vibration,
+    VibrationStd,
+    image_motion_line,
+    tone_head,
+    tone_places,
+    tone_rows,
+)
+
+_UNITS_OF_AXES = ("px", "px", "rad", "relative")  # in names of columns
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,3 +93,61 @@ class DetectedVibration(
         if any("(± " in cell for cells in rows for cell in cells):
             verdict.append("(±): if another tone is hidden in the record")
         return "\n".join([table, *image_motion_line(self.vibration, self.std), *verdict])
+
+    def physical_summary(self, pixel_size: float) -> str:
+        """Amplitudes of displacement, velocity and acceleration of the tones of x and y, for a pixel size in m."""
+        rows = []
+        for at, labels in tone_places(self.vibration):
+            amplitude, frequency = (
+                float(values[at]) for values in (self.vibration.amplitude, self.vibration.frequency)
+            )
+            if at[-2] < 2 and amplitude > 0:
+                relative = float(self.std.amplitude[at]) / amplitude
+                values = physical_tone(amplitude, frequency, pixel_size).values()
+                rows.append([*labels, measured_text(frequency), *(measured_text(v, relative * v) for v in values)])
+        return text_table([*axis_head(self.batch_shape), "frequency (Hz)", *PHYSICAL_HEAD], rows)
+
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+        """One row per tone and axis (and result of a batch); an axis without a tone has one row with tone 0.
+
+        The phase refers to the time origin of the vibration, which is that of its stack or window. Amplitudes of roll
+        and zoom have columns of their own. ``reasons`` are codes of ``Reason``. Arguments as in ``Result.table``.
+
+        Example:
+            >>> import rsvib_torch as rsv
+            >>> from rsvib_torch.evaluation import example_frames
+            >>> frames, timing, _ = example_frames()
+            >>> table = rsv.detect_vibration(frames, timing).table(pixel_size=5e-6)
+            >>> table["axis"], table["tone"], [round(value, 1) for value in table["amplitude_um"]]
+            (['x', 'y'], [1, 1], [10.5, 8.0])
+        """
+        return joined_columns(self.tone_lines(pixel_size))
+
+    def tone_lines(self, pixel_size: float | None = None) -> list[dict[str, Any]]:
+        """Lines of ``table``."""
+        pixel_size = check_pixel_size(pixel_size)
+        vibration, hidden = self.vibration, self.std_if_hidden_tone or self.std
+        lines: list[dict[str, Any]] = []
+        for at, _ in tone_places(vibration):
+            *batch, axis, tone = at
+            found, unit = float(vibration.amplitude[at]) > 0, _UNITS_OF_AXES[axis]
+            line: dict[str, Any] = {"index": ", ".join(map(str, batch))} if batch else {}
+            middle = self._middle_time(tuple(batch))
+            line |= {} if middle is None else {"middle_time_s": middle}
+            line |= {"axis": AXIS_NAMES[axis], "tone": found * (tone + 1)}
+            for name, of in (("frequency", "Hz"), ("amplitude", unit), ("phase", "rad")):
+                for kind, values in (("", vibration), ("_std", self.std), ("_std_if_hidden_tone", hidden)):
+                    line[f"{name}{kind}_{of}"] = plain_values(getattr(values, name)[at]) if found else None
+            line[f"image_motion_{unit}_per_s"] = float(vibration.image_motion[at[:-1]])
+            line |= {"reliable": bool(self.reliable[at[:-1]]), "reasons": self.codes(at[:-1])}
+            if pixel_size is not None and axis < 2:
+                amplitude, frequency = float(vibration.amplitude[at]), float(vibration.frequency[at])
+                physical = physical_tone(amplitude, frequency, pixel_size)
+                line |= physical if found else dict.fromkeys(physical)
+                line["image_motion_um_per_s"] = 1e6 * pixel_size * line["image_motion_px_per_s"]
+            lines.append(line)
+        return lines
+
+    def _middle_time(self, batch: tuple[int, ...]) -> float | None:
+        """Middle of the frames of a result in s; None without an offset curve."""
+        return None

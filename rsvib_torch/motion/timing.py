@@ -21,6 +21,7 @@ MIN_ROW_TIME = 1e-9  # s; the fastest sensors read a row in 0.1 us
 MAX_FRAMES, MAX_ROWS = 10**8, 10**6  # 40 days of a camera with 30 frames/s; the largest sensors have 3e4 rows
 MAX_BATCH = 10**6  # stacks; their frames of 128 x 128 px would fill 130 GB
 MAX_SPAN = 2**19  # row times from the first to the last frame; the detection in 4 frames then takes 30 s and 0.5 GB
+_MIN_EXPOSURE = 0.01  # row times; the shortest exposure of sensors is about one row, so that this is one in seconds
 _MAX_BLANKING = 32  # row times per row; of more frames with so long a blanking time, 1 ms of 32 ms is read
 MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
@@ -86,9 +87,17 @@ class SensorTiming:
                 f"{frame_rows * row_time:g} s, longer than 10 s; row_time is in seconds, frame_rows in row times"
             )
         if exposure_rows > frame_rows:
+            exposure = exposure_rows * row_time
+            in_us = f"; {exposure:g} us is {exposure:g}us on the command line, {exposure:g}e-6 elsewhere"
             raise ValueError(
                 f"exposure_rows={exposure_rows:g} exceeds the frame period of frame_rows={frame_rows:g} row times: "
-                f"exposure {exposure_rows * row_time:.4g} s, frame period {frame_rows * row_time:.4g} s"
+                f"exposure {exposure:.4g} s, frame period {frame_rows * row_time:.4g} s" + in_us * (exposure > 1)
+            )
+        if exposure_rows < _MIN_EXPOSURE:
+            raise ValueError(
+                f"exposure_rows={exposure_rows:g} is an exposure of {exposure_rows * row_time:.3g} s; it is the "
+                f"exposure time divided by row_time ({exposure_rows:g} s are exposure_rows="
+                f"{exposure_rows / row_time:.6g}), see SensorTiming.from_seconds"
             )
         if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
@@ -109,6 +118,40 @@ class SensorTiming:
             if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
                 raise ValueError("frame_start_times must be strictly increasing (seconds)")
             object.__setattr__(self, "frame_start_times", starts)
+
+    @classmethod
+    def from_seconds(
+        cls,
+        *,
+        row_time: float,
+        exposure_time: float,
+        frame_rate: float,
+        scan_axis: Literal[-2, -1, "y", "x"] = -2,
+        readout_direction: Literal["forward", "reverse"] = "forward",
+        frame_start_times: Sequence[float] | Tensor | None = None,
+    ) -> SensorTiming:
+        """The timing from the exposure time and the frame rate: ``N_e = T_e / T_row``, ``m = 1 / (rate T_row)``.
+
+        Args:
+            row_time: As in ``SensorTiming``.
+            exposure_time: T_e in seconds.
+            frame_rate: Frames per second of the sensor.
+            scan_axis: As in ``SensorTiming``.
+            readout_direction: As in ``SensorTiming``.
+            frame_start_times: As in ``SensorTiming``.
+
+        Raises:
+            ValueError: As ``SensorTiming``.
+
+        Example:
+            >>> timing = SensorTiming.from_seconds(row_time=20e-6, exposure_time=1 / 500, frame_rate=30)
+            >>> timing.exposure_rows, round(timing.frame_rows, 2)
+            (100.0, 1666.67)
+        """
+        row_time = check_number("row_time", row_time, above=0.0)
+        exposure = check_number("exposure_time", exposure_time, above=0.0)
+        period = 1 / check_number("frame_rate", frame_rate, above=0.0)
+        return cls(row_time, exposure / row_time, period / row_time, scan_axis, readout_direction, frame_start_times)
 
     @classmethod
     def line_sensors(

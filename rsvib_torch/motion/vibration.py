@@ -114,7 +114,11 @@ def _check_values(values: dict[str, Tensor]) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_methods
-class Vibration(Motion, units=_UNITS):
+class Vibration(
+    Motion,
+    units=_UNITS,
+    shapes={**dict.fromkeys(_QUANTITIES, "... A=2-4 K"), **dict.fromkeys(_POLYNOMIAL, "... A")},
+):
     """Sinusoidal displacement of the image on the sensor, with an image motion.
 
     ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + c`` per axis (Eq. 1 of Liu et al. 2023, several
@@ -240,7 +244,7 @@ class Vibration(Motion, units=_UNITS):
         return Vibration(**tones, **{name: getattr(self, name)[..., :2] for name in _POLYNOMIAL})
 
     def summary(self) -> str:
-        """The tones of each axis as a table; of a batch, the strongest tone of each axis."""
+        """The tones of each axis as a table."""
         rows = [cells for _, cells in tone_rows(self)]
         table = text_table([*axis_head(self.batch_shape), *tone_head(axes=self.num_axes)], rows)
         return "\n".join([table, *image_motion_line(self)])
@@ -401,10 +405,10 @@ class VibrationStd(
     displacement: Tensor | None = None
 
     def summary(self) -> str:
-        """Standard deviations of the tones of each axis as a table; of a batch, those of the strongest tones."""
+        """Standard deviations of the tones of each axis as a table."""
         rows = [
             [*labels, *(measured_text(getattr(self, name)[at], digits=2) for name in _QUANTITIES)]
-            for at, labels in _tones(self)
+            for at, labels in tone_places(self)
         ]
         head = [*axis_head(self.batch_shape), *tone_head(axes=self.amplitude.shape[-2])]
         return "standard deviations\n" + text_table(head, rows)
@@ -418,13 +422,9 @@ class VibrationStd(
 # Text
 
 
-def _tones(values: Vibration | VibrationStd) -> list[tuple[tuple[int, ...], list[str]]]:
-    """Index (..., axis, tone) and first cells of the rows: all tones of one vibration, the strongest of a batch.
-
-    An axis without a tone has one row.
-    """
-    count = 1 if values.batch_shape else values.amplitude.shape[-1]
-    axes = values.amplitude.shape[-2]
+def tone_places(values: Vibration | VibrationStd) -> list[tuple[tuple[int, ...], list[str]]]:
+    """Index (..., axis, tone) of every tone, and the first cells of its row; an axis without a tone has one row."""
+    axes, count = values.amplitude.shape[-2:]
     rows = [((*at, tone), labels) for at, labels in axis_rows(values.batch_shape, axes) for tone in range(count)]
     return [(at, labels) for at, labels in rows if at[-1] == 0 or float(values.amplitude[at]) > 0]
 
@@ -444,11 +444,11 @@ def tone_rows(
 ) -> list[tuple[tuple[int, ...], list[str]]]:
     """Rows of a table of tones: the index (..., axis, tone) in the tensors, and the cells of the ``quantities``.
 
-    Of a batch, the strongest tone of each axis is shown. Standard deviations if a further tone is hidden are added
+    Standard deviations if a further tone is hidden are added
     where they are larger, but for phases: a line of a terminal has 80 characters.
     """
     rows = []
-    for at, labels in _tones(vibration):
+    for at, labels in tone_places(vibration):
         cells = ["no tone"] + [""] * (len(quantities) - 1)
         if float(vibration.amplitude[at]) > 0:
             cells = [

@@ -13,7 +13,7 @@ from .plots import (
     save_figure,
     windows_figure,
 )
-from .results import read_vibration, write_offsets, write_restoration, write_vibration, write_windows
+from .results import read_vibration, write_offsets, write_restoration, write_table, write_vibration
 
 __all__ = [
     "Box",
@@ -36,6 +36,6 @@ __all__ = [
     "write_report_page",
     "write_restoration",
     "write_stmap",
+    "write_table",
     "write_vibration",
-    "write_windows",
 ]

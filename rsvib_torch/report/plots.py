@@ -27,11 +27,13 @@ from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import (
     ClockAlignment,
     DetectionResult,
+    DisplacementSpectrum,
     MotionCheck,
     MotionDetection,
     RotationAlignment,
     SweptTone,
 )
+from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
@@ -135,23 +137,40 @@ def _legend_below(figure: Figure, symbols: list[Line2D]) -> None:
     figure.legend(handles=symbols, loc="outside lower center", ncols=len(symbols), fontsize=9.5, frameon=False)
 
 
+_MOST_PAIRS = 12  # pairs of frames whose curves can be told apart on 6 inches
+_SHOWN_PAIRS = 8
+
+
+def _shown_pairs(result: DetectionResult) -> slice:
+    """Pairs of frames whose offsets are drawn: all, or of many frames the neighbouring ones that fit worst."""
+    count = len(result.offsets.pairs)
+    if count <= _MOST_PAIRS:
+        return slice(0, count)
+    residual = (result.offsets.offsets - result.fitted).square().nan_to_num(0.0)
+    of_pairs = (residual / residual.mean((0, 1)).clamp(min=1e-30)).mean((1, 2))  # axes count alike
+    first = int(of_pairs.unfold(0, _SHOWN_PAIRS, 1).mean(-1).argmax())
+    return slice(first, first + _SHOWN_PAIRS)
+
+
 def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) -> Any:
     """Draw the offsets of an axis with their fit, and below the residuals; returns the coloured points."""
-    curve = result.offsets
+    curve, shown = result.offsets, _shown_pairs(result)
     times = curve.times.cpu().numpy() * 1e3
     offsets, fitted, quality = (t.detach().cpu().numpy() for t in (curve.offsets, result.fitted, curve.quality))
     measured, expected = offsets[..., axis], fitted[..., axis]
     good = np.isfinite(measured)
     residual = (measured - expected)[good]
     style = {"c": quality[good], "cmap": _QUALITY_COLOURS, "vmin": 0.0, "vmax": 1.0, "linewidths": 0, "zorder": 2}
-    size = max(4.0, min(22.0, 4000.0 / max(1, measured.size)))
-    points = upper.scatter(times[good], measured[good], s=size, **style)
-    for pair in range(len(times)):
+    size, size_of_all = (max(4.0, min(22.0, 4000.0 / max(1, part.size))) for part in (measured[shown], measured))
+    points = lower.scatter(times[good], residual, s=0.6 * size_of_all, **style)
+    of_shown = good[shown]
+    style["c"] = quality[shown][of_shown]
+    upper.scatter(times[shown][of_shown], measured[shown][of_shown], s=size, **style)
+    for pair in range(len(times))[shown]:
         upper.plot(times[pair], expected[pair], color=_FIT_COLOUR, linewidth=1.3, zorder=3)
-    failed = times[~good]
+    failed = times[shown][~of_shown]
     edge = upper.get_xaxis_transform()
     upper.scatter(failed, np.full_like(failed, 0.02), s=18, marker="x", color=_GREY, transform=edge, zorder=4)
-    lower.scatter(times[good], residual, s=0.6 * size, **style)
     if curve.std is not None:
         std = curve.std.detach().cpu().numpy()[..., axis][good]
         lower.errorbar(times[good], residual, std, fmt="none", ecolor=_GRID, elinewidth=0.8, zorder=1)
@@ -160,7 +179,9 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     smallest = 1e-3 if axis < 2 else 1e-6
     lower.set_ylim(-max(spread, smallest), max(spread, smallest))
     unit, mean = AXIS_UNITS[axis], float(result.residual[axis])
-    plain_axes(upper, y=f"offset ({unit})")
+    some = len(of_shown) < len(times)
+    text = f"frames {shown.start} … {shown.stop} of {len(times) + 1}, in which the residual is largest (ms)"
+    plain_axes(upper, text if some else "", f"offset ({unit})")
     plain_axes(lower, _OFFSET_TIME, f"residual ({unit})", title=f"mean |residual| {mean:.3g} {unit}")
     return points
 
@@ -184,7 +205,8 @@ def offset_figure(result: DetectionResult) -> Figure:
 
     Points are the measurements that the vibration was fitted to: rows of the images in the direct method, with error
     bars of one standard deviation in the lower panels, row bands otherwise. Their colour is their quality; crosses on
-    the lower edge are rows that were not measured; the line is the offset curve of the detected vibration.
+    the lower edge are rows that were not measured; the line is the offset curve of the detected vibration. Of more than
+    13 frames, the upper panels have the 9 neighbouring frames with the largest residual, and the lower ones all.
 
     Args:
         result: A detection (not a batch).
@@ -199,7 +221,8 @@ def offset_figure(result: DetectionResult) -> Figure:
     """
     _check_one(result)
     axes = result.vibration.num_axes
-    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True, height_ratios=(3, 1))
+    all_shown = len(result.offsets.pairs) <= _MOST_PAIRS
+    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=all_shown or "row", height_ratios=(3, 1))
     points: Any = None
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         upper, lower = panels[0, axis], panels[1, axis]
@@ -389,7 +412,8 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
 def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     """Draw the offset curve of one axis of a detection (not a batch) with its fit and residuals."""
     _check_one(result)
-    figure, panels = _panels(5.6, 4.4, 2, sharex=True, height_ratios=(3, 1))
+    all_shown = len(result.offsets.pairs) <= _MOST_PAIRS
+    figure, panels = _panels(5.6, 4.4, 2, sharex=all_shown, height_ratios=(3, 1))
     _finish_offsets(figure, panels, _draw_offsets(panels[0, 0], panels[1, 0], result, axis))
     return figure
 
@@ -685,6 +709,53 @@ def _calibration_figure(result: RowTimeCalibration) -> Figure:
     return figure
 
 
+_LABELLED_LINES = 6  # per axis; more labels would cover each other
+
+
+def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
+    """Draw amplitude spectrum and power spectral density of each axis, their noise, and the blind bands in grey."""
+    axes = len(result.amplitude)
+    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True)
+    frequency, half = result.frequency.cpu().numpy(), 0.25 * result.resolution  # half of a step
+    blind = np.diff(result.blind.cpu().numpy().astype(int), prepend=0, append=0)
+    spans = list(zip(np.flatnonzero(blind > 0), np.flatnonzero(blind < 0), strict=True))  # blind neighbours
+    for axis, name in enumerate(AXIS_NAMES[:axes]):
+        unit, colour = AXIS_UNITS[axis], _AXIS_COLOURS.get(name, _INK)
+        curves = ((result.amplitude, result.noise, unit), (result.psd, result.noise_psd, f"{unit}²/Hz"))
+        for panel, (of_axes, of_noise, unit_of_panel) in zip(panels[:, axis], curves, strict=True):
+            values, noise = of_axes[axis].cpu().numpy(), of_noise[axis].cpu().numpy()
+            for first, behind in spans:
+                panel.axvspan(frequency[first] - half, frequency[behind - 1] + half, color="#ececec", linewidth=0)
+            panel.plot(frequency, values, color=colour, linewidth=0.8)
+            panel.plot(frequency, noise, color=_INK, linewidth=0.9, linestyle="--")
+            panel.set(xscale="log", yscale="log", xlim=(frequency[0], frequency[-1]))
+            if np.isfinite(noise).any():
+                bottom = 0.1 * float(np.nanmin(noise))
+                panel.set_ylim(bottom, 5 * max(float(np.nanmax(values)), 10 * bottom))
+            quantity = "amplitude" if panel is panels[0, axis] else "PSD"
+            plain_axes(panel, "" if quantity == "amplitude" else "frequency (Hz)", f"{quantity} ({unit_of_panel})")
+        panels[0, axis].set_title(
+            f"Displacement along {name}" if axis < 2 else name.capitalize(), loc="left", fontweight="bold"
+        )
+        labelled: list[float] = []
+        label_width = 0.09 * math.log(frequency[-1] / frequency[0])  # 9 % of the panel
+        lines = result.lines.amplitude[axis].tolist(), result.lines.frequency[axis].tolist()
+        for amplitude, at in zip(*lines, strict=True):  # the strongest first
+            apart = all(abs(math.log(at / other)) > label_width for other in labelled if at > 0)
+            if amplitude > SMALLEST_SHOWN * lines[0][0] and apart and len(labelled) < _LABELLED_LINES:
+                text = f"{measured_text(at)} Hz\n{measured_text(amplitude, digits=3)} {unit}"
+                place = {"textcoords": "offset points", "fontsize": 8, "ha": "center"}
+                panels[0, axis].annotate(text, (at, amplitude), (0, 4), **place)
+                labelled.append(at)
+    symbols = [
+        _symbol("displacement", color=_AXIS_COLOURS["x"], marker="", linewidth=0.8),
+        _symbol("noise (rms)", color=_INK, marker="", linewidth=0.9, linestyle="--"),
+        _symbol("blind: the frames cannot show this frequency", color="#ececec", marker="s", markersize=9),
+    ]
+    _legend_below(figure, symbols)
+    return figure
+
+
 def _check_figure(result: MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
     figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
@@ -723,6 +794,7 @@ FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
+        (DisplacementSpectrum, 0): _spectrum_figure,
         (MotionDetection, 0): free_motion_figure,
         (SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,

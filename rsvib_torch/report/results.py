@@ -1,4 +1,4 @@
-"""Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and ``windows.csv``."""
+"""Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and tables."""
 
 import csv
 import math
@@ -12,12 +12,12 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file, write_json
-from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
+from rsvib_torch.core.presentation import Result, plain_values
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.stacks import RestoredFrames, StackManifest
+from rsvib_torch.stacks import RestoredFrames
 
 
 @checks_arguments
@@ -177,15 +177,17 @@ def _write_csv(path: str | os.PathLike[str], head: Iterable[str], lines: Iterabl
 
 
 @checks_arguments
-def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None:
-    """Write a table of the windows of a stack as CSV: the strongest tone of each axis, and the verdict.
+def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: float | None = None) -> None:
+    """Write ``result.table()`` as CSV: tones of a detection or of the windows of a manifest, or a spectrum.
 
     Args:
-        path: The file to write.
-        manifest: The manifest of the stack, from ``read_manifest``.
+        path: The file to write; an existing file is replaced.
+        result: A result that has a table. Its unknown values are empty cells.
+        pixel_size: Size of a pixel in m, to add columns in um, um/s and m/s^2.
 
     Raises:
         OSError: If the file cannot be written.
+        TypeError: If the result has no table.
 
     Example:
         >>> import tempfile
@@ -196,34 +198,13 @@ def write_windows(path: str | os.PathLike[str], manifest: StackManifest) -> None
         >>> rsv.write_stack(f"{folder}/frames.npy", frames)
         >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
         >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
-        >>> rsv.write_windows(f"{folder}/windows.csv", rsv.read_manifest(report.manifest))
-        >>> with open(f"{folder}/windows.csv") as file:
-        ...     print(len(file.readlines()))  # a line for each window below the header
-        3
+        >>> rsv.write_table(f"{folder}/tones.csv", rsv.read_manifest(report.manifest))
+        >>> with open(f"{folder}/tones.csv") as file:
+        ...     print(len(file.readlines()))  # two windows with a tone along x and y each, below the header
+        5
     """
-    quantities = ("amplitude", "frequency", "phase")
-    head = ["window", "first_frame", "last_frame", "start_s"]
-    found = (record.detection for record in manifest.windows)
-    axes = max((len(one.reliable) for one in found if one is not None), default=2)
-    for axis in AXIS_NAMES[:axes]:
-        head += [f"{name}_{axis}{end}" for name in quantities for end in ("", "_std", "_std_if_hidden_tone")]
-        head += [f"image_motion_{axis}", f"reliable_{axis}"]
-    lines = []
-    for record in manifest.windows:
-        line: list[Any] = [record.window, record.first, record.last, record.start_time]
-        detection = record.detection
-        for number in range(axes):
-            if detection is None or number >= len(detection.reliable):
-                line += [None] * (3 * len(quantities) + 2)
-                continue
-            vibration, std = detection.vibration, detection.std
-            columns = (vibration, std, detection.std_if_hidden_tone or std)
-            for name in quantities:
-                line += plain_values([getattr(of_column, name)[number, 0] for of_column in columns])
-            line += [float(vibration.image_motion[number]), bool(detection.reliable[number])]
-        note = record.error or "; ".join(map(str, record.left_alone))
-        lines.append([*line, record.frames, record.outcome, len(record.bad_frames), note])
-    _write_csv(path, [*head, "frames", "outcome", "bad_frames", "note"], lines)
+    columns = result.table(pixel_size=pixel_size)
+    _write_csv(path, columns, zip(*columns.values(), strict=True))
 
 
 def write_restoration(

@@ -156,6 +156,10 @@ class FixedDewarp(nn.Module):
         self.register_buffer("to_rows", rows.float())
         bspline_coefficients(self.to_spectra[0], _DEGREE, 0)  # the filter is computed now: a graph cannot contain that
 
+    def extra_repr(self) -> str:
+        """The frames that it restores."""
+        return "{} frames of {} x {} px".format(*self.shape)
+
     def forward(self, frames: Tensor) -> Tensor:
         """Restore frames (T, H, W), (T, C, H, W) or (B, T, C, H, W)."""
         if not isinstance(frames, Tensor):

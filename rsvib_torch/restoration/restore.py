@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from rsvib_torch.core.arrays import ArrayLike
 from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.frames.entry_points import module_options, vibration_options
+from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
@@ -19,7 +19,7 @@ from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import SensorTiming, check_timing
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OpticsOptions, RestorationOptions, RestoreOptions, RestorerOptions
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
@@ -226,7 +226,7 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: Motion, joi
             warn_of_restoration(f"{where}{verdict.sentence}")
 
 
-class VibrationRestorer(nn.Module):
+class VibrationRestorer(TimedModule):
     """``restore`` as a module, for stacks (T, H, W) to batches of stacks (B, T, C, H, W).
 
     The options are those of ``restore``. It has no weights, ignores autocast, and is called by ``torch.compile``
@@ -250,13 +250,12 @@ class VibrationRestorer(nn.Module):
 
     @module_options(RestorerOptions)
     def __init__(self, timing: SensorTiming, options: RestorerOptions) -> None:
-        super().__init__()
-        check_timing(timing)
+        super().__init__(timing, options)
         check_optics(options.optics)
-        self.timing, self.options = timing, options
 
     def forward(
         self, frames: FramesOrFiles, vibration: Motion | DetectedVibration, ignore: ArrayLike | None = None
     ) -> Tensor:
         """Restore a stack of frames."""
+        self.check_stacks(frames)
         return restore(frames, self.timing, vibration, ignore=ignore, **vars(self.options))

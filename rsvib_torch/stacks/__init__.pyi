@@ -1,3 +1,4 @@
+from .corrector import CorrectedFrames, VibrationCorrector
 from .job import WindowResult
 from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
@@ -7,9 +8,11 @@ from .window_restoration import RestoredFrames, restore_block, restore_trusted, 
 from .windows import Window, cut_windows
 
 __all__ = [
+    "CorrectedFrames",
     "RestoredFrames",
     "StackManifest",
     "StackReport",
+    "VibrationCorrector",
     "Window",
     "WindowResult",
     "cut_windows",

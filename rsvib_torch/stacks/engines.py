@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from rsvib_torch.io.stack_format import needed_package
+from rsvib_torch.core.checks import needed_package
 from rsvib_torch.stacks.heap import keep_freed_memory, share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
 from rsvib_torch.stacks.windows import Window

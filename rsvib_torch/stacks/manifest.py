@@ -8,15 +8,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from statistics import median, stdev
 from typing import Any, Literal
 
-import torch
-
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.presentation import AXIS_NAMES, Result, plain_values
+from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joined_columns, physical_tone, plain_values
 from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.result_files import decode
 from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
+from rsvib_torch.io.stack_format import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import StackJob
 
 
@@ -97,10 +99,43 @@ class StackManifest(Result, file_format="rsvib stack"):
         vibration, restoration = self.lines()
         return "\n".join([*vibration, *(restoration if self.output is not None else [])])
 
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+        """One row per tone, axis and window, as in ``DetectedVibration.table``; a failed window has one row.
+
+        Phases refer to ``start_s``, the exposure start of the first row of the window. The vibration of a video that
+        was followed is that of one frame, at ``middle_time_s``.
+        """
+        lines = []
+        for record, middle in zip(self.windows, self._middle_times(), strict=True):
+            first: dict[str, Any] = {"window": record.window, "first_frame": record.first, "last_frame": record.last}
+            first |= {"start_s": record.start_time, "middle_time_s": middle}
+            note = record.error or "; ".join(map(str, record.left_alone))
+            last = {
+                "frames": record.frames,
+                "outcome": record.outcome,
+                "bad_frames": len(record.bad_frames),
+                "note": note,
+            }
+            tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)
+            lines += [{**first, **tone, **last} for tone in tones]
+        return joined_columns(lines)
+
+    def _middle_times(self) -> list[float | None]:
+        """Middle of the frames of each window, or of the frame that the vibration belongs to, in s."""
+        if self.settings.get("sensor") is None:
+            return [None] * len(self.windows)
+        timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
+        rows = self.input["shape"][timing.scan_axis]
+        half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        if "video" in self.settings:
+            return [record.start_time + half_frame for record in self.windows]
+        starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
+        return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]
+
     def totals(self) -> dict[str, Any]:
         """Summary of the windows of a stack: numbers of windows, gain, tones of each axis, and axes left unchanged.
 
-        Tones are medians over the reliable windows of the strongest tone, with the standard deviation over the windows.
+        Tones are medians over the reliable windows, with the standard deviation over the windows.
         """
         windows, found = self.windows, self.detections()
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
@@ -115,36 +150,49 @@ class StackManifest(Result, file_format="rsvib stack"):
             "restored": sum(record.frames == "restored" for record in windows),
             "outcomes": dict(Counter(record.outcome for record in windows if record.outcome is not None)),
             "predicted_gain_db": {"lowest": min(gains), "highest": max(gains)} if gains else None,
-            "tones": {name: _tone_over_windows(found, axis) for axis, name in enumerate(names)},
+            "tones": {name: _tones_over_windows(found, axis) for axis, name in enumerate(names)},
             "left_alone": unchanged,
             "errors": {str(record.window): record.error for record in windows if record.error is not None},
             "bad_frames": self.bad_frames,
         }
 
-    def tone_table(self) -> tuple[list[str], list[list[str]]]:
-        """Head and rows of a table of the strongest tone of each axis: median ± standard deviation over the windows."""
-        rows = []
-        for name, tone in self.totals()["tones"].items():
-            texts = [
-                "" if tone[quantity] is None else measured_text(tone[quantity], tone[f"{quantity}_spread"])
-                for quantity in ("amplitude", "frequency")
-            ]
-            rows.append([name, f"{tone['reliable_windows']} of {len(self.windows)}", *texts])
-        return ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"], rows
+    def tone_table(self, pixel_size: float | None = None) -> tuple[list[str], list[list[str]]]:
+        """Head and rows of a table of the tones of each axis: median ± standard deviation over the windows.
 
-    def lines(self) -> tuple[list[str], list[str]]:
+        With the size of a pixel in m, there are columns in units of length for x and y.
+        """
+        rows = []
+        for name, of_axis in self.totals()["tones"].items():
+            for tone in of_axis["tones"] or [{"windows": 0}]:
+                texts = [
+                    measured_text(tone[quantity], tone[f"{quantity}_spread"]) if tone["windows"] else ""
+                    for quantity in ("amplitude", "frequency")
+                ]
+                if pixel_size is not None:
+                    known = tone["windows"] and name in ("x", "y")
+                    physical = physical_tone(tone["amplitude"], tone["frequency"], pixel_size).values() if known else ()
+                    texts += [measured_text(value) for value in physical] or [""] * len(PHYSICAL_HEAD)
+                rows.append([name, f"{tone['windows']} of {len(self.windows)}", *texts])
+        head = ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"]
+        return [*head, *(PHYSICAL_HEAD if pixel_size is not None else ())], rows
+
+    def lines(self, pixel_size: float | None = None) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
         vibration = [
-            text_table(*self.tone_table()),
-            "strongest tone: median ± standard deviation over the windows",
+            text_table(*self.tone_table(pixel_size)),
+            "median ± standard deviation over the windows",
         ]
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
             restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
+        still = self._has_no_tone()
+        if still:
+            text = "the camera stands still, or moves uniformly or by less than the noise"
+            vibration.append(wrapped(f"no window has a significant tone: {text}"))
         for name, notes in data["left_alone"].items():
-            if notes:
+            if notes and not still:
                 window, note = next(iter(notes.items()))
                 restoration.append(
                     wrapped(
@@ -157,24 +205,54 @@ class StackManifest(Result, file_format="rsvib stack"):
             vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
 
+    def _has_no_tone(self) -> bool:
+        """Whether all windows were measured, and nothing else than missing tones is stated against any axis."""
+        codes = [
+            one.codes((axis,)) if one is not None else "failed"
+            for one in self.detections()
+            for axis in range(2 if one is None else one.vibration.num_axes)
+        ]
+        return bool(codes) and set(codes) == {"no_tone"}
+
     def detections(self) -> list[DetectedVibration | None]:
         """The detection of every window; None where it failed."""
         return [record.detection for record in self.windows]
 
 
-def _tone_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
-    """Number of windows in which an axis is reliable, and median and spread of its strongest tone over them."""
-    reliable = [
-        one.vibration for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])
-    ]
-    data: dict[str, Any] = {"reliable_windows": len(reliable)}
-    for name in ("amplitude", "frequency"):
-        values = torch.tensor(
-            [float(getattr(one, name)[axis, 0]) for one in reliable], dtype=torch.float64, device="cpu"
+_SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window closer than this is the same one
+
+
+def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
+    """Number of windows in which an axis is reliable, and median and spread of its tones over them, strongest first.
+
+    The tones of a window continue those of nearly the same frequency in the windows before, the nearest ones first.
+    """
+    reliable = [one for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])]
+    tones: list[list[tuple[float, float]]] = []  # (amplitude, frequency) in the windows of each tone
+    for one in reliable:
+        amplitudes, frequencies, stds = (
+            values[axis].tolist() for values in (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)
         )
-        data[name] = float(values.median()) if len(values) else None
-        data[f"{name}_spread"] = float(values.std()) if len(values) > 1 else None
-    return data
+        new = [
+            (a, f, max(_SAME_TONE * f, 4 * s)) for a, f, s in zip(amplitudes, frequencies, stds, strict=True) if a > 0
+        ]
+        steps = ((abs(f - tone[-1][1]), i, j) for i, (_, f, _) in enumerate(new) for j, tone in enumerate(tones))
+        pairs: dict[int, int] = {}  # number of the tone that each one of this window continues
+        for step, i, j in sorted(steps):
+            if i not in pairs and j not in pairs.values() and step <= new[i][2]:
+                pairs[i] = j
+        for i, (amplitude, frequency, _) in enumerate(new):
+            if i in pairs:
+                tones[pairs[i]].append((amplitude, frequency))
+            else:
+                tones.append([(amplitude, frequency)])
+    described = []
+    for tone in tones:
+        entry: dict[str, Any] = {"windows": len(tone)}
+        for name, values in zip(("amplitude", "frequency"), zip(*tone, strict=True), strict=True):
+            entry |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
+        described.append(entry)
+    return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 
 
 def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: int = 32) -> dict[str, Any]:
@@ -188,6 +266,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: in
         steps = min(count, most)
         return sorted({round(i * (count - 1) / max(1, steps - 1)) for i in range(steps)})
 
+    name, (path, _) = path.name, split_range(path)
     if path.is_dir():
         members = sorted(file for file in path.rglob("*") if file.is_file())
     else:
@@ -202,7 +281,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: in
             for index in spread(-(-sizes[number] // block), blocks):
                 opened.seek(index * block)
                 digest.update(opened.read(block))
-    return {"name": path.name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
+    return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> dict[str, Any]:

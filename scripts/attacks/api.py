@@ -208,7 +208,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "write_stack": {"path": folder / "written.tif", "like": info},
         "write_stmap": {"folder": new["maps"], "motion": vibration},
         "write_vibration": {"path": folder / "written.json"},
-        "write_windows": {"path": folder / "windows.csv"},
+        "write_table": {"path": folder / "tones.csv"},
     }
     functions = {name: getattr(rsv, name) for name in rsv.__all__ if inspect.isfunction(getattr(rsv, name))}
     result = {name: call(function, **different.get(name, {})) for name, function in functions.items()}

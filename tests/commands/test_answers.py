@@ -122,7 +122,9 @@ def test_detect_names_the_next_command(place, config, tmp_path, capsys, monkeypa
     monkeypatch.chdir(tmp_path)
     assert rsvib("detect", place / "frames.tif", *config, "--out", "found") == 0
     answer = sections(capsys.readouterr().out)
-    assert answer["Files (open offsets.png first)"] == ["found: offsets.png, vibration.json, offsets.csv"]
+    assert answer["Files (open offsets.png first)"] == [
+        "found: offsets.png, spectrum.png, vibration.json, tones.csv, offsets.csv, spectrum.csv"
+    ]
     arguments = shlex.split(answer["Next"][1])[1:]
     arguments[2] = str(tmp_path / "restored.tif")
     assert rsvib(*arguments) == 0
@@ -144,7 +146,7 @@ def test_windows_have_a_summary_a_table_and_a_figure(place, config, tmp_path, ca
         assert cv2.imread(str(folder / "windows.png")).std() > 5
         summary = json.loads((folder / "windows.json").read_text())
         assert (summary["windows"], summary["tones"]["y"]["reliable_windows"]) == (3, 3)
-        assert summary["tones"]["y"]["frequency"] == pytest.approx(113.0, abs=0.1)
+        assert summary["tones"]["y"]["tones"][0]["frequency"] == pytest.approx(113.0, abs=0.1)
         assert summary["errors"] == {}
     restoration = json.loads((tmp_path / "run" / "windows.json").read_text())
     assert (restoration["restored"], restoration["outcomes"]) == (3, {"helps": 3})
@@ -239,7 +241,7 @@ def test_quiet_prints_warnings_and_errors_only(place, config, tmp_path, capsys):
 
 
 EXISTING = {
-    "run": (("run", "frames.tif", "{}"), ["manifest.json", "restored.tif", "windows.csv"]),
+    "run": (("run", "frames.tif", "{}"), ["manifest.json", "restored.tif", "tones.csv"]),
     "detect": (("detect", "frames.tif", "--out", "{}"), ["vibration.json", "windows.json"]),
     "report": (("report", "frames.tif", "{}"), ["report.html"]),
     "motion": (("motion", "long.tif", "--out", "{}/m.csv"), ["m.csv"]),
@@ -279,7 +281,7 @@ def test_overwrite_replaces_all_results_of_the_earlier_run(place, config, tmp_pa
     assert rsvib("run", place / "frames.tif", out, *config, "--overwrite") == 0
     names = {path.name for path in out.iterdir()}
     assert {"vibration.json", "notes.txt"} <= names
-    assert not {"windows.csv", "windows.json", "windows.png"} & names
+    assert not {"windows.json", "windows.png"} & names
 
 
 @pytest.mark.parametrize("command", COMMANDS)

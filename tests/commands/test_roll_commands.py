@@ -55,7 +55,7 @@ def test_windows_of_a_rolling_camera(folder, capsys):
     arguments = ["detect", str(folder / "frames.tif"), "--out", str(out), "--config", str(folder / "camera.toml")]
     assert run_command([*arguments, "--window", "3"]) == 0
     assert "roll" in capsys.readouterr().out
-    head, *lines = (out / "windows.csv").read_text().splitlines()
+    head, *lines = (out / "tones.csv").read_text().splitlines()
     rows = [dict(zip(head.split(","), line.split(","), strict=True)) for line in lines]
-    reliable = [float(row["amplitude_roll"]) for row in rows if row["reliable_roll"] == "True"]
+    reliable = [float(row["amplitude_rad"]) for row in rows if (row["axis"], row["reliable"]) == ("roll", "True")]
     assert reliable == pytest.approx([2.5e-3] * 2, rel=0.05)

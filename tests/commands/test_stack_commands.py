@@ -15,7 +15,8 @@ from program import rsvib
 from small_config import CAMERA
 from small_stack import HEIGHT, WIDTH, write_small
 
-from rsvib_torch import read_stack_info
+from rsvib_torch import read_stack_info, write_stack
+from rsvib_torch.evaluation import example_frames
 
 FRAMES = 13
 CONFIG = f"""{CAMERA}
@@ -43,22 +44,26 @@ def test_run_of_a_long_stack(place, tmp_path, capsys):
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "13 frames in 4 windows, 4 restored, " in shown.out
-    names = ["before_after.png", "clear.zarr", "manifest.json", "windows.csv", "windows.json", "windows.png"]
+    names = ["before_after.png", "clear.zarr", "manifest.json", "tones.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     assert read_stack_info(tmp_path / "out" / "clear.zarr").full_scale == 4095
-    with (tmp_path / "out" / "windows.csv").open() as file:
+    with (tmp_path / "out" / "tones.csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert [line["first_frame"] for line in lines] == ["0", "3", "6", "9"]
+    # one row per window, axis and tone; the middle is that of the exposures of the frames first ... last
+    assert [(line["first_frame"], line["axis"]) for line in lines] == [(f, a) for f in "0369" for a in "xy"]
     for line in lines:
-        assert float(line["amplitude_x"]) == pytest.approx(1.2, rel=0.06)
-        assert float(line["frequency_y"]) == pytest.approx(170, rel=0.03)
-        assert line["frames"] == "restored"
+        amplitude, frequency = (1.2, 130) if line["axis"] == "x" else (0.8, 170)
+        assert float(line["amplitude_px"]) == pytest.approx(amplitude, rel=0.06)
+        assert float(line["frequency_Hz"]) == pytest.approx(frequency, rel=0.03)
+        assert (line["tone"], line["frames"], line["reliable"], line["reasons"]) == ("1", "restored", "True", "")
+        middle = 104e-4 * (int(line["first_frame"]) + int(line["last_frame"])) / 2 + 0.5 * ((HEIGHT - 1) * 1e-4 + 6e-4)
+        assert float(line["middle_time_s"]) == pytest.approx(middle)
 
 
 def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     options = ("--config", place / "camera.toml")
     assert rsvib("detect", place / "frames.tif", *options, "--out", tmp_path / "found", "--memory", "1GB") == 0
-    names = ["manifest.json", "windows.csv", "windows.json", "windows.png"]
+    names = ["manifest.json", "tones.csv", "windows.json", "windows.png"]
     assert sorted(path.name for path in (tmp_path / "found").iterdir()) == names
     manifest = tmp_path / "found" / "manifest.json"
     assert rsvib("restore", place / "frames.tif", tmp_path / "r.tif", *options, "--vibration", manifest) == 0
@@ -147,3 +152,18 @@ def test_errors_are_one_line_and_leave_no_files(place, tmp_path, capsys, options
     assert message in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_readout_time_replaces_the_row_time(tmp_path, capsys):
+    frames, timing, _ = example_frames()
+    write_stack(tmp_path / "frames.npy", frames)
+    readout = f"{1e3 * timing.row_time * frames.shape[-2]}ms"
+    camera = ("--exposure", timing.exposure_time, "--frame-rate", timing.frame_rate, "--readout-time", readout)
+    detect = ("detect", tmp_path / "frames.npy", *camera, "--out", tmp_path / "found")
+    assert rsvib(*detect) == 0
+    stored = json.loads((tmp_path / "found" / "vibration.json").read_text())["timing"]
+    assert stored["row_time"] == pytest.approx(timing.row_time)
+    capsys.readouterr()
+    assert rsvib(*detect, "--row-time", "100us", "--overwrite") == 2
+    message = "--readout-time replaces --row-time of frames in a file, and goes without --config"
+    assert message in capsys.readouterr().err

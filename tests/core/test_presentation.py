@@ -224,7 +224,8 @@ def test_results_are_drawn(results, tmp_path):
         path = tmp_path / f"{number}.png"
         if name not in DRAWN:
             with pytest.raises(
-                TypeError, match=r"has no figure; these have one: ClockAlignment, DetectionResult, FreeMotion, Mot"
+                TypeError,
+                match=r"has no figure; these have one: ClockAlignment, DetectionResult, DisplacementSpectrum, F",
             ):
                 result.plot(path)
         elif name in ("OffsetCurve", "Vibration") and result.batch_shape:

@@ -51,9 +51,9 @@ def test_files_can_be_read_by_other_libraries(tmp_path):
     with h5py.File(tmp_path / "a.h5") as file:
         np.testing.assert_array_equal(file["frames"][:], COUNTS)
         assert file["frames"].attrs["full_scale"] == 4095
-    array = zarr.open_array(tmp_path / "a.zarr", mode="r", zarr_format=3)
+    array = zarr.open_group(tmp_path / "a.zarr", mode="r", zarr_format=3)["frames"]
     np.testing.assert_array_equal(array[:], COUNTS)
-    assert array.metadata.dimension_names == ("T", "H", "W")
+    assert array.metadata.dimension_names == ("frame", "y", "x")
     np.testing.assert_array_equal(np.fromfile(tmp_path / "a.raw", "<u2").reshape(3, 9, 7), COUNTS)
 
 

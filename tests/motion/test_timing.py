@@ -123,3 +123,19 @@ def test_type_checker_requires_row_order(tmp_path):
         )
         assert (status == 0) == accepted, output
         assert accepted or 'has incompatible type "SensorTiming"; expected "RowTiming"' in output
+
+
+def test_timing_in_seconds_is_that_in_rows():
+    seconds = SensorTiming.from_seconds(row_time=20e-6, exposure_time=1 / 500, frame_rate=30, scan_axis="x")
+    assert (seconds.exposure_rows, seconds.frame_rows, seconds.scan_axis) == (100, pytest.approx(5000 / 3), -1)
+    with pytest.raises(ValueError, match="exposure_time must be larger than 0, got 0"):
+        SensorTiming.from_seconds(row_time=20e-6, exposure_time=0, frame_rate=30)
+
+
+def test_times_in_another_unit_are_refused_with_the_right_one():
+    with pytest.raises(ValueError, match=r"exposure_rows=0.002 .* \(0.002 s are exposure_rows=100\)"):
+        SensorTiming(row_time=20e-6, exposure_rows=0.002, frame_rows=1700)
+    with pytest.raises(
+        ValueError, match=r"exposure 410 s, frame period 0.03333 s; 410 us is 410us on the command line"
+    ):
+        SensorTiming.from_seconds(row_time=20e-6, exposure_time=410, frame_rate=30)

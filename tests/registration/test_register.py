@@ -76,7 +76,7 @@ def test_layout(pair, paper_camera, method):
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.4), (3.5, 2.25)])
 def test_uniform_shift_to_subpixel(method, shift):
     """A still scene moved as a whole between the frames: every band has the same offset."""
-    timing = SensorTiming(row_time=10e-6, exposure_rows=1e-3, frame_rows=1000)
+    timing = SensorTiming(row_time=10e-6, exposure_rows=0.01, frame_rows=1000)
     # this image motion displaces frames as a whole; within a frame it is negligible
     motion = Motion(amplitude=(0.0, 0.0), image_motion=(shift[0] / 10e-3, shift[1] / 10e-3))
     scene = draw_scene(512 + 80, 512 + 80, 5)

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.checks import needed_package
 from rsvib_torch.io.gyroscope.gcsv_log import check_orientation, oriented
 from rsvib_torch.io.gyroscope.rates_table import angular_rates
-from rsvib_torch.io.stack_format import needed_package
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 Array = NDArray[np.float64]

@@ -1,0 +1,178 @@
+"""Tables of tones: one row per tone and axis, units in the names, no padding; pandas, xarray and Zarr."""
+
+import csv
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from detections import detection_of, result_of
+
+import rsvib_torch as rsv
+from rsvib_torch.core.reason import Reason
+from rsvib_torch.stacks.manifest import StackManifest, WindowRecord
+
+TIMING = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
+TWO_TONES = rsv.Vibration(
+    [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.0], [130.0, 0.0]], [[0.3, 2.0], [-1.0, 0.0]], [20.0, 0.0]
+)
+
+
+def window(number, vibration, **options):
+    """Window of frames 4 n ... 4 n + 4; None as the vibration for a failed one."""
+    detection = None if vibration is None else detection_of(vibration, **options)
+    start, error = 4 * number * TIMING.frame_period, "the frames have no contrast" if detection is None else None
+    return WindowRecord(
+        number, 4 * number, 4 * number + 4, start, 4, "as taken", detection, (), None, None, None, error, {}
+    )
+
+
+def manifest_of(*windows):
+    settings = {"sensor": TIMING.to_dict()}
+    return StackManifest({"shape": [40, 300, 400]}, settings, {}, None, {}, windows)
+
+
+def test_one_row_per_tone_without_padding(tmp_path):
+    found = result_of(
+        TWO_TONES, TIMING, 0.01, last_row=480, num_pairs=2, reliable=(True, False), reasons=((), ("few", "blind"))
+    )
+    rsv.write_table(tmp_path / "tones.csv", found)
+    with (tmp_path / "tones.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["axis"], row["tone"]) for row in rows] == [("x", "1"), ("x", "2"), ("y", "1")]
+    assert [float(row["frequency_Hz"]) for row in rows] == [60.0, 145.0, 130.0]
+    assert [float(row["amplitude_px"]) for row in rows] == [2.0, 0.5, 1.0]
+    assert (
+        {row["amplitude_std_px"] for row in rows}
+        == {row["amplitude_std_if_hidden_tone_px"] for row in rows}
+        == {"0.01"}
+    )
+    assert [row["reliable"] for row in rows] == ["True", "True", "False"]
+    assert [row["reasons"] for row in rows] == ["", "", "unspecified unspecified"]
+    times = found.offsets
+    middle = 0.5 * float(times.times.min() + times.later_times.max())  # the timing of this result is not known
+    assert [float(row["middle_time_s"]) for row in rows] == pytest.approx([middle] * 3)
+
+
+def test_units_of_length():
+    found = detection_of(TWO_TONES)
+    table = found.table(pixel_size=12.5e-6)
+    angular = 2 * math.pi * np.array([60.0, 145.0, 130.0])
+    amplitude = 12.5e-6 * np.array([2.0, 0.5, 1.0])
+    np.testing.assert_allclose(table["amplitude_um"], 1e6 * amplitude)
+    np.testing.assert_allclose(table["velocity_um_per_s"], 1e6 * angular * amplitude)
+    np.testing.assert_allclose(table["acceleration_m_per_s2"], angular**2 * amplitude)
+    assert table["image_motion_um_per_s"] == [250.0, 250.0, 0.0]
+    assert "25.000 ± 0.025" in found.physical_summary(12.5e-6)
+    with pytest.raises(ValueError, match=r"pixel_size \(in m\) must be at most 1000"):
+        found.table(pixel_size=12500.0)
+
+
+def test_roll_has_a_column_of_its_own_and_an_axis_without_tone_one_row():
+    vibration = rsv.Vibration([[2.0], [0.0], [1e-3]], [[60.0], [0.0], [70.0]])
+    table = detection_of(vibration, reliable=(True, True, True), reasons=((), (), ())).table(pixel_size=1e-6)
+    assert table["tone"] == [1, 0, 1]
+    assert table["amplitude_px"] == [2.0, None, None]
+    assert table["amplitude_rad"] == [None, None, 1e-3]
+    assert table["frequency_Hz"] == [60.0, None, 70.0]
+    assert table["amplitude_um"] == [pytest.approx(2.0), None, None]
+
+
+def test_windows_have_their_middle_and_failed_ones_a_row():
+    still = rsv.Vibration([[1.0], [0.0]], [[60.0], [0.0]])
+    table = manifest_of(window(0, TWO_TONES), window(1, None), window(2, still)).table()
+    assert table["window"] == [0, 0, 0, 1, 2, 2]
+    assert table["axis"] == ["x", "x", "y", None, "x", "y"]
+    assert table["note"][3] == "the frames have no contrast"
+    half = 0.5 * (299 * 2e-5 + 20 * 2e-5)
+    assert table["middle_time_s"] == pytest.approx([(2 + 4 * n) * TIMING.frame_period + half for n in table["window"]])
+
+
+def test_all_tones_are_followed_over_the_windows():
+    """Two tones 2 % apart in frequency change places in size; a third one is in one window."""
+    windows = [
+        window(0, rsv.Vibration([[2.0, 1.0], [0.0, 0.0]], [[100.0, 102.0], [0.0, 0.0]])),
+        window(1, rsv.Vibration([[1.9, 1.1], [0.0, 0.0]], [[102.4, 100.2], [0.0, 0.0]])),
+        window(2, rsv.Vibration([[2.2, 0.3], [0.0, 0.0]], [[100.4, 310.0], [0.0, 0.0]])),
+        window(3, rsv.Vibration([[9.0], [0.0]], [[55.0], [0.0]]), reliable=(False, True)),
+    ]
+    summary = manifest_of(*windows).totals()["tones"]["x"]
+    assert summary["reliable_windows"] == 3
+    tones = [(tone["windows"], tone["amplitude"], tone["frequency"]) for tone in summary["tones"]]
+    assert tones == [(3, 2.0, 100.2), (2, pytest.approx(1.45), pytest.approx(102.2)), (1, 0.3, 310.0)]
+    text = manifest_of(*windows).summary()
+    assert all(f"{windows} of 4" in text for windows in (3, 2, 1))
+
+
+def test_a_camera_that_stands_still_is_said_to_stand_still():
+    still, without = rsv.Vibration.still(), ((Reason("no_tone", "x"),), (Reason("no_tone", "y"),))
+    quiet = [replace(detection_of(still, reliable=(False, False)), findings=without)] * 2
+    records = [replace(window(number, still), detection=found) for number, found in enumerate(quiet)]
+    text = " ".join(manifest_of(*records).summary().split())
+    assert "no window has a significant tone: the camera stands still" in text
+    assert "stands still" not in manifest_of(window(0, TWO_TONES), records[1]).summary()
+    assert "stands still" not in manifest_of(records[0], window(1, None)).summary()
+
+
+def test_a_batch_prints_and_tabulates_every_tone():
+    batch = rsv.DetectionResult.stacked([result_of(TWO_TONES, TIMING, 0.01, last_row=480) for _ in range(2)])
+    assert batch.table()["index"] == ["0", "0", "0", "1", "1", "1"]
+    assert batch.summary().count("145.00") == 2
+
+
+def test_pandas_frame_is_the_table():
+    pandas = pytest.importorskip("pandas")
+    frame = detection_of(TWO_TONES).to_pandas(pixel_size=1e-6)
+    assert list(frame.columns) == list(detection_of(TWO_TONES).table(pixel_size=1e-6))
+    assert frame.groupby("axis").amplitude_um.max().to_dict() == pytest.approx({"x": 2.0, "y": 1.0})
+    assert isinstance(frame, pandas.DataFrame)
+
+
+def test_dataset_has_names_units_and_reads_back_from_zarr(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("zarr")
+    found = result_of(TWO_TONES, TIMING, 0.01, last_row=480, reliable=(True, False), reasons=((), ("few",)))
+    dataset = rsv.DetectionResult.stacked([found, found]).to_xarray()
+    assert dataset.amplitude.dims == ("index", "axis", "tone")
+    assert dataset.amplitude.attrs["units"].startswith("px")
+    assert float(dataset.frequency.sel(axis="x", tone=1)[0]) == 145.0
+    assert float(dataset.std_amplitude.sel(axis="y", tone=0)[1]) == 0.01
+    assert dataset.offsets.dims == ("index", "pair", "row", "axis")
+    assert dataset.reasons.sel(axis="y").values.tolist() == ["unspecified"] * 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zarr on metadata that xarray consolidates
+        dataset.to_zarr(tmp_path / "result.zarr")
+    again = xarray.open_zarr(tmp_path / "result.zarr")
+    np.testing.assert_array_equal(again.amplitude, dataset.amplitude)
+
+
+def test_restored_frames_in_zarr_are_opened_by_xarray(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("zarr")
+    frames = torch.rand(3, 2, 9, 7, generator=torch.Generator().manual_seed(0))
+    info = rsv.StackInfo((3, 2, 9, 7), "uint16", 4095, frame_times=(0.0, 0.1, 0.2))
+    rsv.write_stack(tmp_path / "a.zarr", frames, dtype="uint16", full_scale=4095, like=info)
+    dataset = xarray.open_zarr(tmp_path / "a.zarr")
+    assert dataset.frames.dims == ("frame", "channel", "y", "x")
+    np.testing.assert_allclose(dataset.frames / dataset.frames.attrs["full_scale"], frames, atol=0.5 / 4095)
+    assert dataset.time.values.tolist() == [0.0, 0.1, 0.2]
+    assert rsv.read_stack_info(tmp_path / "a.zarr").frame_times == (0.0, 0.1, 0.2)
+
+
+@pytest.mark.parametrize(("method", "package"), [("to_pandas", "pandas"), ("to_xarray", "xarray")])
+def test_missing_package_is_named_with_the_extra(monkeypatch, method, package):
+    def without(name):
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    monkeypatch.setattr("rsvib_torch.core.checks.import_module", without)
+    with pytest.raises(
+        ModuleNotFoundError, match=rf"{method} needs the package {package}: pip install rsvib_torch\[tables\]"
+    ):
+        getattr(detection_of(TWO_TONES), method)()
+
+
+def test_results_without_a_table_name_what_they_have():
+    with pytest.raises(TypeError, match=r"Vibration has no table: use to_xarray\(\), which all results have"):
+        TWO_TONES.table()
