@@ -82,27 +82,23 @@ def assumptions(
             "otherwise frame_rows, and a row_time of 1 / (frame rate x rows), are wrong"
         )
     if num_frames == 2:
-        what = "frame_rows" if timing.frame_start_times is None else "frame_start_times"
+        what = "frame_rows" if timing.frame_start_times is None else "row_time, frame_start_times"
         sentences.append(
             f"{what}, readout direction, scan axis and order of the frames: two frames cannot contradict them, more "
             "frames can"
         )
-        if timing.frame_start_times is None:
-            sentences.append(_effect("frame_rows", vibration, sensitivity, timing.frame_rows))
-    if float(sensitivity.amplitude_by_exposure_rows.abs().amax()) > 0.01:
-        sentences.append(_effect("exposure_rows", vibration, sensitivity, timing.exposure_rows))
+        name = "frame_rows" if timing.frame_start_times is None else "row_time"
+        sentences += _effects(name, vibration, sensitivity, getattr(timing, name))
+    sentences += _effects("exposure_rows", vibration, sensitivity, timing.exposure_rows)
     return tuple(sentences)
 
 
-def _effect(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> str:
-    """Sentence about the effect of an error of 1 % of a stated time, on the strongest tone of each axis."""
-    of_axes = []
-    for axis, letter in enumerate(AXIS_NAMES[: vibration.num_axes]):
-        if float(vibration.amplitude[axis, 0]) <= 0:
-            continue
-        amplitude, frequency = (
-            round(float(getattr(sensitivity, f"{of}_by_{name}")[axis, 0]), 1) + 0.0  # no -0.0
-            for of in ("amplitude", "frequency")
-        )
-        of_axes.append(f"{letter} amplitude {amplitude:+.1f} %, frequency {frequency:+.1f} %")
-    return f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_axes)}"
+def _effects(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> list[str]:
+    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.01 %."""
+    of_tones = []
+    for axis, tone in vibration.amplitude.nonzero().tolist():
+        changes = {of: float(getattr(sensitivity, f"{of}_by_{name}")[axis, tone]) for of in ("amplitude", "frequency")}
+        texts = [f"{of} {change:+.2g} %" for of, change in changes.items() if abs(change) > 0.01]
+        if texts:
+            of_tones.append(f"{AXIS_NAMES[axis]} {float(vibration.frequency[axis, tone]):.4g} Hz: {', '.join(texts)}")
+    return [f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []
