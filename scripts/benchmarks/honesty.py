@@ -36,7 +36,7 @@ from rsvib_torch.restoration.verdict.trust import displacement_uncertainty
 
 OPTIONS = {
     "honesty_classes": (tuple(CLASSES), "honesty: classes of recordings", CLASSES),
-    "honesty_cases": (9, "honesty: cases of each class, of some a multiple; 333 in all"),
+    "honesty_cases": (9, "honesty: cases of each class, of some a multiple; 387 in all"),
     "honesty_size": (384, "honesty: rows and columns of the frames"),
 }
 QUICK = {"honesty_classes": ("plain", "frame_rows +2%"), "honesty_cases": 1, "honesty_size": 128}
