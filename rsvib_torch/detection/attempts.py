@@ -117,6 +117,7 @@ def assembled_attempt(found: Attempt, timing: SensorTiming, num_frames: int) -> 
         scale=found.scale,
         num_frames=num_frames,
         interval=found.interval,
+        blur=None if found.fitted.refined is None else found.fitted.refined.other_motion.blur,
     )
 
 
