@@ -229,14 +229,14 @@ def contradicted_axes(findings: Findings) -> tuple[bool, bool]:
 # Roll and zoom
 
 
-def max_apart(size: Array | float) -> Array:
+def _max_apart(size: Array | float) -> Array:
     """Largest permitted difference in px of the displacements along a row, for an axis with offsets of size px rms."""
     return np.maximum(0.009 * size, 0.035)
 
 
 def halves_move_apart(other: OtherMotion) -> Array:
     """(B,) whether the halves of the rows move apart, as roll and zoom cause it."""
-    return np.any(other.differential[..., ::-1] > max_apart(other.size), -1)
+    return np.any(other.differential[..., ::-1] > _max_apart(other.size), -1)
 
 
 # Limits of roll and zoom as the cause. Of 15 recordings with either, 0.057 px of the differences along a row were not
@@ -252,7 +252,7 @@ def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array
     is the rows of a frame over its columns.
     """
     apart = other.differential[..., ::-1]
-    is_uneven = (uneven[..., ::-1] > _MAX_UNEVEN * max_apart(other.size)).any(-1)
+    is_uneven = (uneven[..., ::-1] > _MAX_UNEVEN * _max_apart(other.size)).any(-1)
     moved = np.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * apart)
     return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
 
@@ -268,7 +268,7 @@ def rotation_reasons(
     ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
     ``size`` px the rms offset along the axis, and ``remedy`` the value of roll and zoom with which they are measured.
     """
-    apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(max_apart(size))
+    apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
     if apart <= allowed:
         return []
     if axes > 2:
