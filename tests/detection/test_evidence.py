@@ -1,4 +1,4 @@
-"""Evidence beside the displacements of rows: the blur contradicts an exposure, and halves that vibrate alike confirm."""
+"""Evidence beside the displacements of rows: the blur contradicts an exposure, halves that vibrate alike confirm."""
 
 import re
 from dataclasses import replace
