@@ -55,8 +55,8 @@ def beside(motions, num_frames):
 
 
 def test_parallax_does_not_refuse_halves_that_vibrate_alike():
-    """The right half travels by 0.9 px per frame."""
-    moving = replace(MOTION, image_motion=(25.0, -18.0))
+    """The right half travels by 0.15 px per frame."""
+    moving = replace(MOTION, image_motion=(4.0, -3.0))
     found = detect_vibration(beside([MOTION, moving], 4), TIMING)
     assert codes(found) == [set(), set()]
     error = found.vibration.amplitude[:, 0].numpy() - MOTION.amplitude
