@@ -1,13 +1,17 @@
 #!/usr/bin/env python
-"""Generate docs/benchmarks.md from the stored results of the benchmarks in scripts/benchmarks/results."""
+"""Generate docs/benchmarks.md from the stored results of the benchmarks in scripts/benchmarks/results.
+
+The table of standard deviations is written between two marks in docs/verdicts.md.
+"""
 
 import argparse
 from pathlib import Path
 
 from benchmarks.sections import SECTIONS, module_of
-from harness import RESULTS, StoredResult, machine_line, read_result
+from harness import RESULTS, StoredResult, machine_line, read_result, with_generated_part
 
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
+VERDICTS = PAGE.with_name("verdicts.md")
 HEAD = """# Benchmarks
 
 Speed and accuracy of rsvib_torch and of other software, measured on the same frames in the same run. The frames of
@@ -17,21 +21,22 @@ is measured again with `python scripts/benchmark.py --only NAME --store`.
 """
 
 
-def section_text(result: StoredResult) -> str:
-    """Heading, origin and tables of one result."""
+def measured_text(result: StoredResult) -> str:
+    """Origin and tables of one result."""
     commit = "" if result.commit is None else f", commit {result.commit}"
     origin = (
         f"Measured by `python scripts/benchmark.py --only {result.section} --store` with rsvib_torch {result.version}"
         f"{commit}, on {result.date} in {result.seconds:.0f} s. {machine_line(result.machine)}"
     )
     tables = "\n".join(module_of(result.section).lines(result.rows, result.options)).strip()
-    return f"## {SECTIONS[result.section].title}\n\n{origin}\n\n{tables}\n"
+    return f"{origin}\n\n{tables}\n"
 
 
 def page_text(folder: Path) -> str:
     """The page: a section for every result in a folder, in the order of ``SECTIONS``."""
-    paths = [folder / f"{name}.json" for name in SECTIONS]
-    sections = [section_text(read_result(path)) for path in paths if path.exists()]
+    paths = [folder / f"{name}.json" for name, section in SECTIONS.items() if section.page == PAGE.name]
+    results = [read_result(path) for path in paths if path.exists()]
+    sections = [f"## {SECTIONS[result.section].title}\n\n{measured_text(result)}" for result in results]
     return "\n".join([HEAD, *sections])
 
 
@@ -41,6 +46,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=PAGE, help="page to write (default: docs/benchmarks.md)")
     options = parser.parse_args(arguments)
     options.out.write_text(page_text(options.results), encoding="utf-8")
+    bars = options.results / "error_bars.json"
+    if bars.exists():
+        text = with_generated_part(VERDICTS.read_text(encoding="utf-8"), [measured_text(read_result(bars))])
+        VERDICTS.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

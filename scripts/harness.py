@@ -51,7 +51,14 @@ _LIBRARIES = {
     "NumPy": ("numpy",),
     "vidstab": ("vidstab",),
 }
+BEGIN, END = "<!-- begin of the generated table -->", "<!-- end of the generated table -->"
 _NOT_FINITE = ("nan", "inf", "-inf")  # JSON has no such numbers, they are stored as text
+
+
+def with_generated_part(page: str, lines: Iterable[str]) -> str:
+    """The text of a page with other lines between ``BEGIN`` and ``END``."""
+    before, rest = page.split(BEGIN)
+    return "\n".join([before + BEGIN, *lines, END + rest.split(END)[1]])
 
 
 # Options

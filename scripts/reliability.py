@@ -19,13 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from attacks.trial import FAILURES, OUTCOMES, Trial
-from harness import machine, table, today
+from harness import machine, table, today, with_generated_part
 
 import rsvib_torch as rsv
 
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
 RESULTS = Path(__file__).parent / "attacks" / "results.json"
-BEGIN, END = "<!-- begin of the generated table -->", "<!-- end of the generated table -->"
 
 
 @dataclass(frozen=True)
@@ -81,11 +80,10 @@ def counted(results: dict[str, dict[str, Any]]) -> list[str]:
 
 def store(results: dict[str, dict[str, Any]]) -> None:
     """Replace the stored results and the generated part of the page."""
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    after = rest.split(END)[1]
     origin = f"Measured by `python scripts/reliability.py --store` with rsvib_torch {rsv.__version__}."
     RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text("\n".join([before + BEGIN, origin, "", *counted(results), END + after]), encoding="utf-8")
+    page = with_generated_part(PAGE.read_text(encoding="utf-8"), [origin, "", *counted(results)])
+    PAGE.write_text(page, encoding="utf-8")
 
 
 def main() -> int:

@@ -115,6 +115,9 @@ def test_results_are_stored_and_read_back(tmp_path):
 def test_the_page_of_the_documentation_is_up_to_date():
     if any(benchmark_page.RESULTS.glob("*.json")):
         assert benchmark_page.PAGE.read_text() == benchmark_page.page_text(benchmark_page.RESULTS)
+    bars = benchmark_page.RESULTS / "error_bars.json"
+    if bars.exists():
+        assert benchmark_page.measured_text(read_result(bars)) in benchmark_page.VERDICTS.read_text()
 
 
 def test_one_command_writes_markdown_and_json(tmp_path, capsys):

@@ -246,7 +246,7 @@ _TONES = {
         "{exposure_rows:g} rows, the limit is {limit:g}",
         "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
         "determine the motion",
-        "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2.5",
+        "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
         refuses="all axes",
     ),
     "bands_unexplained": ReasonKind(

@@ -41,6 +41,7 @@ def assembled(
     scale: FieldScale,
     num_frames: int,
     interval: float,
+    blur: Array | None = None,
 ) -> DetectionResult:
     """The results of B stacks in image axes.
 
@@ -55,6 +56,7 @@ def assembled(
         scale: Components of the motion.
         num_frames: Frames of a stack.
         interval: Seconds between two frames, for the gain.
+        blur: (B, 3) as in ``OtherMotion``; None if it was not measured.
     """
     row_timing = timing.in_row_order()
     predicted = torch.from_numpy(fitted).to(curve.offsets.device)
@@ -82,7 +84,14 @@ def assembled(
         findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
         sensitivity=sensitivity,
         assumptions=tuple(
-            assumptions(vibration[index], sensitivity[index], row_timing, num_frames, scale.height)
+            assumptions(
+                vibration[index],
+                sensitivity[index],
+                row_timing,
+                num_frames,
+                scale.height,
+                None if blur is None else blur[index, :2].tolist(),
+            )
             for index in range(len(findings))
         ),
         timing=timing,

@@ -44,13 +44,21 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
     frequency_by_exposure_rows: Tensor  # d ln f / d ln exposure_rows
 
     def summary(self) -> str:
-        """Changes of the strongest tone of each axis if a time is stated 1 % larger."""
+        """Changes of every tone if a time is stated 1 % larger; of a batch, of the strongest one of each axis."""
+        shown = 1 if self.batch_shape else self.frequency_by_row_time.shape[-1]
         rows = [
-            [*labels, name, *(f"{float(getattr(self, f'{of}_by_{name}')[at][0]):+.2f}" for of in _TONE_VALUES)]
+            [
+                *labels,
+                str(tone + 1),
+                name,
+                *(f"{float(getattr(self, f'{of}_by_{name}')[at][tone]):+.2f}" for of in _TONE_VALUES),
+            ]
             for at, labels in axis_rows(self.batch_shape)
+            for tone in range(shown)
+            if tone == 0 or float(self.frequency_by_row_time[at][tone]) != 0.0
             for name in ("row_time", "frame_rows", "exposure_rows")
         ]
-        return text_table([*axis_head(self.batch_shape), "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
+        return text_table([*axis_head(self.batch_shape), "tone", "1 % of", *(f"{of} (%)" for of in _TONE_VALUES)], rows)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -3,6 +3,8 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -68,41 +70,73 @@ def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:
 
 
 def assumptions(
-    vibration: Vibration, sensitivity: TimingSensitivity, timing: RowTiming, num_frames: int, num_rows: int
+    vibration: Vibration,
+    sensitivity: TimingSensitivity,
+    timing: RowTiming,
+    num_frames: int,
+    num_rows: int,
+    blur: Sequence[float] | None = None,
 ) -> tuple[str, ...]:
-    """What the frames cannot contradict, with its effect on one vibration in image axes, one sentence for each."""
+    """What the frames cannot contradict, with its effect on one vibration in image axes, one sentence for each.
+
+    ``blur`` is the ratio of ``OtherMotion.blur`` and its standard deviation; None if it was not measured.
+    """
     if not bool((vibration.amplitude > 0).any()):
         return ()
     sentences = []
     if timing.frame_start_times is None:
-        sentences.append(f"row_time={timing.row_time:g} s; all frequencies are inversely proportional to it")
+        sentences.append(
+            f"row_time={timing.row_time:g} s; all frequencies are inversely proportional to it, or differ by multiples "
+            f"of {timing.frame_rate:.4g} Hz if this frame rate is right and row_time wrong"
+        )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
         sentences.append(
             f"frame_rows={num_rows} is the number of rows of the frames: there are no blanking rows, which is rare; "
             "otherwise frame_rows, and a row_time of 1 / (frame rate x rows), are wrong"
         )
     if num_frames == 2:
-        what = "frame_rows" if timing.frame_start_times is None else "frame_start_times"
+        what = "frame_rows" if timing.frame_start_times is None else "row_time, frame_start_times"
         sentences.append(
             f"{what}, readout direction, scan axis and order of the frames: two frames cannot contradict them, more "
             "frames can"
         )
-        if timing.frame_start_times is None:
-            sentences.append(_effect("frame_rows", vibration, sensitivity, timing.frame_rows))
-    if float(sensitivity.amplitude_by_exposure_rows.abs().amax()) > 0.01:
-        sentences.append(_effect("exposure_rows", vibration, sensitivity, timing.exposure_rows))
+        name = "frame_rows" if timing.frame_start_times is None else "row_time"
+        sentences += _effects(name, vibration, sensitivity, getattr(timing, name))
+    sentences += _effects("exposure_rows", vibration, sensitivity, timing.exposure_rows)
+    if blur is not None:
+        sentences += _exposure_range(vibration, timing, *blur)
     return tuple(sentences)
 
 
-def _effect(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> str:
-    """Sentence about the effect of an error of 1 % of a stated time, on the strongest tone of each axis."""
-    of_axes = []
-    for axis, letter in enumerate(AXIS_NAMES[: vibration.num_axes]):
-        if float(vibration.amplitude[axis, 0]) <= 0:
-            continue
-        amplitude, frequency = (
-            round(float(getattr(sensitivity, f"{of}_by_{name}")[axis, 0]), 1) + 0.0  # no -0.0
-            for of in ("amplitude", "frequency")
-        )
-        of_axes.append(f"{letter} amplitude {amplitude:+.1f} %, frequency {frequency:+.1f} %")
-    return f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_axes)}"
+def _effects(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> list[str]:
+    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.01 %."""
+    of_tones = []
+    for axis, tone in vibration.amplitude.nonzero().tolist():
+        changes = {of: float(getattr(sensitivity, f"{of}_by_{name}")[axis, tone]) for of in ("amplitude", "frequency")}
+        texts = [f"{of} {change:+.2g} %" for of, change in changes.items() if abs(change) > 0.01]
+        if texts:
+            of_tones.append(f"{AXIS_NAMES[axis]} {float(vibration.frequency[axis, tone]):.4g} Hz: {', '.join(texts)}")
+    return [f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []
+
+
+def _exposure_range(vibration: Vibration, timing: RowTiming, ratio: float, std: float) -> list[str]:
+    """Sentence about the exposures that the blur of the frames agrees with, within two standard deviations.
+
+    The rows determine ``A sinc(f T_e)`` (Eq. 2). There is no sentence if no amplitude changes by more than 1 %.
+    """
+    stated = timing.exposure_time
+    low, high = (min(stated * math.sqrt(max(ratio + 2 * n * std, 0.0)), timing.frame_period) for n in (-1, 1))
+    low, high = min(low, stated), max(high, stated)
+    of_tones = []
+    for axis, tone in vibration.amplitude[:2].nonzero().tolist():
+        frequency = float(vibration.frequency[axis, tone])
+        # an exposure of a period averages the tone out
+        longest = min(high, 0.9 / frequency)
+        changes = [100 * (np.sinc(frequency * stated) / np.sinc(frequency * time) - 1) for time in (low, longest)]
+        if stated < longest and max(map(abs, changes)) > 1.0:
+            more = " and more" if longest < high else ""
+            name = f"{AXIS_NAMES[axis]} {frequency:.4g} Hz"
+            of_tones.append(f"{name}: amplitude {changes[0]:+.2g} to {changes[1]:+.2g} %{more}")
+    rows = f"{low / timing.row_time:.3g} to {high / timing.row_time:.3g}"
+    effects = "; ".join(of_tones)
+    return [f"exposure_rows={timing.exposure_rows:g}: the blur agrees with {rows}: {effects}"] if of_tones else []

@@ -282,15 +282,15 @@ def rotation_reasons(
 def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) -> list[Reason]:
     """Reasons against all axes from the difference of the blur between frames.
 
-    Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). Interpolation
-    errors increase it by about 0.005 / size, so that high ratios count only if the excess is 0.02 of the detail, and
-    sizes below 0.002 do not count; above 0.25 the second order is not enough. Negative ratios are caused by another
-    error, because no exposure time gives them.
+    Its ratio to the expected one is the square of the ratio of the exposure times (docs/verdicts.md). A stated exposure
+    that is far too short expects nearly no blur, so that what counts is the size of the measured difference. Sizes
+    above 0.25 of the detail are beyond the second order, with which ratios of 0.5 to 1.5 were measured for sizes of
+    0.05 and more. Negative ratios are caused by another error, because no exposure time gives them.
     """
-    low, high = 0.6, 2.5
-    is_low = -0.3 < ratio < low and 1 - ratio > 3 * std
-    is_high = ratio > high and ratio - 1 > 5 * std and (ratio - 1) * size > 0.02
-    if not 0.002 < size < 0.25 or not (is_low or is_high):
+    low, high = 0.6, 2.0
+    is_low = -0.3 < ratio < low and 1 - ratio > 3 * std and size > 0.002
+    is_high = ratio > high and ratio - 1 > 4 * std and (ratio - 1) * size > 0.002
+    if size >= 0.25 or not (is_low or is_high):
         return []
     details: dict[str, float | str] = {"exposure_rows": timing.exposure_rows}
     if ratio > 0:

@@ -32,6 +32,11 @@ class GreyFrames:
         valid = None if self.valid is None else cut_columns(self.valid, parts)
         return replace(self, images=cut_columns(self.images, parts), valid=_unless_complete(valid))
 
+    def columns(self, part: slice) -> "GreyFrames":
+        """Some neighbouring columns of each stack."""
+        valid = None if self.valid is None else self.valid[..., part]
+        return replace(self, images=self.images[..., part], valid=_unless_complete(valid))
+
     def one(self, index: int) -> "GreyFrames":
         """One stack out of the batch, as a batch of one."""
         part = slice(index, index + 1)

@@ -106,11 +106,17 @@ def free_components(seed: int, axes: int) -> Motion:
 
 
 def scene_of(size: int, optics: float) -> tuple[Layer, torch.Tensor]:
-    """A drawn city as a layer of the camera, and its pixels at rest, ``RIM`` px larger on each side than the frame."""
+    """A drawn city as a layer of the camera, and its pixels at rest."""
     layer = Layer(seen_by_pixels(city(fine_shape(size, size), np.random.default_rng(3)), optics))
+    return layer, pixels_at_rest(layer, size)
+
+
+def pixels_at_rest(layer: Layer, size: int) -> torch.Tensor:
+    """Pixels of a scene at rest, ``RIM`` px larger on each side than the frame."""
     place = FINER * (np.arange(-RIM, size + RIM) + MARGIN + 0.5)  # as in take_frames
-    pixels = map_coordinates(layer.light, np.meshgrid(place, place, indexing="ij"), np.float64, prefilter=False)
-    return layer, torch.from_numpy(pixels)
+    return torch.from_numpy(
+        map_coordinates(layer.light, np.meshgrid(place, place, indexing="ij"), np.float64, prefilter=False)
+    )
 
 
 def noisy(frames: Array, noise: float, seed: int) -> torch.Tensor:

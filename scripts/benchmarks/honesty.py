@@ -36,7 +36,7 @@ from rsvib_torch.restoration.verdict.trust import displacement_uncertainty
 
 OPTIONS = {
     "honesty_classes": (tuple(CLASSES), "honesty: classes of recordings", CLASSES),
-    "honesty_cases": (9, "honesty: cases of each class, of some a multiple; 333 in all"),
+    "honesty_cases": (9, "honesty: cases of each class, of some a multiple; 387 in all"),
     "honesty_size": (384, "honesty: rows and columns of the frames"),
 }
 QUICK = {"honesty_classes": ("plain", "frame_rows +2%"), "honesty_cases": 1, "honesty_size": 128}
@@ -110,17 +110,22 @@ def tone_errors(found: rsv.DetectionResult, true: Array, axis: int) -> tuple[lis
     return errors, wrong_number
 
 
+def effect_of(found: rsv.DetectionResult, taken: Recording, of: str, name: str, axis: int, tone: int) -> float:
+    """Logarithm of the factor by which an error of a stated time changes an amplitude or a frequency."""
+    if name == "exposure_rows" and of == "amplitude":  # its effect is not linear
+        frequency = float(found.vibration.frequency[axis, tone])
+        return float(np.log(np.sinc(frequency * taken.exposure) / np.sinc(frequency * taken.timing.exposure_time)))
+    factor = taken.case.stated[name]
+    return float(getattr(found.sensitivity, f"{of}_by_{name}")[axis, tone]) * math.log(factor)
+
+
 def is_assumed(found: rsv.DetectionResult, taken: Recording, axis: int, tones: list[dict[str, float]]) -> bool:
     """Whether the sensitivity to a stated assumption gives at least a third of every wrong parameter's error."""
     names = [name for name in taken.case.stated if any(text.startswith(name) for text in found.assumptions)]
     for tone in tones:
         for of in ("amplitude", "frequency"):
             if abs(tone[f"{of}_z"]) > MANY_STD and abs(tone[f"{of}_error"]) > WRONG_SHARE:
-                effect = sum(
-                    float(getattr(found.sensitivity, f"{of}_by_{name}")[axis, int(tone["place"])])
-                    * math.log(taken.case.stated[name])
-                    for name in names
-                )
+                effect = sum(effect_of(found, taken, of, name, axis, int(tone["place"])) for name in names)
                 if effect * tone[f"{of}_error"] <= 0 or abs(tone[f"{of}_error"]) > 3 * abs(effect):
                     return False
     return bool(names)

@@ -1,11 +1,13 @@
 """Recordings of the counts of confident wrong answers: classes of motions, scenes and errors of the stated timing."""
 
+import io
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import av
 import numpy as np
 from benchmarks.honesty_camera import Array, Layer, Motion, row_displacement, standing, take_frames
 from benchmarks.honesty_scenes import cars, cloud, near_half, scene_layer
@@ -40,6 +42,7 @@ class Case:
         reverse: Whether the last row is read first.
         stated: Errors of the stated timing: factors of ``row_time``, ``exposure_rows`` and ``frame_rows``.
         time_stamps: Whether the true start times of the frames are stated.
+        crf: Quality of the H.264 video (libx264) that the frames are decoded from; None for frames without encoding.
     """
 
     motion: Motion
@@ -53,6 +56,7 @@ class Case:
     reverse: bool = False
     stated: dict[str, float] = field(default_factory=dict)
     time_stamps: bool = False
+    crf: int | None = None
 
     @property
     def timing_is_wrong(self) -> bool:
@@ -108,6 +112,8 @@ def record(case: Case, generator: Generator, size: int) -> Recording:
     starts = taken[:, None] * FRAME_PERIOD + order * row_time
     frames = take_frames(layers, case.motion, starts, exposure_rows * row_time, size)
     frames += case.noise * generator.standard_normal(frames.shape)
+    if case.crf is not None:
+        frames = decoded_h264(frames, case.crf)
     timing = rsv.SensorTiming(
         row_time=row_time * case.stated.get("row_time", 1.0),
         exposure_rows=exposure_rows * case.stated.get("exposure_rows", 1.0),
@@ -115,6 +121,24 @@ def record(case: Case, generator: Generator, size: int) -> Recording:
         frame_start_times=(FRAME_PERIOD * taken).tolist() if case.time_stamps else None,
     )
     return Recording(case, frames, timing, starts, exposure_rows * row_time, tuple(layers))
+
+
+def decoded_h264(frames: Array, crf: int) -> Array:
+    """Frames (T, H, W) after encoding as the luma of an H.264 video of limited range and decoding."""
+    height, width = frames.shape[1:]
+    counts = np.clip(np.round(16 + 219 * frames), 0, 255).astype(np.uint8)
+    grey = np.full((height // 2, width), 128, np.uint8)  # both planes of chroma
+    video = io.BytesIO()
+    with av.open(video, "w", format="mp4") as output:
+        stream = output.add_stream("libx264", rate=round(1 / FRAME_PERIOD), options={"crf": str(crf)})
+        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+        for luma in counts:
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.concatenate([luma, grey]), format="yuv420p")))
+        output.mux(stream.encode())
+    video.seek(0)
+    with av.open(video) as encoded:
+        decoded = [frame.to_ndarray()[:height] for frame in encoded.decode(video=0)]
+    return (np.stack(decoded).astype(np.float64) - 16) / 219
 
 
 # Motions
@@ -163,6 +187,16 @@ def of_tones(x: Tones, y: Tones, **others: Any) -> Case:
 def plain(generator: Generator, **others: Any) -> Case:
     """One tone along each axis."""
     return of_tones(one_tone(generator), one_tone(generator), **others)
+
+
+def fast_weak(generator: Generator, **others: Any) -> Case:
+    """A slow strong tone and a fast weak one along each axis, eight frames with an exposure of 1 ms."""
+    axes = []
+    for _ in range(2):
+        tones = np.concatenate([one_tone(generator), one_tone(generator)])
+        tones[1, 0], tones[1, 1] = generator.uniform(0.1, 0.3), generator.uniform(250.0, 450.0)
+        axes.append(tones)
+    return of_tones(*axes, num_frames=8, exposure=1e-3 / FRAME_PERIOD * BLANKING * FULL_ROWS, **others)
 
 
 def random(generator: Generator) -> Case:
@@ -284,6 +318,8 @@ TIMING_CORRECT: dict[str, Build] = {
     "long period, 0.58": partial(long_period, periods=0.58),
     "long period, 0.97": partial(long_period, periods=0.97),
     "large amplitude": large_amplitude,
+    "fast weak tone": fast_weak,
+    "H.264": partial(plain, num_frames=8, exposure=55.0, crf=23),
     "stars": partial(plain, scene="stars"),
     "objects": partial(plain, in_front=partial(sliding, cars, 20.0)),
     "cloud": partial(plain, in_front=partial(sliding, cloud, 4.0)),
@@ -297,6 +333,18 @@ TIMING_WRONG: dict[str, Build] = {
         for error in (0.01, 0.03, 0.10)
     },
     "exposure 300, true 200": partial(plain, exposure=200.0, stated={"exposure_rows": 1.5}),
+    **{
+        f"fast weak tone, exposure x {factor}": partial(fast_weak, stated={"exposure_rows": factor})
+        for factor in (0.05, 0.3, 0.6)
+    },
+    # 40 us for 55 us at the right frame rate and exposure time, with H.264 of about 2.5 Mb/s for 640 x 360 px
+    "row_time x 0.73, H.264": partial(
+        plain,
+        num_frames=8,
+        exposure=55.0,
+        crf=23,
+        stated={"row_time": 0.73, "frame_rows": 1 / 0.73, "exposure_rows": 1 / 0.73},
+    ),
     "exposure x 0.5": partial(plain, exposure=100.0, stated={"exposure_rows": 0.5}),
     "exposure x 2": partial(plain, exposure=100.0, stated={"exposure_rows": 2.0}),
     "dropped frame": partial(plain, taken=(0, 1, 3, 4)),

@@ -14,10 +14,12 @@ class Section:
     Attributes:
         title: Heading on the page.
         by_default: Whether it runs without ``--only``; sections of more than a quarter of an hour do not.
+        page: Page in docs/ with its tables.
     """
 
     title: str
     by_default: bool = True
+    page: str = "benchmarks.md"
 
 
 SECTIONS: dict[str, Section] = {
@@ -38,7 +40,7 @@ SECTIONS: dict[str, Section] = {
     "timing": Section("Mistakes of the timing", by_default=False),
     "detection": Section("Accuracy of detection, roll and zoom", by_default=False),
     "row_time": Section("Row time from motion", by_default=False),
-    "error_bars": Section("Standard deviations", by_default=False),
+    "error_bars": Section("Standard deviations", by_default=False, page="verdicts.md"),
 }
 
 

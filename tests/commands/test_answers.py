@@ -94,7 +94,7 @@ def test_the_answer_of_run_names_everything(place, config, tmp_path, capsys, mon
     assert re.match(r"x     1\.(59|60)\d* ± 0\.0\d+( \(± 0\.\d+\))?  +7[01]\.", vibration[1])
     assumed = " ".join(" ".join(line for line in vibration if not re.match("[xy]:", line)).split())
     assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in assumed
-    assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x amplitude" in assumed
+    assert "assumed: frame_rows=200: if it is stated 1 % too large, this changes x 71." in assumed
     assert answer["Restoration"][0] == "2 frames restored along x and y"
     assert re.fullmatch(r"restored frames agree; estimated improvement \+\d+\.\d dB", answer["Restoration"][1])
     names = " ".join(answer["Files (open before_after.png first)"]).removeprefix("out: ").replace(",", "").split()

@@ -582,6 +582,9 @@ def _different(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> Te
     return (spread(paths) > 0.5) | (spread(_second_moments(paths, weights)) > 0.03) | (spread(third) > 0.0024)
 
 
+_SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
+
+
 def blur_ratio(
     groups: list[FrameGroups], timing: RowTiming, motion: Motion, *, block: int = 2, highest: float = 0.15
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -589,21 +592,23 @@ def blur_ratio(
 
     An exposure blurs a row to second order by ``1 + M : grad grad / 2`` with the second moments M of the path. The
     difference of two warped frames is fitted by ``ratio (M_2 - M_1) : grad grad m / 2 + gain m``, m their mean. The
-    offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Interpolation
-    errors increase the ratio by about 0.005 / size, and the finite differences increase it by about 0.2.
+    offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Only coarse detail is
+    compared, along and across rows: interpolation errors of fine detail increase the ratio.
 
     Args:
         groups: The frames.
         timing: The sensor, in row order.
         motion: Motion of each stack (B).
-        block: Rows that are averaged.
+        block: Rows that are averaged, three of these blocks with the weights 1/4, 1/2, 1/4.
         highest: Cycles/px along rows, below which the expansion is used; a blur of 2 px is then expanded to 20 %.
 
     Returns:
         (B,) each: ratio, its standard deviation, and the size of the expected difference relative to m.
     """
-    sums: list[tuple[Tensor, ...]] = []
+    parts: list[Tensor] = []
+    counts: list[Tensor] = []
     for group in groups:
+        # 1. Coarse detail of the warped frames, and the second moments of the paths.
         of_groups = group.motion_of_groups(motion)
         positions = _Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
         u = group.spectra.frequencies
@@ -612,37 +617,52 @@ def blur_ratio(
 
         def averaged(values: Tensor) -> Tensor:
             rows = values.shape[2] // block
-            rows_of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block))
-            return rows_of_blocks.mean(3)
+            of_blocks: Tensor = values[:, :, : rows * block].unflatten(2, (rows, block)).mean(3)
+            return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
 
         spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
         moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, of_groups)))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
-        mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
-        change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 1:-1, None]
-        before, here, after = mean[:, :, :-2], mean[:, :, 1:-1], mean[:, :, 2:]
-        by_x = (2j * math.pi * u[low]).to(mean.dtype)
-        change = change.to(by_x.dtype)
-        expected = (change[..., 0, 0] * by_x.square()) * here
-        expected += (change[..., 1, 1] / block**2) * (after - 2 * here + before)
-        expected += (change[..., 0, 1] / block * by_x) * (after - before)
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
-        weight = both[:, :, 1:-1] * both[:, :, 2:] * both[:, :, :-2]
-        values = torch.view_as_real(torch.stack([expected, here, difference[:, :, 1:-1]], -2)).flatten(-2)
+        mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
+        weight = both.unfold(2, 5, 1).amin(-1)
+
+        # 2. The expected difference. Derivatives across rows are of fourth order, from two neighbours on each side.
+        def neighbour(step: int, mean: Tensor = mean) -> Tensor:
+            return mean[:, :, 2 + step : mean.shape[2] - 2 + step]
+
+        by_x = (2j * math.pi * u[low]).to(mean.dtype)
+        here = neighbour(0)
+        by_y = 8 / 12 * (neighbour(1) - neighbour(-1)) - 1 / 12 * (neighbour(2) - neighbour(-2))
+        by_yy = 16 / 12 * (neighbour(1) + neighbour(-1)) - 1 / 12 * (neighbour(2) + neighbour(-2)) - 30 / 12 * here
+        change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
+        expected = (change[..., 0, 0] * by_x.square()) * here
+        expected += (2 * change[..., 0, 1] / block * by_x) * by_y
+        expected += (change[..., 1, 1] / block**2) * by_yy
+
+        # 3. Its products with the mean and with the measured difference.
+        values = torch.view_as_real(torch.stack([expected, here, difference[:, :, 2:-2]], -2)).flatten(-2)
         of_rows = (values @ values.mT).double()  # (B M, G - 1, S, 3, 3)
         of_rows, weight = (_of_stacks(part, group.count) for part in (of_rows, weight))
-        products = torch.einsum("bgs,bgsij->bij", weight, of_rows)  # sum over pairs g and rows s of a stack b
-        sums.append((products[:, :2, :2], products[:, :2, 2], products[:, 2, 2], values.shape[-1] * weight.sum((1, 2))))
-    normal, right, square, count = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+        of_rows *= weight[..., None, None]
+        length = min(_SCATTER_ROWS // block, of_rows.shape[2])
+        of_parts = of_rows[:, :, : of_rows.shape[2] // length * length].unflatten(2, (-1, length)).sum(3)
+        parts.append(of_parts.flatten(1, 2))
+        counts.append(values.shape[-1] * weight.sum((1, 2)))
+    # 4. Least squares. The variance is that of the residuals, 8/3 of it because values share blocks, or by the scatter
+    # of the scores of parts if that is larger: errors of interpolation are alike in neighbouring rows.
+    products, count = torch.cat(parts, 1), torch.stack(counts).sum(0).clamp(min=1.0)  # (B, M, 3, 3) of M parts
+    total = products.sum(1)
+    normal, right, square = total[:, :2, :2], total[:, :2, 2], total[:, 2, 2]
     scale = normal.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
-    inverse = torch.linalg.inv(
-        normal / (scale[:, :, None] * scale[:, None])
-        + 1e-9 * torch.eye(2, dtype=torch.float32, device="cpu").to(normal)
-    )
-    inverse = inverse / (scale[:, :, None] * scale[:, None])
+    outer = scale[:, :, None] * scale[:, None]
+    inverse = torch.linalg.inv(normal / outer + 1e-9 * torch.eye(2, dtype=torch.float32, device="cpu").to(normal))
+    inverse = inverse / outer
     solution = (inverse @ right[..., None])[..., 0]
-    variance = (square - (solution * right).sum(-1)).clamp(min=0.0) / count.clamp(min=1.0)
-    return solution[:, 0], (inverse[:, 0, 0] * variance).sqrt(), scale[:, 0] / scale[:, 1]
+    variance = 8 / 3 * inverse[:, 0, 0] * (square - (solution * right).sum(-1)).clamp(min=0.0) / count
+    scores = products[:, :, :2, 2] - (products[:, :, :2, :2] @ solution[:, None, :, None])[..., 0]
+    scatter = (scores @ inverse[:, 0, :, None]).square().sum((1, 2))
+    return solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]
 
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> Tensor:

@@ -51,8 +51,10 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 # with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the standard deviation was 1.26 and 1.93
 # (largest 3.8 and 7.9) without this term, and is 0.89 and 0.98 (3.1 and 2.7) with it
 _UNKNOWN_ALIASING = 2.0, 0.8
-# px^-2, relative, per square of the path within an exposure: with paths of 4 to 7 px, errors were 2e-4 to 8e-4
-_UNKNOWN_BLUR = 1.5e-5
+# px^-2, relative, per square of the path within an exposure, of x, y, roll and zoom: with paths of 4 to 7 px, errors
+# were 2e-4 to 8e-4; of roll with paths of 1.5 and 2.8 px at half the width 2.2e-3 and 8e-3, 3.4 and 5.8 standard
+# deviations with the value of x and y
+_UNKNOWN_BLUR = 1.5e-5, 1.5e-5, 1e-3, 1e-3
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
 # intervals of 150 simulated recordings with random tones contain the truth, with 0.2 fewer
 _PRIOR_SIZE = 0.5
@@ -214,7 +216,7 @@ def with_unknown_amplitudes(fit: ToneFit, aliasing: Array, intervals: Array, exp
     gain = np.maximum(offset_gain(fit.frequencies, intervals), 1e-3)
     small, large = _UNKNOWN_ALIASING
     by_aliasing = aliasing[:, None, None] * np.minimum(small * size, large / (1 + 2 * size))
-    by_blur = _UNKNOWN_BLUR * np.square(path) * size * 2.0 / gain
+    by_blur = np.array(_UNKNOWN_BLUR)[: size.shape[1], None] * np.square(path) * size * 2.0 / gain
     error = np.hypot(by_aliasing, by_blur) / np.maximum(size, 1e-300)  # relative
     unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
     unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
