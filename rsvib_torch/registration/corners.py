@@ -16,10 +16,13 @@ _LARGEST_MOTION = 0.25  # of the longer side, which the coarsest level of the py
 _MAX_RETURN = 0.3  # px, between a corner and the point where the way back from the other frame ends
 
 
-def find_corners(grey: NDArray[np.uint8], known: Points | None = None, most: int = 256) -> Points:
+def find_corners(
+    grey: NDArray[np.uint8], known: Points | None = None, mask: NDArray[np.uint8] | None = None, *, most: int
+) -> Points:
     """The known corners (N, 2) of a frame (H, W), and new ones where a cell has less than half of its number.
 
-    All cells of the frame have the same number; together, they have at most ``most`` corners.
+    All cells of the frame have the same number; together, they have at most ``most`` corners. There are none where the
+    mask (H, W) is 0.
     """
     height, width = grey.shape
     side = min(height, width) / _CELLS
@@ -32,8 +35,9 @@ def find_corners(grey: NDArray[np.uint8], known: Points | None = None, most: int
     corners = [known]
     for row, column in zip(*np.nonzero(filled <= number // 2), strict=True):
         top, left = row * height // rows, column * width // columns
-        part = grey[top : (row + 1) * height // rows, left : (column + 1) * width // columns]
-        found = cv2.goodFeaturesToTrack(part, number, _QUALITY, distance)
+        part = slice(top, (row + 1) * height // rows), slice(left, (column + 1) * width // columns)
+        inner = None if mask is None else np.ascontiguousarray(mask[part])
+        found = cv2.goodFeaturesToTrack(grey[part], number, _QUALITY, distance, mask=inner)
         if found is not None:
             places = found[:, 0].astype(np.float64) + np.array([left, top])
             apart = np.abs(places[:, None] - known).max(-1).min(-1, initial=np.inf) >= distance

@@ -25,6 +25,7 @@ from rsvib_torch.registration.corners import Points, find_corners, follow_corner
 WINDOW_FRAMES = 96  # of one fit; amplitudes and frequencies may change from window to window
 _MOST_TONES = 3  # of an axis in a window
 _MOST_PIXELS = 700_000  # of a frame in which corners are followed; the sides of larger ones are halved
+_MOST_CORNERS = 256  # of a pair of frames; 480 take twice the time, and the clips become no steadier
 _MIN_CORNERS = 8  # of a pair of frames; four components are determined, and wrong matches are rejected
 _MIN_SHARE = 0.25  # of the corners of a pair that agree on one motion; pairs of unrelated frames reach 0.1
 _AGREE = 3.0  # px, from an affine motion between two frames: parallax, and vibration within a frame
@@ -91,7 +92,7 @@ class CornerFollower:
         self._before, self._start, self._known = second, start, None
         if first is None:
             return None
-        found = find_corners(first, known)
+        found = find_corners(first, known, most=_MOST_CORNERS)
         ends, good = follow_corners(first, second, found)
         found, ends = found[good], ends[good]
         if len(found) < _MIN_CORNERS:

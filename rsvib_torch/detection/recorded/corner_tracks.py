@@ -14,6 +14,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration.corners import find_corners, follow_corners
 
 CELL_ROWS, CELL_COLUMNS = 6, 8  # cells of a frame, in which residuals may be alike
+_MOST_CORNERS = 480  # of a pair of frames
 _LEAST_CORNERS = 12  # of a pair of frames; 3 angles and 3 components of a translation are fitted to each
 _Frame = tuple[NDArray[np.uint8], NDArray[np.uint8] | None]  # grey levels and the mask of usable pixels
 _BORDER = 11  # px, half of the patch that OpenCV compares, in which no pixel may be missing
@@ -102,7 +103,7 @@ def _inner(valid: Tensor) -> NDArray[np.uint8]:
 
 def _followed(first: _Frame, second: _Frame) -> NDArray[np.float64]:
     """(N, 4) px, x and y of the corners in both frames."""
-    start = find_corners(first[0], mask=first[1])
+    start = find_corners(first[0], mask=first[1], most=_MOST_CORNERS)
     end, good = follow_corners(first[0], second[0], start)
     if second[1] is not None:
         x, y = end[good].round().astype(np.int64).T
