@@ -192,6 +192,13 @@ _TONES = {
         "height]",
         "offset gain of a tone, below 0.1",
     ),
+    "tones_alias": ReasonKind(
+        "tones of {frequency:.5g} and {value:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
+        "because the rows are read in another time than stated",
+        "check row_time and the readout direction",
+        "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
+        "Hz",
+    ),
     "tone_averaged_out": ReasonKind(
         "tone of {value:.4g} Hz is above 1/T_e = {limit:.4g} Hz, where the exposure averages it out",
         "use a shorter exposure",

@@ -176,17 +176,18 @@ class VideoRestorer:
         return frames_to_counts(prepared.from_row_order(restored)[0], self.layout.dtype, scale)
 
 
-def source_map(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -> NDArray[np.float32]:
-    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded.
+def recorded_offsets(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -> NDArray[np.float32]:
+    """(2, n, m) px, how far (x, y) from each pixel of the restored frame it was recorded.
 
     A pixel at rest at p was recorded at ``q = p + D(p, t(q))`` with the mean displacement D during the exposure of the
-    row of q. D is computed for every row and some columns, between which it is linear.
+    row of q. Rows in the order of the sensor are n; along them, D is linear between m columns, of which the first and
+    the last are those of the frame; without roll and zoom there is one.
     """
     height, width = size
     along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)  # axes (x, y) along which rows follow, and along rows
     count, length = (height, width) if along == 1 else (width, height)
     parts = _MAP_COLUMNS if motion.num_axes > 2 else 1
-    grid = np.empty((2, count, parts))  # in row order
+    grid = np.empty((2, count, parts))
     grid[along] = np.arange(count)[:, None]
     grid[across] = np.linspace(0.0, length - 1.0, parts) if parts > 1 else 0.0
     centre = 0.5 * (np.array([width, height]) - 1)
@@ -201,14 +202,22 @@ def source_map(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -
             turned, zoomed = moved[..., 2], moved[..., 3]
             offset = offset + torch.stack([zoomed * x - turned * y, turned * x + zoomed * y], -1)
         places = grid + np.moveaxis(offset.numpy(), -1, 0)
-    offsets = (places - grid).astype(np.float32)
+    return (places - grid).astype(np.float32)
+
+
+def source_map(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -> NDArray[np.float32]:
+    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded."""
+    offsets = recorded_offsets(motion, timing, size)
+    along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)
+    count, length = size[::-1][along], size[::-1][across]
+    parts = offsets.shape[-1]
     if parts > 1:  # to all columns
         place = np.arange(length) * ((parts - 1) / max(length - 1, 1))
         hats = np.maximum(1.0 - np.abs(place - np.arange(parts)[:, None]), 0.0).astype(np.float32)
         offsets = offsets @ hats
     result = np.empty((2, count, length), dtype=np.float32)
-    result[along] = np.arange(count, dtype=np.float32)[:, None] + offsets[along]
-    result[across] = np.arange(length, dtype=np.float32) + offsets[across]
+    np.add(np.arange(count, dtype=np.float32)[:, None], offsets[along], out=result[along])
+    np.add(np.arange(length, dtype=np.float32), offsets[across], out=result[across])
     return result if along == 1 else result.transpose(0, 2, 1)
 
 

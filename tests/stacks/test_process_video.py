@@ -6,6 +6,7 @@ import json
 import av
 import numpy as np
 import pytest
+import torch
 from skimage.registration import phase_cross_correlation
 from small_video import sound_of, write_video
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
@@ -135,6 +136,14 @@ def test_a_steady_video_follows_the_mean_of_its_path(shaky, tmp_path):
     margins = json.loads(report.manifest.read_text())["margins"]
     assert margins["top"] % 2 == margins["left"] % 2 == 0
     assert min(margins.values()) >= 2
+
+
+def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
+    timing = SensorTiming(row_time=0.73 * 150e-6, exposure_rows=4 / 0.73, frame_rows=1 / RATE / (0.73 * 150e-6))
+    report = process_video(clip, tmp_path / "still.mp4", timing, **OPTIONS)
+    for found in read_manifest(report.manifest).detections():
+        right = (found.vibration.frequency[:, 0] - torch.tensor([52.0, 71.0])).abs() < 0.2
+        assert not (found.reliable & ~right).any()
 
 
 def test_held_pixels_change_less_from_frame_to_frame(clip, tmp_path):
