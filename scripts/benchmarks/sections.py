@@ -30,6 +30,7 @@ SECTIONS: dict[str, Section] = {
     "pipeline": Section("Detection and restoration"),
     "live": Section("Tracking at camera rate"),
     "video": Section("Colour video"),
+    "steady": Section("Hand-held clips made steady"),
     "gpu": Section("Batches and devices"),
     "streaming": Section("Long stacks"),
     "memory": Section("Memory of long stacks"),
