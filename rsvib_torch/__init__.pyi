@@ -52,6 +52,7 @@ from .io import (
 )
 from .io.gyroscope.read_gyroscope import read_gyroscope
 from .motion.camera import Camera
+from .motion.cameras import CameraMode, camera_mode, find_cameras
 from .motion.gyroscope_rates import AngularRates
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
@@ -105,6 +106,7 @@ from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 __all__ = [
     "AngularRates",
     "Camera",
+    "CameraMode",
     "ClockAlignment",
     "DetectionResult",
     "DisplacementSpectrum",
@@ -145,12 +147,14 @@ __all__ = [
     "calibrate_row_time_by_exposure",
     "calibrate_row_time_by_motion",
     "camera_isd",
+    "camera_mode",
     "check_motion",
     "comparison_figure",
     "detect_motion",
     "detect_swept_tone",
     "detect_vibration",
     "diagnose_timing",
+    "find_cameras",
     "find_slanted_edges",
     "gain_figure",
     "iterate_stack",

@@ -72,6 +72,7 @@ def run_code(*arguments):
         (run_code("detect", "frames.tif", "--out", "out", "--config", "camera.toml", "--row-time", "20"), PROGRAM),
         (run_code("detect", "frames.tif", "--out", "out", "--config", "camera.toml", "--exposure", "1"), PROGRAM),
         (run_code("init", "--list-presets"), PROGRAM),
+        (run_code("cameras", "iphone", "12"), PROGRAM),
     ],
 )
 def test_libraries_are_imported_when_they_are_used(tmp_path, code, names):

@@ -1,11 +1,12 @@
-"""Command ``init``: a configuration file for the camera of a stack, or one of the presets."""
+"""Commands ``init``, a configuration file for the camera of a stack, and ``cameras``, the known camera models."""
 
 import math
 import sys
 import textwrap
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,9 +18,13 @@ from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import SensorSection, presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.text import printable
+from rsvib_torch.core.text import measured_text, printable, text_table
 from rsvib_torch.core.validation import MistakesError, fields_of
+from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorTiming
+
+if TYPE_CHECKING:
+    from rsvib_torch.io.stack_info import StackInfo
 
 # How to find each value of [sensor]: comments of the file, and the text of questions and errors.
 _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
@@ -50,6 +55,10 @@ def init(
             )
         ),
     ],
+    camera: Annotated[
+        str | None,
+        typer.Option(help="Model of the camera, for its measured row time (rsvib cameras lists them)."),
+    ] = None,
     preset: Annotated[str | None, typer.Option(help=f"Copy a preset instead: {', '.join(presets())}.")] = None,
     list_presets: Annotated[bool, typer.Option("--list-presets", help="List the presets and exit.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing configuration file.")] = False,
@@ -61,8 +70,10 @@ def init(
     if list_presets:
         listed = {name: _first_comment(text) for name, text in presets().items()}
         return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
-    if preset is not None and (frames is not None or sensor):
+    if preset is not None and (frames is not None or sensor or camera is not None):
         raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
+    if camera is not None and "row_time" in sensor:
+        raise ValueError("--camera and --row-time both state the row time; give one of them")
     if preset is None and frames is None:
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
     if out.exists() and not overwrite:
@@ -75,7 +86,7 @@ def init(
         text = presets()[preset]
     else:
         assert frames is not None
-        text = _describe_camera(frames, sensor)
+        text = _describe_camera(frames, sensor, camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
     step = command_text("run", frames or "FRAMES", "results", "--config", out)
@@ -89,7 +100,46 @@ def _first_comment(text: str) -> str:
     return " ".join(line.removeprefix("#").strip() for line in lines[:end])
 
 
-def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
+def cameras(
+    search: Annotated[
+        list[str] | None, typer.Argument(help="Words of the name of a camera, e.g. iphone 12. Default: all cameras.")
+    ] = None,
+) -> Answer:
+    """List the modes of camera models whose readout time is known, with their row time.
+
+    Median and spread of calibrations by users of Gyroflow (CC0 1.0). rsvib init --camera NAME takes the row time.
+    """
+    modes = find_cameras(" ".join(search or ()))
+    head = ("brand", "model", "view", "width x height", "fps", "readout (ms)", "row time (us)", "entries")
+    rows = [
+        (
+            *(mode.brand, mode.model, mode.lens, f"{mode.width} x {mode.height}", f"{mode.frame_rate:g}"),
+            measured_text(1e3 * mode.readout_time, 1e3 * mode.readout_time_std),
+            measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std),
+            str(mode.calibrations),
+        )
+        for mode in modes
+    ]
+    data = [asdict(mode) | {"row_time": mode.row_time, "row_time_std": mode.row_time_std} for mode in modes]
+    return Answer({"Cameras": [text_table(head, rows, most=len(rows))]}, {"cameras": data})
+
+
+def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> tuple[float, str]:
+    """Row time in s of a camera model in the mode of the frames, and where it comes from."""
+    if "frame_rate" not in values:
+        raise ValueError(f"the mode of {camera} depends on the frame rate: give --frame-rate")
+    columns, rows = info.shape[-1], info.shape[-2]
+    if values.get("scan_axis") == "x":
+        columns, rows = rows, columns
+    mode = camera_mode(camera, width=columns, height=rows, frame_rate=values["frame_rate"])
+    source = f"{mode} (gyroflow/lens_profiles)"
+    if mode.height != rows:
+        source += f"; the {rows} rows of the frames are assumed to be read in the same time"
+    row_time = mode.timing(1e-3, height=rows, frame_rate=values["frame_rate"]).row_time
+    return row_time, f"row time {measured_text(1e6 * row_time, 1e6 * mode.readout_time_std / rows)} us of {source}"
+
+
+def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -> str:
     """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
     with working(f"reading {path}"):
         reader = io.open_stack(path)
@@ -106,18 +156,29 @@ def _describe_camera(path: Path, given: Mapping[str, Any]) -> str:
         note(f"frame rate {stated:.6g} per second, from the times in the file")
     elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
         error_line(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}", "warning")
-    likely = None
+    source, likely, proposal = None, {}, ""
+    if camera is not None:
+        values["row_time"], source = _row_time_of(camera, info, values)
+        note(source)
+    elif info.camera is not None and "row_time" not in given:
+        try:
+            likely["row_time"], proposed = _row_time_of(info.camera, info, values)
+            proposal = f' The file names its camera: --camera "{info.camera}" takes {proposed}.'
+        except ValueError as error:
+            proposal = f" The file names its camera, {info.camera}: {error}."
     if info.is_integer and info.full_scale is None:
-        likely = _likely_full_scale(first)
+        likely["full_scale"] = _likely_full_scale(first)
     elif info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
-    _complete(values, rows, likely)
+    _complete(values, rows, likely, proposal)
     settings = read_config(None, sensor=values)
     _check_timing(settings.timing, rows)
     head = [
         f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
         "Values hold for one mode of the camera: resolution, cropping, binning and frame rate change the row time.",
     ]
+    if source is not None:
+        head.append(f"{source[0].upper()}{source[1:]}. Users measured it: confirm it with rsvib calibrate.")
     if info.frame_times is not None and not info.time_error:
         head.append("The frames file states the time of every frame, which all commands use.")
     order = ("row_time", "exposure_time", "frame_rate", "scan_axis", "readout_direction", "full_scale")
@@ -134,22 +195,25 @@ def _likely_full_scale(pixels: Any) -> float:
     return float(((1 << max(int(pixels.max()) // step, 255).bit_length()) - 1) * step)
 
 
-def _complete(values: dict[str, Any], rows: int, likely: float | None) -> None:
+def _complete(values: dict[str, Any], rows: int, likely: Mapping[str, float], proposal: str) -> None:
     """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
     questions: dict[str, tuple[str, Callable[[str], float]]] = {
         "frame_rate": ("--frame-rate", rate),
         "row_time": ("--row-time", seconds),
         "exposure_time": ("--exposure", seconds),
     }
-    if likely is not None:
+    if "full_scale" in likely:
         questions["full_scale"] = ("--full-scale", rate)
     missing = {name: question for name, question in questions.items() if name not in values}
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        lines = [f"{option} is missing. {_hint(name, values, rows, likely)}" for name, (option, _) in missing.items()]
+        lines = [
+            f"{option} is missing. {_hint(name, values, rows, likely, proposal)}"
+            for name, (option, _) in missing.items()
+        ]
         if lines:
             raise MistakesError(lines)
     for name, (option, convert) in missing.items():
-        typer.echo(f"\n{_hint(name, values, rows, likely)}", err=True)
+        typer.echo(f"\n{_hint(name, values, rows, likely, proposal)}", err=True)
         limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
         longest = limits[name] / values["frame_rate"] if name in limits else math.inf
 
@@ -160,18 +224,18 @@ def _complete(values: dict[str, Any], rows: int, likely: float | None) -> None:
                 raise typer.BadParameter(f"expected a number above 0{limit}; got {text!r}")
             return value
 
-        default = f"{likely:g}" if name == "full_scale" and likely is not None else None
+        default = f"{likely[name]:.6g}" if name in likely else None
         values[name] = typer.prompt(
             option.strip("-").replace("-", " "), default=default, value_proc=checked_answer, err=True
         )
 
 
-def _hint(name: str, values: Mapping[str, Any], rows: int, likely: float | None) -> str:
+def _hint(name: str, values: Mapping[str, Any], rows: int, likely: Mapping[str, float], proposal: str) -> str:
     """How to find a value, with the limits that follow from the frames."""
     if name == "row_time" and values.get("frame_rate"):
-        return f"{_HINTS[name]} Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us."
-    if name == "full_scale" and likely is not None:
-        return f"{_HINTS[name]} Frame 0 indicates {likely:g}."
+        return f"{_HINTS[name]} Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us.{proposal}"
+    if name in likely:
+        return f"{_HINTS[name]} Frame 0 indicates {likely[name]:g}."
     return _HINTS[name]
 
 

@@ -13,7 +13,7 @@ import rsvib_torch
 from rsvib_torch.commands import motion_commands, stack_commands
 from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.flat_command import flat_command
-from rsvib_torch.commands.init import init
+from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
 from rsvib_torch.commands.terminal import (
     Answer,
@@ -33,7 +33,16 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
         "Write a configuration file for the camera of a stack.",
         """
         rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
-        rsvib init --preset iso12233 --out camera.toml
+        rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
+        """,
+    ),
+    (
+        "cameras",
+        cameras,
+        "List camera models with known row times.",
+        """
+        rsvib cameras iphone 12
+        rsvib cameras gopro --json
         """,
     ),
     (

@@ -70,6 +70,7 @@ class StackInfo(Summarised):
             that cannot be kept.
         decoding_bytes: Memory that reading needs besides the frame that is returned: frames that are stored together
             are decoded together.
+        camera: Make and model of the camera, if the file states them (EXIF of JPEG and PNG, tags of videos).
 
     Example:
         >>> import rsvib_torch as rsv
@@ -94,6 +95,7 @@ class StackInfo(Summarised):
     frame_numbers: tuple[int, ...] | None = field(default=None, compare=False)
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
+    camera: str | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         check_fields(self)

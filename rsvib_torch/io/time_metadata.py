@@ -1,4 +1,4 @@
-"""Times, frame rate and orientation in the metadata of other programs: HDF5 and Zarr attributes, TIFF, EXIF.
+"""Times, frame rate, orientation and camera in the metadata of other programs: HDF5 and Zarr attributes, TIFF, EXIF.
 
 Functions return the fields of ``StackInfo`` that the metadata state, and none if they are ambiguous or damaged, since
 frames can be read without them.
@@ -13,6 +13,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 from PIL import ExifTags, Image
+
+from rsvib_torch.core.text import one_line
 
 _SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
 
@@ -42,6 +44,18 @@ def _time_fields(times: Iterable[float | None], count: int, error: float, source
 def orientation_of(value: object) -> int:
     """The value of an orientation tag, 1 to 8; 1 (as stored) if it is anything else."""
     return int(value) if isinstance(value, int | np.integer) and value in range(1, 9) else 1
+
+
+def camera_name(make: object, model: object) -> str | None:
+    """Make and model of a camera as one name; None without a model.
+
+    Example:
+        >>> camera_name("Apple", "iPhone 12"), camera_name("Canon", "Canon EOS R5")
+        ('Apple iPhone 12', 'Canon EOS R5')
+    """
+    maker, name = (one_line("" if text is None else str(text).replace("\0", " "), 60) for text in (make, model))
+    repeated = name.casefold().startswith(maker.casefold())
+    return None if not name else name if repeated else f"{maker} {name}"
 
 
 def time_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,7 +118,7 @@ def _seconds_of_date(text: object, fraction: object = "") -> float | None:
 
 
 def exif_fields(data: bytes) -> dict[str, Any]:
-    """Orientation and time of one image from its EXIF metadata."""
+    """Orientation, camera and time of one image from its EXIF metadata."""
     exif = Image.Exif()
     try:
         exif.load(data)
@@ -118,7 +132,10 @@ def exif_fields(data: bytes) -> dict[str, Any]:
             (exif.get(ExifTags.Base.DateTime), ExifTags.Base.SubsecTime),
         )
     )
-    fields = {"orientation": orientation_of(exif.get(ExifTags.Base.Orientation))}
+    fields = {
+        "orientation": orientation_of(exif.get(ExifTags.Base.Orientation)),
+        "camera": camera_name(exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)),
+    }
     return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 

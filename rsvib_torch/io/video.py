@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
+from rsvib_torch.io.time_metadata import camera_name
 
 _LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
 CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
@@ -44,6 +45,12 @@ _MATRICES = {
 }
 
 
+_GOPRO_FIRMWARE = {
+    "HD5.02": "GoPro HERO5 Black",
+    "HD5.03": "GoPro HERO5 Session",
+    "HD6.01": "GoPro HERO6 Black",
+    "HD7.01": "GoPro HERO7 Black",
+}  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
 
 
@@ -138,6 +145,18 @@ def _listed_times(container: Any, stream: Any) -> list[Fraction | None] | None:
     return [*times] if len(times) == len(listed) == stream.frames else None
 
 
+def _camera(tags: dict[str, str]) -> str | None:
+    """Make and model of the camera in the tags of a video: QuickTime, Android, or the firmware of GoPro."""
+    for make, model in (
+        ("com.apple.quicktime.make", "com.apple.quicktime.model"),
+        ("com.android.manufacturer", "com.android.model"),
+        ("make", "model"),
+    ):
+        if tags.get(model):
+            return camera_name(tags.get(make), tags[model])
+    return _GOPRO_FIRMWARE.get(tags.get("firmware", "")[:6])
+
+
 @lru_cache(maxsize=8)
 def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fraction, ...], Picture]:
     """What a video states, and the presentation times in s of its frames.
@@ -181,6 +200,7 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
             orientation=_orientation(first),
             time_error=float(stream.time_base),
             time_source="time stamps",
+            camera=_camera(container.metadata | stream.metadata),
         )
         picture = Picture(first.format.name, int(first.colorspace), int(first.color_range))
         return info, tuple(known) if rising else (), picture

@@ -1,0 +1,201 @@
+"""rsvib cameras, rsvib init --camera, and the camera that a file names: row times of the table of camera models."""
+
+import csv
+import io
+import json
+import tomllib
+from fractions import Fraction
+from importlib.resources import files
+
+import av
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
+
+# Name as a user writes it, size and rate of a clip, readout time in ms that the profiles of the model state
+MODELS = (
+    ("iPhone 12", 3840, 2160, 59.94, 4.98),
+    ("apple iphone 12 ultra wide", 1920, 1080, 24, 15.7),
+    ("Apple iPhone 15 Pro Max", 3840, 2160, 30, 4.7),
+    ("Sony a7S III", 3840, 2160, 23.976, 8.7),
+    ("ZV-E10", 3840, 2160, 25, 38.8),
+    ("FUJIFILM X-H2S", 3840, 2160, 25, 5.6),
+    ("GoPro Hero6 Black", 2704, 2028, 29.97, 11.1),
+    ("Samsung S25 Ultra", 3840, 2160, 50, 14.5),
+    ("EOS R5C", 8192, 4320, 29.97, 15.5),
+    ("Pixel 8", 2048, 1536, 24, 4.53),
+    ("Panasonic G9", 3840, 2160, 60, 11.0),
+    ("Sigma fp", 3840, 2160, 24, 20.8),
+)
+
+
+class Terminal(io.StringIO):
+    """Standard input or error that is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.fixture(name="place", autouse=True)
+def go_to_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def write_clip(name="clip.mp4", size=(48, 64), rate=30, tags=None):
+    """A video of three frames with the tags of a camera."""
+    with av.open(name, "w", options={"movflags": "use_metadata_tags"}) as output:
+        output.metadata.update(tags or {})
+        video = output.add_stream("mpeg4", rate=Fraction(rate).limit_denominator(1001))
+        video.height, video.width = size
+        for level in (50, 90, 130):
+            output.mux(video.encode(av.VideoFrame.from_ndarray(np.full((*size, 3), level, np.uint8))))
+        output.mux(video.encode())
+
+
+def sensor():
+    with open("camera.toml", "rb") as file:
+        return tomllib.load(file)["sensor"]
+
+
+@pytest.mark.parametrize(("name", "width", "height", "rate", "readout"), MODELS)
+def test_models_by_name(name, width, height, rate, readout):
+    mode = rsv.camera_mode(name, width=width, height=height, frame_rate=rate)
+    assert mode.row_time == pytest.approx(1e-3 * readout / height, rel=0.01)
+    assert 0.029 < mode.row_time_std / mode.row_time < 0.1
+    timing = mode.timing(1e-3, frame_rate=rate)
+    assert (timing.row_time, timing.frame_rate) == pytest.approx((mode.row_time, rate))
+    assert timing.exposure_time == pytest.approx(1e-3)
+
+
+def test_table_has_no_row_that_contradicts_itself():
+    """Readout times fit into the frame period, spreads are those of measurements, and no mode occurs twice."""
+    text = (files("rsvib_torch") / "motion" / "readout_times.csv").read_text(encoding="utf-8")
+    assert "CC0 1.0" in text
+    rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+    modes = rsv.find_cameras()
+    assert len(modes) == len(rows) > 300
+    keys = {(mode.name.casefold(), mode.width, mode.height, mode.frame_rate) for mode in modes}
+    assert len(keys) == len(modes)
+    for mode in modes:
+        assert 3e-3 <= mode.readout_time <= 1.02 / mode.frame_rate, mode
+        assert 0.029 <= mode.readout_time_std / mode.readout_time <= 0.1, mode
+        mode.timing(1e-4)
+
+
+def test_wrong_entries_are_left_out():
+    """The profiles of these modes have entries of 1.16, 4.89 and 8.4 to 9.57 ms, and of 1.0 to 40 ms."""
+    zve1 = rsv.camera_mode("ZV-E1", width=3840, height=2160, frame_rate=50)
+    assert 8.4e-3 <= zve1.readout_time <= 9.6e-3
+    with pytest.raises(ValueError, match="no camera 'EOS 6D2'"):  # its only entry is 4.89 ms
+        rsv.find_cameras("EOS 6D2")
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "message"),
+    [
+        ("iPhnoe 12", (3840, 2160, 60), "no camera 'iPhnoe 12' .*; similar: Apple iPhone 12"),
+        ("iPhone 7", (3840, 2160, 30), "no camera 'iPhone 7' .*; similar: Apple iPhone 7 Plus"),  # another camera
+        ("toaster", (3840, 2160, 30), r"similar: none \(rsvib cameras lists all\)"),
+        ("iPhone 12", (1920, 1080, 24), "several modes fit.*: Apple iPhone 12 Ultra Wide, Apple iPhone 12 Wide"),
+        ("iPhone 12", (1920, 1080, 60), "no mode .* 1920 x 1080 px at 60/s: 3840 x 2160 px at 60/s, "),  # half the size
+        ("iPhone 12", (3840, 2160, 30), "no mode of Apple iPhone 12"),  # another rate
+        ("iPhone 12", (3840, 2880, 60), "no mode of Apple iPhone 12"),  # another aspect
+    ],
+)
+def test_what_the_table_does_not_state_is_refused(name, size, message):
+    with pytest.raises(ValueError, match=message) as error:
+        rsv.camera_mode(name, width=size[0], height=size[1], frame_rate=size[2])
+    assert "\n" not in str(error.value)
+
+
+def test_command_lists_models_and_modes(capsys):
+    assert run_command(["cameras", "iphone", "12"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[:2] == ["brand", "model"]
+    assert len([line for line in lines if "iPhone 12" in line]) == 5
+    assert "Apple  iPhone 12              3840 x 2160     60   4.98 ± 0.15   2.306 ± 0.069  1" in lines[2]
+    assert run_command(["cameras", "HERO7", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)["cameras"]
+    assert {entry["model"] for entry in listed} == {"HERO7 Black"}
+    assert listed[0]["row_time"] == pytest.approx(listed[0]["readout_time"] / listed[0]["height"])
+    assert run_command(["cameras", "iphnoe 12"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "similar: Apple iPhone 12" in error
+
+
+def test_init_takes_the_row_time_of_a_camera(place, capsys):
+    write_clip(size=(1080, 1920), rate=30)
+    options = ("--exposure", "1/500")
+    assert run_command(["init", "clip.mp4", "--camera", "a6700", *options]) == 2  # of 2160 rows only: half the size
+    assert "3840 x 2160 px at 30/s" in capsys.readouterr().err
+    assert run_command(["init", "clip.mp4", "--camera", "Xperia 1 VI", *options]) == 2
+    error = capsys.readouterr().err
+    assert "similar: Sony Xperia 1 V" in error
+    assert error.count("\n") == 1
+    assert run_command(["init", "clip.mp4", "--camera", "HERO5 Black", *options]) == 0  # scaled from 1520 rows
+    assert sensor()["row_time"] == pytest.approx(26.69e-3 / 1080, rel=1e-3)
+    text = " ".join(line.removeprefix("# ") for line in (place / "camera.toml").read_text().splitlines())
+    assert "GoPro HERO5 Black, 2704 x 1520 px at 30/s" in text
+    assert "the 1080 rows of the frames are assumed to be read in the same time" in text
+    both = ("--camera", "HERO5 Black", "--row-time", "10us")
+    assert run_command(["init", "clip.mp4", *both, *options, "--overwrite"]) == 2
+    assert "give one of them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("tags", "camera"),
+    [
+        (
+            {"com.apple.quicktime.make": "Apple", "com.apple.quicktime.model": "iPhone 7 Plus"},
+            "Apple iPhone 7 Plus",
+        ),
+        ({"com.android.manufacturer": "Apple", "com.android.model": "iPhone 7 Plus"}, "Apple iPhone 7 Plus"),
+        ({"firmware": "HD6.01.02.01.00"}, "GoPro HERO6 Black"),
+    ],
+)
+def test_camera_that_a_video_names(capsys, tags, camera):
+    write_clip(size=(2160, 3840), tags=tags)
+    assert rsv.read_stack_info("clip.mp4").camera == camera
+    assert run_command(["init", "clip.mp4", "--exposure", "1ms"]) == 2
+    error = capsys.readouterr().err
+    assert f'--camera "{camera}" takes row time' in error
+    assert error.count("\n") == 1
+    assert run_command(["init", "clip.mp4", "--exposure", "1ms", "--camera", camera]) == 0
+    readout = {"Apple iPhone 7 Plus": 15.52e-3, "GoPro HERO6 Black": 8.34e-3}[camera]
+    assert sensor()["row_time"] == pytest.approx(readout / 2160, rel=0.01)
+
+
+def test_row_time_of_the_named_camera_is_proposed_in_a_terminal(monkeypatch):
+    write_clip(size=(2160, 3840), tags={"firmware": "HD6.01.02.01.00"})
+    monkeypatch.setattr("sys.stdin", Terminal("\n1ms\n"))  # the proposal is accepted
+    monkeypatch.setattr("sys.stderr", Terminal())
+    assert run_command(["init", "clip.mp4"]) == 0
+    assert sensor()["row_time"] == pytest.approx(8.34167e-3 / 2160, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_camera_that_images_name(place, capsys, kind):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Google", "Pixel 8\0"
+    (place / "frames").mkdir()
+    for number in range(2):
+        Image.new("L", (2048, 1536), 40 + number).save(place / "frames" / f"{number}.{kind}", exif=exif)
+    assert rsv.read_stack_info("frames").camera == "Google Pixel 8"
+    assert run_command(["init", "frames", "--exposure", "1ms", "--frame-rate", "24"]) == 2
+    assert '--camera "Google Pixel 8" takes row time 2.949 ± 0.091 us' in capsys.readouterr().err
+    assert run_command(["init", "frames", "--exposure", "1ms", "--frame-rate", "30"]) == 2
+    assert "The file names its camera, Google Pixel 8: no mode of Google Pixel 8" in capsys.readouterr().err
+
+
+def test_files_without_a_camera_or_of_an_unknown_one(capsys):
+    write_clip()
+    assert rsv.read_stack_info("clip.mp4").camera is None
+    write_clip("other.mp4", tags={"com.apple.quicktime.model": "Toaster"})
+    assert run_command(["init", "other.mp4", "--exposure", "1ms"]) == 2
+    assert "names its camera, Toaster: no camera 'Toaster' in the table" in capsys.readouterr().err
+    assert run_command(["init", "other.mp4", "--exposure", "1ms", "--row-time", "20us"]) == 0
