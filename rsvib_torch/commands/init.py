@@ -101,9 +101,7 @@ def _first_comment(text: str) -> str:
 
 
 def cameras(
-    search: Annotated[
-        list[str] | None, typer.Argument(help="Words of the name of a camera, e.g. iphone 12. Default: all cameras.")
-    ] = None,
+    search: Annotated[list[str] | None, typer.Argument(help="Words of its name, e.g. iphone 12.")] = None,
 ) -> Answer:
     """List the modes of camera models whose readout time is known, with their row time.
 
@@ -132,11 +130,8 @@ def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> t
     if values.get("scan_axis") == "x":
         columns, rows = rows, columns
     mode = camera_mode(camera, width=columns, height=rows, frame_rate=values["frame_rate"])
-    source = f"{mode} (gyroflow/lens_profiles)"
-    if mode.height != rows:
-        source += f"; the {rows} rows of the frames are assumed to be read in the same time"
-    row_time = mode.timing(1e-3, height=rows, frame_rate=values["frame_rate"]).row_time
-    return row_time, f"row time {measured_text(1e6 * row_time, 1e6 * mode.readout_time_std / rows)} us of {source}"
+    time = measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std)
+    return mode.row_time, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
 
 
 def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -> str:

@@ -107,6 +107,7 @@ class StackInfo(Summarised):
         parts = [f"{self.shape[0]} frames of {self.shape[-2]} x {self.shape[-1]} px", self.dtype]
         parts += [f"{self.shape[1]} channels"] if self.axes == "TCHW" else []
         parts += [] if self.full_scale is None else [f"full scale {self.full_scale:g}"]
+        parts += [] if self.camera is None else [self.camera]
         parts += [] if self.orientation == 1 else [f"orientation {self.orientation}"]
         parts += [] if self.frame_rate is None else [f"{self.frame_rate:.6g} frames per second"]
         if self.frame_times:

@@ -5,7 +5,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
@@ -39,6 +39,7 @@ class CameraMode:
             and at least 3 %.
         calibrations: Number of calibrations.
         readout_direction: ``"forward"`` if a calibration states it, otherwise empty.
+        measured_rows: Rows of the calibrations; ``camera_mode`` assumes that scaled frames are read in the same time.
     """
 
     brand: str
@@ -51,6 +52,7 @@ class CameraMode:
     readout_time_std: float
     calibrations: int
     readout_direction: str
+    measured_rows: int
 
     @property
     def name(self) -> str:
@@ -69,44 +71,30 @@ class CameraMode:
 
     @property
     def size(self) -> str:
-        """Width, height, frame rate, for messages."""
-        return f"{self.width} x {self.height} px at {self.frame_rate:g}/s"
+        """Width, height and frame rate, for messages."""
+        return f"{self.width} x {self.height} px at {self.frame_rate:.4g}/s"
 
-    @property
-    def spellings(self) -> set[str]:
-        """Complete names in small letters and digits, with and without brand and field of view."""
-        return {_letters(brand + self.model + lens) for brand in ("", self.brand) for lens in ("", self.lens)}
-
-    def timing(
-        self, exposure_time: float, *, height: int | None = None, frame_rate: float | None = None
-    ) -> SensorTiming:
-        """Timing of the sensor in this mode.
-
-        Args:
-            exposure_time: Exposure time in s.
-            height: Rows of a frame, if frames of another height show the same rows of the sensor: the row time is
-                readout time / height. None for that of the mode.
-            frame_rate: Frames per second; None for the nominal one of the mode.
+    def timing(self, exposure_time: float) -> SensorTiming:
+        """Timing of the sensor in this mode, for an exposure time in s.
 
         Raises:
             ValueError: As ``SensorTiming.from_seconds``.
 
         Example:
             >>> import rsvib_torch as rsv
-            >>> mode = rsv.camera_mode("iPhone 12", width=3840, height=2160, frame_rate=59.94)
-            >>> timing = mode.timing(1 / 500, frame_rate=59.94)
+            >>> timing = rsv.camera_mode("iPhone 12", width=3840, height=2160, frame_rate=59.94).timing(1 / 500)
             >>> round(1e6 * timing.row_time, 3), round(timing.frame_rows)
             (2.306, 7236)
         """
-        rows = self.height if height is None else check_whole_number("height", height, at_least=1)
-        rate = self.frame_rate if frame_rate is None else frame_rate
         return SensorTiming.from_seconds(
-            row_time=self.readout_time / rows, exposure_time=exposure_time, frame_rate=rate
+            row_time=self.row_time, exposure_time=exposure_time, frame_rate=self.frame_rate
         )
 
     def __str__(self) -> str:
         readout = measured_text(1e3 * self.readout_time, 1e3 * self.readout_time_std)
-        return f"{self.name}, {self.size}: readout {readout} ms, {number_of(self.calibrations, 'calibration')}"
+        text = f"{self.name}, {self.size}: readout {readout} ms, {number_of(self.calibrations, 'calibration')}"
+        same = f" of {self.measured_rows} rows, which are assumed to be read in the same time"
+        return text + same * (self.measured_rows != self.height)
 
 
 @cache
@@ -118,6 +106,7 @@ def _modes() -> tuple[CameraMode, ...]:
         CameraMode(
             *(row["brand"], row["model"], row["lens"], int(row["width"]), int(row["height"]), float(row["frame_rate"])),
             *(1e-3 * float(row["readout_ms"]), 1e-3 * float(row["spread_ms"]), int(row["entries"]), row["direction"]),
+            int(row["height"]),
         )
         for row in rows
     )
@@ -170,10 +159,10 @@ def _unknown(name: str, modes: Iterable[CameraMode]) -> ValueError:
 
 
 def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> CameraMode:
-    """The mode of a camera model that fits the frames.
+    """The mode of a camera model that fits the frames, with their size and rate.
 
-    It has the frame rate (within 3 %) and the aspect of the frames, and the nearest height. Frames of another height,
-    up to a factor of 1.6, are taken for the same rows of the sensor, scaled: pass ``height`` to ``CameraMode.timing``.
+    It is the measured mode of the same rate (within 3 %), the same aspect and the nearest height. Frames of another
+    height, up to a factor of 1.6, are assumed to be scaled, and read in the same time (``measured_rows``).
 
     Args:
         name: Complete name of the model, with or without brand and field of view.
@@ -188,7 +177,7 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     Example:
         >>> import rsvib_torch as rsv
         >>> print(rsv.camera_mode("HERO6 Black", width=3840, height=2160, frame_rate=29.97))
-        GoPro HERO6 Black, 3840 x 2160 px at 30/s: readout 8.34 ± 0.25 ms, 1 calibration
+        GoPro HERO6 Black, 3840 x 2160 px at 29.97/s: readout 8.34 ± 0.25 ms, 1 calibration
         >>> rsv.camera_mode("iPhone 12", width=1920, height=1080, frame_rate=24)
         Traceback (most recent call last):
         ...
@@ -198,7 +187,11 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     aspect = check_whole_number("width", width, at_least=1) / rows
     rate = check_number("frame_rate", frame_rate, above=0.0)
     found = find_cameras(name)
-    modes = [mode for mode in found if _letters(name) in mode.spellings]
+    modes = [
+        mode
+        for mode in found
+        if _letters(name) in {_letters(b + mode.model + v) for b in ("", mode.brand) for v in ("", mode.lens)}
+    ]
     if not modes:  # of "iPhone 7", "iPhone 7 Plus" is another camera
         raise _unknown(name, found)
 
@@ -221,4 +214,5 @@ def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> Cam
     best = [mode for mode in fitting if scale(mode) == min(map(scale, fitting))]
     if len(names := dict.fromkeys(mode.name for mode in best)) > 1:
         raise ValueError(f"several modes fit, give the complete name: {', '.join(names)}")
-    return min(best, key=lambda mode: abs(mode.frame_rate - rate))
+    mode = min(best, key=lambda mode: abs(mode.frame_rate - rate))
+    return replace(mode, width=width, height=rows, frame_rate=rate)

@@ -66,7 +66,7 @@ def test_models_by_name(name, width, height, rate, readout):
     mode = rsv.camera_mode(name, width=width, height=height, frame_rate=rate)
     assert mode.row_time == pytest.approx(1e-3 * readout / height, rel=0.01)
     assert 0.029 < mode.row_time_std / mode.row_time < 0.1
-    timing = mode.timing(1e-3, frame_rate=rate)
+    timing = mode.timing(1e-3)
     assert (timing.row_time, timing.frame_rate) == pytest.approx((mode.row_time, rate))
     assert timing.exposure_time == pytest.approx(1e-3)
 
@@ -140,8 +140,8 @@ def test_init_takes_the_row_time_of_a_camera(place, capsys):
     assert run_command(["init", "clip.mp4", "--camera", "HERO5 Black", *options]) == 0  # scaled from 1520 rows
     assert sensor()["row_time"] == pytest.approx(26.69e-3 / 1080, rel=1e-3)
     text = " ".join(line.removeprefix("# ") for line in (place / "camera.toml").read_text().splitlines())
-    assert "GoPro HERO5 Black, 2704 x 1520 px at 30/s" in text
-    assert "the 1080 rows of the frames are assumed to be read in the same time" in text
+    assert "GoPro HERO5 Black, 1920 x 1080 px at 30/s" in text
+    assert "1 calibration of 1520 rows, which are assumed to be read in the same time" in text
     both = ("--camera", "HERO5 Black", "--row-time", "10us")
     assert run_command(["init", "clip.mp4", *both, *options, "--overwrite"]) == 2
     assert "give one of them" in capsys.readouterr().err
