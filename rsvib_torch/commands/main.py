@@ -119,8 +119,8 @@ _COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
         "Follow the vibration of a running camera, and restore its frames.",
         """
         rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
-        rsvib live clip.mp4 --config camera.toml --out still.mp4 --steady 1 \\
-              --border crop
+        rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
+              --steady 1
         """,
     ),
     (

@@ -86,8 +86,8 @@ def assumptions(
     sentences = []
     if timing.frame_start_times is None:
         sentences.append(
-            f"row_time={timing.row_time:g} s; all frequencies are inversely proportional to it, or differ by multiples "
-            f"of {timing.frame_rate:.4g} Hz if this frame rate is right and row_time wrong"
+            f"row_time={timing.row_time:g} s; frequencies scale inversely with it, or differ by multiples of "
+            f"{timing.frame_rate:.4g} Hz"
         )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
         sentences.append(
@@ -109,11 +109,11 @@ def assumptions(
 
 
 def _effects(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> list[str]:
-    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.01 %."""
+    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
     of_tones = []
     for axis, tone in vibration.amplitude.nonzero().tolist():
         changes = {of: float(getattr(sensitivity, f"{of}_by_{name}")[axis, tone]) for of in ("amplitude", "frequency")}
-        texts = [f"{of} {change:+.2g} %" for of, change in changes.items() if abs(change) > 0.01]
+        texts = [f"{of} {change:+.2g} %" for of, change in changes.items() if abs(change) > 0.1]
         if texts:
             of_tones.append(f"{AXIS_NAMES[axis]} {float(vibration.frequency[axis, tone]):.4g} Hz: {', '.join(texts)}")
     return [f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []

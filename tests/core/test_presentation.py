@@ -116,7 +116,8 @@ def test_a_detection_prints_in_seven_lines(detection):
         for value, std, true in zip(numbers[::2], numbers[1::2], (amplitude, frequency, phase), strict=True):
             assert abs(value - true) < 5 * std < 0.5
     assert lines[3:5] == ["x: reliable", "y: reliable"]
-    assert lines[5:] == ["assumed: row_time=4e-05 s; all frequencies are inversely proportional to it", HIDDEN]
+    assumed = "assumed: row_time=4e-05 s; frequencies scale inversely with it, or differ by multiples of 83.33 Hz"
+    assert lines[5:] == [assumed, HIDDEN]
 
 
 def test_reasons_tones_and_image_motion_are_printed(detection):
@@ -138,7 +139,7 @@ def test_reasons_tones_and_image_motion_are_printed(detection):
     assert lines[6] == "y: not reliable:"
     assert lines[7].startswith(" - no significant tone")
     assert lines[8].startswith("   ")
-    assert lines[-2] == " - blind"
+    assert " - blind" in lines[9:]
     assert max(map(len, lines)) <= 100
 
 
