@@ -193,7 +193,7 @@ _TONES = {
         "offset gain of a tone, below 0.1",
     ),
     "tones_alias": ReasonKind(
-        "tones of {frequency:.5g} and {value:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
+        "tones of {value:.5g} and {limit:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
         "because the rows are read in another time than stated",
         "check row_time and the readout direction",
         "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
@@ -340,8 +340,8 @@ _RECORDED = {
     "recording_explains_nothing": _of_result("the recording does not explain the frames"),
     "motion_repeats": _of_result("an offset of {offset:.6g} s explains the frames as well: the motion repeats"),
     "offset_outside": _of_result(
-        "the frames begin at {value:.6g} s of the recording, outside offsets",
-        compares="offset of the best fit, outside the given ones by more than 4 standard deviations",
+        "the frames begin at {value:.6g} s of the recording, and offsets ends at {limit:.6g} s",
+        compares="offset of the best fit, beyond a limit of those given by more than 4 standard deviations",
         unit="s",
     ),
     "axes_mirrored": _of_result(

@@ -40,7 +40,10 @@ class RowSpectra:
         self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly
         # Frames at a time, so that copies of few need memory, and rows of these at a time, which stay in the cache.
         bytes_of_frame = 4 * frames[:, 0].numel() * frames.element_size()
-        level, contrast = (torch.as_tensor(x).expand(*frames.shape[:2], 1, 1) for x in (level, contrast))
+        level, contrast = (
+            torch.as_tensor(x, dtype=frames.dtype, device=frames.device).expand(*frames.shape[:2], 1, 1)
+            for x in (level, contrast)
+        )
 
         def transformed(part: slice) -> Tensor:
             rows_of_frames = (

@@ -296,7 +296,7 @@ class VideoPasses:
         for first, second in combinations(frequencies, 2):
             cycles = abs(first - second) * self.job.timing.frame_period
             if round(cycles) > 0 and abs(cycles - round(cycles)) < _SAME_ALIAS:
-                return (Reason("tones_alias", AXIS_NAMES[axis], second, details={"frequency": first}),)
+                return (Reason("tones_alias", AXIS_NAMES[axis], first, second),)
         return ()
 
 

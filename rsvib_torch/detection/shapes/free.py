@@ -198,7 +198,8 @@ def _detect(
     weighed = measured.reweighted(residual)
     share = weighed.independent_fraction(residual) * measured.share_counted(residual)
     starts = rowwise.frame_starts(stack.images.shape[1])
-    rows_of_report = torch.linspace(0, scale.height - 1, min(32, scale.height), dtype=torch.float64)
+    count = min(32, scale.height)
+    rows_of_report = torch.linspace(0, scale.height - 1, count, dtype=torch.float64, device=starts.device)
     times = starts[:, None] + rows_of_report * rowwise.row_time + 0.5 * rowwise.exposure_time
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, table(times).ravel())
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
