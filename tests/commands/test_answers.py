@@ -122,9 +122,8 @@ def test_detect_names_the_next_command(place, config, tmp_path, capsys, monkeypa
     monkeypatch.chdir(tmp_path)
     assert rsvib("detect", place / "frames.tif", *config, "--out", "found") == 0
     answer = sections(capsys.readouterr().out)
-    assert answer["Files (open offsets.png first)"] == [
-        "found: offsets.png, spectrum.png, vibration.json, tones.csv, offsets.csv, spectrum.csv"
-    ]
+    names = " ".join(line.strip() for line in answer["Files (open offsets.png first)"])  # wrapped at the terminal
+    assert names == "found: offsets.png, spectrum.png, vibration.json, tones.csv, offsets.csv, spectrum.csv"
     arguments = shlex.split(answer["Next"][1])[1:]
     arguments[2] = str(tmp_path / "restored.tif")
     assert rsvib(*arguments) == 0
