@@ -102,8 +102,7 @@ class StackManifest(Result, file_format="rsvib stack"):
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
         """One row per tone, axis and window, as in ``DetectedVibration.table``; a failed window has one row.
 
-        Phases refer to ``start_s``, the exposure start of the first row of the window. The vibration of a video that
-        was followed is that of one frame, at ``middle_time_s``.
+        Phases refer to ``start_s``, the exposure start of the first row of the window.
         """
         lines = []
         for record, middle in zip(self.windows, self._middle_times(), strict=True):
@@ -121,14 +120,12 @@ class StackManifest(Result, file_format="rsvib stack"):
         return joined_columns(lines)
 
     def _middle_times(self) -> list[float | None]:
-        """Middle of the frames of each window, or of the frame that the vibration belongs to, in s."""
+        """Middle of the frames of each window in s."""
         if self.settings.get("sensor") is None:
             return [None] * len(self.windows)
         timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
         rows = self.input["shape"][timing.scan_axis]
         half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
-        if "video" in self.settings:
-            return [record.start_time + half_frame for record in self.windows]
         starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
         return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]
 
