@@ -11,6 +11,8 @@ from pathlib import Path
 from statistics import median, stdev
 from typing import Any, Literal
 
+import numpy as np
+
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joined_columns, physical_tone, plain_values
 from rsvib_torch.core.reason import Reason
@@ -40,6 +42,8 @@ class WindowRecord:
         predicted_gain: Mean of ``RestorationVerdict.predicted_gain`` in dB; None if unknown.
         error: Why detection or restoration failed.
         bad_frames: Index of each frame that could not be used, with the reason.
+        shaking: Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``,
+            changes of the motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     """
 
     window: int
@@ -55,6 +59,14 @@ class WindowRecord:
     predicted_gain: float | None
     error: str | None
     bad_frames: dict[str, str]
+    shaking: dict[str, tuple[float, ...]] | None = None
+
+
+def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[str, tuple[float, ...]]:
+    """Rms of ``WindowRecord.shaking`` over the parts of a video; empty if it was measured in none of them."""
+    known = [part for part in parts if part is not None]
+    names = known[0] if known else ()
+    return {name: tuple(np.sqrt(np.square([part[name] for part in known]).mean(0)).tolist()) for name in names}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,8 +81,6 @@ class StackManifest(Result, file_format="rsvib stack"):
         bad_frames: Index of each frame that could not be used, with the reason.
         not_kept: Metadata of the input that the output does not contain.
         margins: px that were cut off the sides of the frames of a video.
-        shaking: Rms motion in px of a video before and after, in some frames of each part: ``frame_to_frame``, changes
-            of the motion of the frame, and ``rows``, of twelfths of the rows beside it.
         windows: Result of every window.
     """
 
@@ -82,7 +92,6 @@ class StackManifest(Result, file_format="rsvib stack"):
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()
     margins: dict[str, int] | None = None
-    shaking: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,6 +137,11 @@ class StackManifest(Result, file_format="rsvib stack"):
         half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
         starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
         return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]
+
+    @property
+    def shaking(self) -> dict[str, tuple[float, ...]] | None:
+        """``rms_shaking`` of a video; None of a stack that was processed in windows."""
+        return rms_shaking(record.shaking for record in self.windows) or None
 
     def totals(self) -> dict[str, Any]:
         """Summary of the windows of a stack: numbers of windows, gain, tones of each axis, and axes left unchanged.

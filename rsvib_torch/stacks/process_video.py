@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -29,11 +29,11 @@ from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, 
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, plan_job
-from rsvib_torch.stacks.manifest import manifest_header
+from rsvib_torch.stacks.manifest import manifest_header, rms_shaking
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
 from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, RestoredFrame, VideoRestorer
-from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, Shaking, VideoMotion, VideoPasses
+from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
 from rsvib_torch.tracking import Margins
 
 # A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible. Rows are
@@ -101,7 +101,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     def compute(folder: RunFolder) -> dict[str, Any]:
         nonlocal content
-        shown, shaking = _Progress(options.progress, len(video.starts)), Shaking()
+        shown = _Progress(options.progress, len(video.starts))
         motion = video.motion(shown)
         margins = video.margins(motion) if border == "crop" else None
         content = _cut_content(content, margins)
@@ -109,10 +109,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         with closing(open_stack(source)) as reader:
             planes = planes_of(reader) if video.layout.planar else None
             with closing(_Encoder(folder, sink, content, planes)) as encoder:
-                _restore_parts(video, motion, folder, encoder, border, margins, at_once, shown, shaking)
-        measured = shaking.result()
-        _check_shaking(measured, folder)
-        return {"margins": None if margins is None else asdict(margins), "shaking": measured}
+                _restore_parts(video, motion, folder, encoder, border, margins, at_once, shown)
+        _check_shaking(folder)
+        return {"margins": None if margins is None else asdict(margins)}
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
@@ -179,10 +178,10 @@ def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
     return replace(content, shape=(*content.shape[:-2], *kept))
 
 
-def _check_shaking(measured: Mapping[str, Sequence[float]] | None, folder: RunFolder) -> None:
+def _check_shaking(folder: RunFolder) -> None:
     """Raise a ``ValueError`` if the restored frames shake more than those of the input; nothing is kept."""
     names = {"frame_to_frame": "from frame to frame", "rows": "between the rows"}
-    for key, (before, after) in (measured or {}).items():
+    for key, (before, after) in rms_shaking(record["shaking"] for record in folder.records()).items():
         if after > _MORE_SHAKING[key] * before + _VISIBLE_SHAKING:
             folder.remove()
             raise ValueError(
@@ -252,7 +251,6 @@ def _restore_parts(
     margins: Margins | None,
     at_once: int,
     progress: Callable[[], None],
-    shaking: Shaking,
 ) -> None:
     """Restore and encode all parts that are not in the folder."""
     share_one_heap()
@@ -296,8 +294,7 @@ def _restore_parts(
                     pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
                 if video.ends_part(done):
                     verdict = video.verdict(pair) if len(pair) == 2 else None
-                    video.add_shaking(shaking, motion, tracks[0].index, written)
-                    record = video.record(part, tracks, motion, verdict)
+                    record = video.record(part, tracks, motion, verdict, written)
                     with disk_errors_named(folder):
                         encoder.finish_part(record, video.layout.frame(before))
                     tracks, pair, written = [], [], []

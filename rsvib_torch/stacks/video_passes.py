@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -55,30 +55,6 @@ class VideoMotion:
     acceleration: Array  # (N, 4) per s^2
     faults: dict[int, str]  # number of each frame that could not be used, with the reason
     shakes: dict[int, tuple[Array, float]]  # ``shake`` between the frame of this number and the next one
-
-
-@dataclass(eq=False)
-class Shaking:
-    """The shaking of frames before and after restoration, from ``shake`` of neighbouring frames in a row."""
-
-    changes: list[Array] = field(default_factory=list)  # (2, n, 2) px, changes of the motion, before and after
-    rows: list[Array] = field(default_factory=list)  # (2, n) px, of rows beside the motion
-
-    def add(self, before: list[tuple[Array, float]], after: list[tuple[Array, float]]) -> None:
-        """Add neighbouring frames in a row."""
-        self.changes.append(np.diff([[motion for motion, _ in row] for row in (before, after)], axis=1))
-        self.rows.append(np.array([[rows for _, rows in row] for row in (before, after)]))
-
-    def result(self) -> dict[str, tuple[float, float]] | None:
-        """Rms change of the motion from frame to frame, and of rows beside it, in px, before and after."""
-        if not self.changes:
-            return None
-        changes = np.concatenate(self.changes, 1)
-        rows = np.concatenate(self.rows, 1)
-        return {
-            "frame_to_frame": tuple(np.sqrt(np.square(changes).sum(-1).mean(-1)).tolist()),
-            "rows": tuple(np.sqrt(np.square(rows).mean(-1)).tolist()),
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,20 +167,24 @@ class VideoPasses:
 
     # Verdict and record of a part
 
-    def add_shaking(self, shaking: Shaking, motion: VideoMotion, first: int, frames: list[Frame]) -> None:
-        """Compare the shaking of frames of the output, the first of which has a number, with that of the input."""
-        before: list[tuple[Array, float]] = []
-        after: list[tuple[Array, float]] = []
+    def shaking(self, motion: VideoMotion, first: int, frames: list[Frame]) -> dict[str, list[float]] | None:
+        """``WindowRecord.shaking`` from frames of the output, the first of which has a number; None if unknown."""
+        measured: list[tuple[tuple[Array, float], tuple[Array, float]]] = []  # of neighbouring frames, before and after
         follower = CornerFollower(self.job.timing)
         for number, frame in enumerate(frames, first):
             corners, raw = follower.next(self.layout.grey(frame), self.starts[number]), motion.shakes.get(number - 1)
             if number > first:
                 if raw is None or corners is None:
                     break
-                before.append(raw)
-                after.append(shake(corners))
-        if len(before) > 1:
-            shaking.add(before, after)
+                measured.append((raw, shake(corners)))
+        if len(measured) < 2:
+            return None
+        changes = np.diff([[moved for moved, _ in pair] for pair in measured], axis=0)  # (pairs - 1, 2, 2) px
+        rows = np.array([[rows for _, rows in pair] for pair in measured])  # (pairs, 2) px
+        return {
+            "frame_to_frame": np.sqrt(np.square(changes).sum(-1).mean(0)).tolist(),
+            "rows": np.sqrt(np.square(rows).mean(0)).tolist(),
+        }
 
     def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
@@ -227,9 +207,14 @@ class VideoPasses:
         return None
 
     def record(
-        self, part: int, tracks: list[FrameTrack], motion: VideoMotion, verdict: RestorationVerdict | None
+        self,
+        part: int,
+        tracks: list[FrameTrack],
+        motion: VideoMotion,
+        verdict: RestorationVerdict | None,
+        first_frames: list[Frame],
     ) -> dict[str, Any]:
-        """Content of the ``WindowRecord`` of a part of the video."""
+        """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
         detection = self._detection(motion, tracks)
         faults = {str(track.index): track.fault for track in tracks if track.fault is not None}
         moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
@@ -252,6 +237,7 @@ class VideoPasses:
             "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
             "error": None,
             "bad_frames": faults,
+            "shaking": self.shaking(motion, tracks[0].index, first_frames),
         }
 
     def _detection(self, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:

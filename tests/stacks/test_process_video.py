@@ -187,6 +187,9 @@ def test_an_interrupted_run_is_resumed(clip, tmp_path, damage):
     report = process_video(clip, sink, TIMING, resume=True, **options)
     assert report.resumed == (1 if damage is None else 0)
     assert np.array_equal(pixels(sink), pixels(tmp_path / "whole.mp4"))
+    whole = read_manifest(tmp_path / "whole.mp4.manifest.json").shaking
+    assert read_manifest(report.manifest).shaking == whole
+    assert whole["frame_to_frame"][1] < 0.2 * whole["frame_to_frame"][0]
     assert process_video(clip, sink, TIMING, resume=True, **options).resumed == 2  # it is complete
     assert not (tmp_path / ".again.mp4.rsvib").exists()
 
