@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
@@ -197,11 +198,7 @@ def recorded_offsets(motion: Vibration, timing: SensorTiming, size: tuple[int, i
         rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
         starts = torch.from_numpy(start + rows * timing.row_time)
         moved = motion.mean_displacement(starts, timing.exposure_time)
-        offset = moved[..., :2]
-        if parts > 1:
-            turned, zoomed = moved[..., 2], moved[..., 3]
-            offset = offset + torch.stack([zoomed * x - turned * y, turned * x + zoomed * y], -1)
-        places = grid + np.moveaxis(offset.numpy(), -1, 0)
+        places = grid + np.moveaxis(displacement_at(moved, x, y).numpy(), -1, 0)
     return (places - grid).astype(np.float32)
 
 

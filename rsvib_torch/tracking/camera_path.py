@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from rsvib_torch.core.tables import Array
+from rsvib_torch.core.tables import Array, table, tensor
+from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.registration.corners import Points, find_corners, follow_corners
 
@@ -57,6 +58,12 @@ class Corners:
     times: Array  # (N, 2) s, middle of the exposure of their rows in both frames
     places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
     offsets: Array  # (N, 2) px
+
+    @property
+    def factors(self) -> Array:
+        """(N, 2, 4), displacement by unit components of the path."""
+        x, y = tensor(self.places).unbind(-1)
+        return table(displacement_factors(x, y, 4))
 
     @staticmethod
     def joined(parts: Sequence["Corners"]) -> "Corners":
@@ -193,6 +200,11 @@ def _differences(first: NDArray[np.int64], values: Array, count: int) -> Array:
     return basis
 
 
+def _robust_weights(distance: Array, std: float) -> Array:
+    """Weights of residuals of the size ``distance`` with a standard deviation, which is at least 0.001 px."""
+    return 1.0 / (1.0 + (distance / (_SOFT * max(std, 1e-3))) ** 2) ** 2
+
+
 class _WindowFit:
     """The robust fit of path and tones to the corners of one window."""
 
@@ -205,24 +217,22 @@ class _WindowFit:
         # Roll and zoom are fitted as the displacement in px at the farthest corner.
         self.reach = max(1.0, float(np.abs(corners.places).max()))
         first, weights = _spline(corners.times, self.start, self.step, self.count)
-        x, y = corners.places.T / self.reach
-        one, zero = np.ones_like(x), np.zeros_like(x)
-        factors = np.stack([np.stack([one, zero, -y, x]), np.stack([zero, one, x, y])])  # (axis, component, corner)
+        factors = corners.factors / np.array([1.0, 1.0, self.reach, self.reach])
         # Columns of the path, for the few knots that a pair of frames depends on: every component of a knot at the
         # places of the corners.
         self.pairs: list[tuple[slice, NDArray[np.int64], Array]] = []  # corners, unknowns, columns (2, n, unknowns)
-        ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(x))
+        ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
         for begin, stop in pairwise((0, *ends)):
             part = slice(int(begin), int(stop))
             low, knots = int(first[part].min()), int(first[part].max()) + 4
             basis = _differences(first[part] - low, weights[part], knots - low)
-            columns = np.einsum("acn,nk->anck", factors[..., part], basis).reshape(2, len(basis), -1)
+            columns = np.einsum("nac,nk->anck", factors[part], basis).reshape(2, len(basis), -1)
             unknowns = (np.arange(4)[:, None] * self.count + np.arange(low, knots)).ravel()
             self.pairs.append((part, unknowns, columns))
         third = np.diff(np.eye(self.count), 3, axis=0)
         self.penalty = third.T @ third
         self.tones: list[Tone] = []
-        self.weights = np.ones(len(x))
+        self.weights = np.ones(len(factors))
         self.sigma = math.inf
         self.knots = np.zeros((4, self.count))
 
@@ -255,7 +265,7 @@ class _WindowFit:
             residual = self.corners.offsets - self.explained(self.knots) - (waves @ solution[size:]).T
             length = np.hypot(*residual.T)
             self.sigma = max(float(np.median(length)) / 1.177, 1e-3)  # of two normal components: 1.177 std
-            self.weights = 1.0 / (1.0 + (length / (_SOFT * self.sigma)) ** 2) ** 2
+            self.weights = _robust_weights(length, self.sigma)
             variance = np.abs(cho_solve(factor, np.eye(size + extra)[:, size:])[size:].diagonal())
             for number, tone in enumerate(self.tones):
                 part = slice(size + 3 * number, size + 3 * number + 3)
@@ -300,7 +310,7 @@ class _WindowFit:
         order, sizes = np.lexsort((offsets, cell)), np.bincount(cell)
         middle = np.cumsum(sizes) - sizes + (sizes - 1) // 2
         apart = np.abs(offsets - offsets[order[middle]][cell])
-        weights = 1.0 / (1.0 + (apart / (_SOFT * max(1.5 * float(np.median(apart)), 1e-3))) ** 2) ** 2
+        weights = _robust_weights(apart, 1.5 * float(np.median(apart)))
         total = np.maximum(np.bincount(cell, weights), 1e-9)
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
@@ -463,17 +473,15 @@ def shake(corners: Corners) -> tuple[Array, float]:
 
     The motion of the frame is a displacement with roll and zoom; rows that move apart from it show a rolling shutter.
     """
-    x, y = corners.places.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    columns = np.stack([np.stack([one, zero, -y, x], -1), np.stack([zero, one, x, y], -1)], 1)  # (N, 2, 4)
-    weight = np.ones(len(x))
+    columns = corners.factors
+    weight = np.ones(len(columns))
     for _ in range(_ROUNDS):
         heavy = columns * weight[:, None, None]
         gram = np.einsum("nai,naj->ij", heavy, columns) + 1e-9 * np.eye(4)
         motion = np.linalg.solve(gram, np.einsum("nai,na->i", heavy, corners.offsets))
         rest = corners.offsets - columns @ motion
         length = np.hypot(*rest.T)
-        weight = 1.0 / (1.0 + (length / (_SOFT * max(float(np.median(length)), 1e-3))) ** 2) ** 2
+        weight = _robust_weights(length, float(np.median(length)))
     part = (corners.rows * 12).astype(np.int64)
     bands = [np.median(rest[part == number], 0) for number in range(12) if (part == number).sum() > 4]
     return motion[:2], float(np.sqrt(np.mean(np.square(bands)))) if bands else 0.0

@@ -5,7 +5,8 @@ import math
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-from rsvib_torch.core.tables import Array
+from rsvib_torch.core.tables import Array, table, tensor
+from rsvib_torch.motion.field import largest_in_frame
 
 _HALVINGS = 5  # of the time over which the path is averaged, where the frame would be moved too far
 
@@ -65,6 +66,5 @@ def _local_lines(times: Array, places: Array, duration: float) -> Array:
 def largest_displacement(shift: Array, size: tuple[int, int]) -> Array:
     """(N,) displacement of the corners of a frame by components (N, 4), in parts of its width or height."""
     height, width = size
-    x, y, roll, zoom = np.abs(shift).T
-    along = (x + 0.5 * height * roll) / width + 0.5 * zoom
-    return np.maximum(along, (y + 0.5 * width * roll) / height + 0.5 * zoom)
+    parts: Array = table(largest_in_frame(tensor(np.abs(shift)), width, height)) / np.array([width, height])
+    return parts.max(-1)
