@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.special import i0
 from torch import Tensor
 
+from rsvib_torch.core.fourier import fourier_sums
 from rsvib_torch.core.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
 from rsvib_torch.core.tables import Array, table, tensor, unit_wave
 from rsvib_torch.core.text import measured_text, text_table
@@ -216,13 +216,12 @@ class Offsets:
         ``frequency`` (F,) Hz has equal steps that begin at twice the step, ``span`` is the duration in s, and ``known``
         (K, 2) are lines that the values do not contain.
         """
-        step, count = frequency[1] - frequency[0], len(frequency) + 2
+        grid = float(frequency[1] - frequency[0]), 2, len(frequency)
+        times = np.concatenate([self.later, self.earlier])[None, :, None]
         # Response of an offset to a displacement of each frequency, and its sum over the offsets.
         attenuation = self._attenuation(frequency)
-        later, earlier, intervals = (
-            FourierSums(times, step, count) for times in (self.later, self.earlier, self.later - self.earlier)
-        )
-        energy = 2 * (self.weights.sum() - intervals(self.weights)[2:].real)
+        intervals = fourier_sums((self.later - self.earlier)[None, :, None], self.weights[None, :, None], grid)[0]
+        energy = 2 * (self.weights.sum() - intervals.real)
         energy = np.maximum(energy, 1e-12 * energy.max())
         response = np.abs(attenuation) * np.sqrt(energy)
         visible, shown = (response >= gain * response.max() for gain in (BLIND_GAIN, _SEARCHED_GAIN))
@@ -233,7 +232,7 @@ class Offsets:
             # The residual as a tone of each frequency; the mean and a drift are image motion.
             residual = self._without(lines)
             parts = self.weights * residual
-            sums = (later(parts) - earlier(parts))[2:]
+            sums = fourier_sums(times, np.concatenate([parts, -parts])[None, :, None], grid)[0].conj()
             power = np.square(np.abs(sums)) / energy
             level = float(np.median(power[visible])) / math.log(2)  # the power of white noise is exponential
             excess = np.where(searched, power / max(level, 1e-300), 0.0)
@@ -322,39 +321,3 @@ def _tones(lines: tuple[Array, ...], centre: float) -> Vibration:
         values[:, axis, : len(of_axis)] = np.abs(amplitude), frequency, wrapped
     amplitude_of_axes, frequency_of_axes, phase_of_axes = map(tensor, values)
     return Vibration(amplitude_of_axes, frequency_of_axes, phase_of_axes)
-
-
-_KERNEL = 8  # grid points of the gridding kernel; errors of 1e-7
-
-
-class FourierSums:
-    """Sums (count,) ``sum_n v_n exp(-2 pi i j step t_n)``, j = 0 ... count - 1, of values (N,) at any times (N,) in s.
-
-    The values are gridded with a Kaiser-Bessel kernel on twice as many points, whose Fourier transform is then
-    divided out (Fessler and Sutton 2003).
-
-    Example:
-        >>> times, values = np.array([0.1, 0.25, 0.7]), np.array([1.0, 2.0, -1.0])
-        >>> direct = np.exp(-2j * np.pi * 0.5 * np.arange(20)[:, None] * times) @ values
-        >>> bool(np.abs(FourierSums(times, 0.5, 20)(values) - direct).max() < 1e-6)
-        True
-    """
-
-    def __init__(self, times: Array, step: float, count: int) -> None:
-        half = (count + 1) // 2 + 1
-        self._size, modes = 4 * half, np.arange(count) - half
-        self._wave = unit_wave(-2 * np.pi * step * half * times)  # the grid has negative frequencies as well
-        place = np.mod(step * times, 1.0) * self._size
-        taps = np.floor(place)[:, None] + np.arange(1 - _KERNEL // 2, 1 + _KERNEL // 2)  # (N, taps)
-        shape, distance = 0.75 * np.pi * _KERNEL, (place[:, None] - taps) / (0.5 * _KERNEL)
-        self._weights = i0(shape * np.sqrt(np.maximum(1 - np.square(distance), 0.0)))
-        self._index = np.mod(taps.astype(np.int64), self._size).ravel()
-        angle = np.sqrt(np.square(shape) - np.square(np.pi * _KERNEL * modes / self._size))
-        self._modes, self._kernel = np.mod(modes, self._size), _KERNEL * np.sinh(angle) / angle
-
-    def __call__(self, values: Array) -> Array:
-        """The sums of values (N,)."""
-        spread = (values * self._wave)[:, None] * self._weights
-        real, imaginary = (np.bincount(self._index, part.ravel(), self._size) for part in (spread.real, spread.imag))
-        sums: Array = np.fft.fft(real + 1j * imaginary)[self._modes] / self._kernel
-        return sums

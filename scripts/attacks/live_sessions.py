@@ -273,10 +273,11 @@ def _same_name(name: str, out: Path, frames: int) -> Trial:
         for _ in sessions:
             camera.viewers.acquire(timeout=_LIMIT)
         camera.begin.set()
-        count, end = sessions[0].recorded(frames), time.monotonic() + _LIMIT
+        end = time.monotonic() + _LIMIT
         while all(session.child.poll() is None for session in sessions) and time.monotonic() < end:
             time.sleep(0.1)
         recording = [session for session in sessions if session.child.poll() is None]
+        count = max((session.recorded(frames) for session in recording), default=0)
         for session in recording:
             session.send(signal.SIGTERM)
         outcomes = [outcome_of_command(session.ended(_LONGEST_END)) for session in sessions]

@@ -224,7 +224,7 @@ def test_assumptions_state_what_the_frames_cannot_contradict():
     vibration = vibration_of_fit(fit)[0][0]
     sensitivity = timing_sensitivity(fit, TIMING, 2, ROWS)[0]
     two = assumptions(vibration, sensitivity, TIMING, 2, ROWS)
-    assert any("row_time" in text and "inversely proportional" in text for text in two)
+    assert any("row_time" in text and "scale inversely" in text for text in two)
     assert any("two frames cannot contradict" in text for text in two)
     effect = next(text for text in two if text.startswith("frame_rows=110:"))
     assert effect.endswith("x 55 Hz: amplitude -5.5 %")  # frequencies follow from the rows of a frame

@@ -1,19 +1,17 @@
 """Start frequencies from the data: a gain-aware least-squares periodogram, and the choice among its peaks."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
-from scipy import fft, ndimage, special
+from scipy import ndimage
 
 from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.fourier import fast_length
+from rsvib_torch.core.fourier import fourier_sums
 from rsvib_torch.core.tables import Array, quantile, split_axis, take_stacks, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, tone_response
 
 _OVERSAMPLING = 8  # grid points per 1 / duration: a peak between two of them keeps 98 % of its height
-_CHUNK = 2**21  # values at a time
 _MAX_POWERS = 2**18  # frequencies, times weightings and stacks, at a time; each takes about 1.3 kB
 _TINY = 1e-300  # keeps equations solvable where nothing was measured
 
@@ -65,14 +63,14 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Ar
     earlier, later = np.triu_indices(time.shape[2])
     share = seen[..., earlier] * seen[..., later] / np.maximum(seen.sum(2, keepdims=True), 1.0)
     of_squares = np.where(earlier == later, seen[..., earlier] - share, -2 * share)
-    Q = _transform(time[..., earlier] + time[..., later], of_rows[..., None] * of_squares[:, None, None], grid)
+    Q = fourier_sums(time[..., earlier] + time[..., later], of_rows[..., None] * of_squares[:, None, None], grid)
     apart = earlier != later
     of_moduli = of_rows[..., None] * (2 * share[..., apart])[:, None, None]
-    R = most - _transform(time[..., later[apart]] - time[..., earlier[apart]], of_moduli, grid).real
+    R = most - fourier_sums(time[..., later[apart]] - time[..., earlier[apart]], of_moduli, grid).real
     Q, R = Q * np.square(attenuation), R * np.square(attenuation)
 
     # 3. Products of the waves with the image motion and with the displacements.
-    products = _transform(time, np.stack([of_drift, frame_weights * values], 1), grid) * attenuation
+    products = fourier_sums(time, np.stack([of_drift, frame_weights * values], 1), grid) * attenuation
     with_drift, with_values = np.moveaxis(products, 1, 0)
 
     return explained_power(Q, R + 2 * prior, with_values, with_drift, drift_value, drift_drift)
@@ -99,43 +97,6 @@ def explained_power(
     decrease = sine * np.square(right.real) - 2 * cross * right.real * right.imag + cosine * np.square(right.imag)
     determinant = np.maximum(cosine * sine - np.square(cross), _TINY)
     return decrease / determinant + np.square(drift_value) / drift_drift
-
-
-def _transform(times: Array, values: Array, grid: tuple[float, int, int]) -> Array:
-    """Sums of ``values exp(2 pi i f t)`` over unequal times for equally spaced frequencies.
-
-    The values are spread over a grid of times with a Kaiser-Bessel kernel, transformed, and divided by the transform of
-    the kernel (Fessler and Sutton, IEEE Trans. Signal Process. 51, 560, 2003), to 1e-7 of the sum of their moduli.
-
-    Args:
-        times: (B, N, G) s.
-        values: (B, ..., N, G) real.
-        grid: Frequencies, from ``_grid``.
-
-    Returns:
-        (B, ..., F) complex.
-    """
-    width, shape = 8, 18.6  # grid points; of the kernel, for twice as many grid points as necessary
-    step, first, count = grid
-    length = 4 * fast_length(first + count)
-    # 1. Every value on the eight grid points around its time.
-    places = times.reshape(len(times), -1) * (step * length)  # (B, M)
-    flat = values.reshape(len(values), -1, places.shape[1])  # (B, C, M)
-    taps = np.arange(width) - (width // 2 - 1)
-    rows = length * np.arange(flat.shape[0] * flat.shape[1]).reshape(*flat.shape[:2], 1)  # of the flat sums
-    total = np.zeros(rows.size * length)
-    for part in runs(places.shape[1], max(1, _CHUNK // (width * rows.size))):
-        cell = np.floor(places[:, part])
-        distance = (places[:, part] - cell)[..., None] - taps
-        kernel = special.i0(shape * np.sqrt(np.maximum(1 - np.square(2 / width * distance), 0.0)))
-        index = ((cell.astype(np.int64)[..., None] + taps) % length).reshape(len(places), 1, -1)
-        spread = (flat[..., part, None] * kernel[:, None]).reshape(*flat.shape[:2], -1)
-        total += np.bincount((rows + index).ravel(), spread.ravel(), len(total))
-    # 2. The transform of the grid over that of the kernel.
-    transformed = fft.rfft(total.reshape(*flat.shape[:2], length))[..., first : first + count].conj()
-    angle = math.pi * width / length * np.arange(first, first + count)
-    root = np.sqrt(shape**2 - np.square(angle))
-    return (transformed * (root / (width * np.sinh(root)))).reshape(*values.shape[:-2], count)
 
 
 def strongest_frequencies(
