@@ -39,7 +39,7 @@ bench: setup ## run the benchmarks and store their results
 
 pages: setup ## write the generated pages and drawings of docs/ anew
 	$(PYTHON) scripts/reference_pages.py
-	$(PYTHON) scripts/benchmark_page.py
+	$(PYTHON) scripts/benchmark.py --pages
 	$(PYTHON) scripts/drawings.py --out docs/drawings
 	$(PYTHON) scripts/run_pages.py
 

@@ -7,7 +7,7 @@ A section is a module with
 * ``rows(options)``: the figures, one dictionary per case, of numbers, texts, lists and dictionaries;
 * ``lines(rows, options)``: the tables in Markdown, without further measurement.
 
-``benchmark.py`` runs sections, ``write_result`` stores their rows, and ``benchmark_page.py`` makes the page of all.
+``benchmark.py`` runs sections, ``write_result`` stores their rows, and ``benchmark.py --pages`` makes the pages.
 """
 
 import argparse
