@@ -11,6 +11,14 @@ from rsvib_torch import SensorTiming
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
 ARRANGED = {"report", "test_presentation.py", "test_gallery.py"}  # tests of figures, which are drawn as for users
+LONGEST = (
+    "test_tutorials.py",
+    "test_direct.py",
+    "test_answers.py",
+    "test_cli.py",
+    "test_start.py",
+    "test_slanted_edge.py",
+)
 SLOWER_TESTS = [line for line in (TESTS / "slower_tests.txt").read_text().splitlines() if not line.startswith("#")]
 
 
@@ -26,7 +34,8 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """With ``--quick``, the tests of ``slower_tests.txt`` are left out."""
+    """The longest files begin, so that all workers end together; ``--quick`` leaves out ``slower_tests.txt``."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
     if config.getoption("quick", False):
         slower = [item for item in items if item.nodeid.split("[")[0].removeprefix("tests/") in SLOWER_TESTS]
         config.hook.pytest_deselected(items=slower)
@@ -47,7 +56,7 @@ def same_random_numbers():
 
 @pytest.fixture(autouse=True)
 def figures_are_not_arranged(request, monkeypatch):
-    """Draw figures coarsely, once and without arranging their parts, except in tests of figures: a fifth of the time."""
+    """Draw figures coarsely and without arranging their parts, except in tests of figures: a fifth of the time."""
 
     def print_figure(canvas, file, **_):
         canvas.figure.set_layout_engine("none")
