@@ -9,23 +9,13 @@ from truth import Curve, Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, simulate_frames
 from rsvib_torch.detection.convergence import is_converged
-from rsvib_torch.detection.pipeline import DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.refinement import Refinement, with_unknown_changes
-from rsvib_torch.detection.rows.grouped_frames import grouped_frames
-from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
-    amplitude_std,
-    motion_of_fit,
-    shrunk,
-    vibration_of_fit,
 )
 from rsvib_torch.evaluation import resolution_chart
-from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.options import OffsetOptions, RegistrationOptions
 from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
-from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
+from rsvib_torch.registration.row_spectra import RowSpectra
 
 MARGIN = 40
 
@@ -213,33 +203,6 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
 
 
-def test_changes_of_the_last_rounds_count_as_errors(paper_camera):
-    """Of a refinement that did not converge: here, fits whose amplitude along y was 0.3 and 0.4 px larger."""
-    frames = noisy_frames(paper_camera, Motion(phase=(0.9, 2.2)), 42, 0.005, rows=512)
-    options = DetectionOptions("direct", 1, MotionModel(), RegistrationOptions())
-    stacks = grey_frames(frames, paper_camera, OffsetOptions())
-    translation = Hypothesis(FieldScale(2, frames.shape[-1], 512))
-    rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.refined
-    fit = rows.fit
-    along_y = np.array([[0.0], [1.0]])
-    fits = [
-        replace(fit, coefficients=fit.coefficients * (1 + more * along_y / fit.amplitude)) for more in (0.3, 0.4, 0)
-    ]
-    around, not_converged = shrunk(fit, np.array([0.04])), np.array([True])
-    std = amplitude_std(with_unknown_changes(rows, around, around, fits, not_converged).fit)
-    np.testing.assert_allclose(std, np.sqrt(amplitude_std(fit) ** 2 + 0.5**2 * along_y), rtol=1e-6)
-    unchanged = with_unknown_changes(rows, around, around, fits, ~not_converged)
-    np.testing.assert_array_equal(unchanged.fit.covariance, fit.covariance)
-
-
-@pytest.mark.parametrize("size", [2.0, 59.0])
-def test_large_tones_of_blind_frequencies_do_not_displace_frames(size):
-    """Offsets contain next to nothing of such tones, and a fit of small errors may have any amplitude."""
-    fit = tone_fit([2.4, size], [47.0, 30.005])
-    warped_by = shrunk(fit, np.array([1 / 30, 2 / 30]))
-    assert warped_by.amplitude[0, :, 0].tolist() == pytest.approx([2.4, size if size < 30 else 0.0], rel=1e-3)
-
-
 def test_two_tones_over_four_frames_are_detected(paper_camera):
     first = Motion((1.5, 1.2), (41.0, 97.0), (0.7, 0.3))
     second = Motion((0.6, 0.4), (180.0, 66.0), (2.1, -2.0))
@@ -276,65 +239,6 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     result = detect_vibration(frames, paper_camera, method="direct")
     assert result.reliable.tolist() == [False, True]
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
-
-
-def test_warping_some_rows_equals_warping_all_rows():
-    frames = torch.rand(3, 5, 40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    spectra = RowSpectra(frames, level=0.5 * torch.ones(3, 5, 1, 1), contrast=2.0 * torch.ones(3, 5, 1, 1))
-    rows = 8 + 20 * torch.rand(3, 5, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    shift = rows.sin()
-    whole, part = spectra.warped(rows, shift), spectra.part(slice(1, 4))
-    torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), whole[:, 1:4])
-    pattern = torch.rand(3, whole.shape[-1], generator=torch.Generator().manual_seed(4)).to(whole.dtype)
-    part = part.without(pattern)
-    # the pattern is at the same columns of all rows; the rows are displaced
-    expected = whole[:, 1:4] - pattern[:, None, None] * spectra.ramp(shift[:, 1:4])
-    torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), expected)
-    torch.testing.assert_close(spectra.warped(rows, shift), whole)
-    # rows without displacement: the standardised frames, within the boundary extension
-    there = torch.arange(12, 28, dtype=torch.float64).expand(3, 5, -1)
-    own = torch.fft.irfft(spectra.warped(there, torch.zeros_like(there)), n=spectra.length)[..., :64]
-    torch.testing.assert_close(own, (frames[:, :, 12:28] - 0.5) / 2, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("num_frames", [2, 3, 5])
-def test_differences_from_the_mean_of_the_frames_in_which_a_row_is_visible(num_frames):
-    generator = torch.Generator().manual_seed(num_frames)
-    spectra = torch.randn(2, num_frames, 7, 5, dtype=torch.complex128, generator=generator)
-    seen = (torch.rand(2, num_frames, 7, generator=generator) > 0.3).double()
-    weight = seen[..., None].numpy()
-    mean = (weight * spectra.numpy()).sum(1) / np.maximum(weight.sum(1), 1)
-    expected = weight * (spectra.numpy() - mean[:, None])
-    found = differences(spectra, seen).numpy()
-    np.testing.assert_allclose(found, expected[:, : found.shape[1]], atol=1e-12)
-    if num_frames == 2:
-        np.testing.assert_allclose(-found[:, 0], expected[:, 1], atol=1e-12)
-
-
-def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
-    """Compared with a refinement that is continued after it has converged."""
-    frames = noisy_frames(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
-    timing = paper_camera.in_row_order()
-    stacks = grey_frames(frames, paper_camera, OffsetOptions())
-    options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions())
-    start = attempt(stacks, timing, options, Hypothesis(FieldScale(2, *frames.shape[:-3:-1]))).fitted.fit
-    intervals = np.array([timing.frame_period])
-    rows = grouped_frames(stacks.images, None, timing, motion_of_fit(shrunk(start, intervals)))
-    refinement = Refinement(rows, intervals, start, None)
-    refinement.step()
-    while not refinement.settled.all():
-        refinement.accelerate()
-        refinement.step()
-    assert refinement.round <= 3
-    assert refinement.converged.all()
-    vibration, std = vibration_of_fit(refinement.result().fit)
-    for _ in range(4):
-        refinement.accelerate()
-        refinement.step()
-    continued, _ = vibration_of_fit(refinement.result().fit)
-    for name in ("amplitude", "frequency", "phase"):
-        change = (getattr(vibration, name) - getattr(continued, name)).abs()
-        assert bool((change < 0.1 * getattr(std, name)).all())
 
 
 def tone_fit(coefficients, frequencies):
@@ -676,14 +580,6 @@ def test_rotation_is_not_detected_as_vibration(paper_camera):
 def test_bad_options(paper_camera, options, error, message):
     with pytest.raises(error, match=message):
         detect_vibration(torch.rand(3, 256, 256), paper_camera, **options)
-
-
-@pytest.mark.parametrize("largest", [math.inf, math.nan, 1e300])
-def test_rows_of_a_fit_that_diverged_have_no_weight(largest):
-    """Fits of a shaking handheld camera may displace rows by any amount."""
-    shift = torch.tensor([0.3, largest], dtype=torch.float64)
-    assert float(inner_columns(96, shift[None, None], torch.zeros(1)).sum()) == 0
-    assert float(inner_columns(96, shift[None, None, :1], torch.zeros(1)).sum()) > 60
 
 
 def test_narrow_frames_of_a_rotating_camera_are_refused():

@@ -40,11 +40,6 @@ def test_scan_axis_names(given, kept):
     assert in_rows.frame_period == timing.frame_period
 
 
-def test_equal_timings_are_equal():
-    assert SensorTiming(**GOOD) == SensorTiming(**GOOD, scan_axis="y")
-    assert SensorTiming(**GOOD) != SensorTiming(**GOOD, scan_axis="x")
-
-
 def test_rows_of_a_frame():
     SensorTiming(**GOOD).check_rows(2048)
     with pytest.raises(ValueError, match="frame_rows=2048 is less than the 2049 rows of the frames"):
