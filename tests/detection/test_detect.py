@@ -62,7 +62,7 @@ def pairs(paper_camera):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("case", range(3))
+@pytest.mark.parametrize("case", range(2))
 def test_paper_pair(pairs, paper_camera, registration, case):
     frames, motion = pairs[case]
     result = detect_bands(frames, paper_camera, registration=registration)
@@ -97,8 +97,8 @@ def test_image_motion_is_separated(paper_camera, registration):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("image_motion", [(0.0, 0.0), (300.0, 150.0)])
-def test_no_tone_is_detected_without_vibration(paper_camera, registration, image_motion):
+def test_no_tone_is_detected_without_vibration(paper_camera, registration):
+    image_motion = (300.0, 150.0)
     motion = Motion(amplitude=(0.0, 0.0), image_motion=image_motion)
     result = detect_bands(noisy_frames(paper_camera, motion, 4, margin=60), paper_camera, registration=registration)
     assert bool((result.vibration.amplitude == 0).all())
@@ -107,8 +107,7 @@ def test_no_tone_is_detected_without_vibration(paper_camera, registration, image
     assert result.vibration.image_motion.tolist() == pytest.approx(image_motion, abs=2.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("multiple", [1, 2])
+@pytest.mark.parametrize(("seed", "multiple"), [(1, 1), (2, 2)])
 def test_blind_frequency_is_refused(paper_camera, seed, multiple):
     blind = multiple / (2048 * ROW_TIME)
     motion = Motion(frequency=(blind, blind), phase=random_phase(seed))
@@ -120,9 +119,8 @@ def test_blind_frequency_is_refused(paper_camera, seed, multiple):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_frames_of_noise_are_not_reliable(paper_camera, registration, seed):
-    frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(seed))
+def test_frames_of_noise_are_not_reliable(paper_camera, registration):
+    frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(1))
     result = detect_bands(frames, paper_camera, registration=registration)
     assert not bool(result.reliable.any())
 
@@ -206,7 +204,7 @@ def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
     The standard deviations allow for a further tone, so that errors are smaller for one tone.
     """
     ratios = []
-    for seed in range(20, 26):
+    for seed in range(20, 24):
         motion = Motion(phase=random_phase(seed))
         result = detect_bands(noisy_frames(paper_camera, motion, seed, columns=256), paper_camera)
         found, std = result.vibration, result.std

@@ -8,14 +8,7 @@ from scipy import ndimage
 from truth import Curve, Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, simulate_frames
-from rsvib_torch.detection.convergence import is_converged
-from rsvib_torch.detection.tones.fit import (
-    MotionModel,
-    ToneFit,
-)
 from rsvib_torch.evaluation import resolution_chart
-from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
-from rsvib_torch.registration.row_spectra import RowSpectra
 
 MARGIN = 40
 
@@ -125,9 +118,7 @@ def test_outliers_among_the_measured_offsets_have_quality_0():
     [
         (400, (2048, 512), 7, (-1.386, -1.422), 0.001),
         (200, (2048, 256), 66, (2.5, 0.4), 0.005),  # different blur in each frame
-        (400, (2048, 256), 66, (2.5, 0.4), 0.005),
         (400, (1024, 1024), 66, (-1.39, -1.42), 0.005),  # one period of x and less of y, all rows blurred
-        (400, (1024, 1024), 67, (-1.39, -1.42), 0.005),
     ],
 )
 def test_long_exposures(paper_camera, exposure_rows, size, seed, phase, noise):
@@ -151,11 +142,10 @@ def tall_frames(camera, exposure_rows, motion, seed, columns, num_frames):
     return noisy_frames(exposed, motion, seed, 0.001, 768, columns, num_frames, samples=16), exposed
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_fast_vibration_with_different_blur_in_each_frame(paper_camera, seed):
+def test_fast_vibration_with_different_blur_in_each_frame(paper_camera):
     """Curved paths of 1.7 px that are similar in all frames: their effect on detail is corrected."""
     motion = Motion((1.2, 0.8), (188.3, 170.7), (0.4, -1.0))
-    found = detect_vibration(*tall_frames(paper_camera, 60, motion, seed, 384, 6))
+    found = detect_vibration(*tall_frames(paper_camera, 60, motion, 1, 384, 6))
     wrong = (found.vibration.amplitude[:, 0] - motion.vibration().amplitude[:, 0]).abs()
     assert found.reliable.all(), found.reasons
     assert float(wrong.max()) < 0.0015, wrong
@@ -239,78 +229,6 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     result = detect_vibration(frames, paper_camera, method="direct")
     assert result.reliable.tolist() == [False, True]
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
-
-
-def tone_fit(coefficients, frequencies):
-    """A fit of one tone per axis with standard deviations of 0.01 px and 0.02 Hz."""
-    return ToneFit(
-        np.reshape(coefficients, (1, 2, 1)).astype(complex),
-        np.reshape(frequencies, (1, 2, 1)).astype(float),
-        np.ones((1, 2, 1), dtype=bool),
-        np.zeros((1, 2, 1)),
-        np.diag(np.square([0.01, 0.01, 0.02, 1.0] * 2))[None],
-        np.zeros(1),
-        MotionModel(),
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "ratio", "converged"),
-    [
-        (0.4, None, True),  # change in standard deviations
-        (0.6, None, False),
-        (0.6, 0.5, False),  # slow convergence: as without a ratio
-        (0.4, 0.9, True),
-        (0.6, 0.05, True),  # fast convergence: the next change is a twentieth of this one
-        (1.4, 0.07, False),
-        (1.4, 0.02, True),
-        (3.1, 0.001, False),
-    ],
-)
-def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, ratio, converged):
-    before = tone_fit([1.0, 2.0], [50.0, 30.0])
-    ratio = None if ratio is None else np.array([ratio])
-    for after in (
-        tone_fit([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
-        tone_fit([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
-    ):
-        assert bool(is_converged(before, after, ratio).all()) is converged
-
-
-@pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])
-@pytest.mark.parametrize("num_frames", [2, 3])
-def test_shift_estimated_from_rows(remaining, num_frames):
-    """Frames shifted along the rows by multiples of a shift: positions of the frames relative to their mean."""
-    scene = draw_scene(96, 192, 46)
-    u = np.fft.rfftfreq(192)
-    moved = [
-        np.fft.irfft(np.fft.rfft(scene) * np.exp(-2j * np.pi * u * p * remaining), n=192) for p in range(num_frames)
-    ]
-    noise = 1e-5 * np.random.default_rng(1).standard_normal((num_frames, 96, 192))
-    frames = torch.from_numpy(np.stack(moved) + noise)[None, :, :, 16:-16]
-    spectra = RowSpectra(frames)
-    rows = torch.arange(96, dtype=torch.float64).expand(1, num_frames, 96)
-    seen = ((rows >= 8) & (rows <= 87)).double()
-    none = torch.zeros_like(rows)
-    gradients = row_gradients(spectra, [(slice(None), spectra.warped(rows, none))], rows, none, seen)
-    expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
-
-    def estimated_shift(shift):
-        runs = (slice(0, 40), slice(40, 96))
-        warped = ((run, spectra.warped(rows[..., run], shift[..., run])) for run in runs)
-        matrix, right = row_equations(residual_products(warped, gradients, seen), gradients, seen)
-        known = matrix[0, :, 0, 0] > 0
-        assert known.tolist() == seen[0, 0].bool().tolist()
-        total, sums = matrix[0].sum(0), right[0].sum(1)
-        return torch.linalg.solve(total, sums[..., None])[..., 0]
-
-    again = residual_products([(slice(None), spectra.warped(rows, none))], gradients, seen)
-    torch.testing.assert_close(gradients.residual_products, again, rtol=1e-9, atol=1e-9)
-    shifts = estimated_shift(none)
-    torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
-    assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5
-    # a shift that was removed before has no residual
-    assert estimated_shift(expected[None, :, None].expand(1, -1, 96).double()).abs().max() < 1e-3
 
 
 @dataclass(frozen=True)
@@ -428,7 +346,7 @@ def test_weak_tone_at_the_frequency_of_a_side_tone_is_detected(paper_camera):
     check(result, motion, 0.3, 5.0, 1.0)
 
 
-@pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (700, (5, 0)), (1610, (2, 7))])
+@pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (1610, (2, 7))])
 def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
     """Slow tones are measured on the other rows, for every position and motion of the cloud."""
     motion = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1))
@@ -541,11 +459,9 @@ def test_windows_measure_a_changing_vibration(paper_camera):
     )
 
 
-@pytest.mark.parametrize("noise", [0.001, 0.02])
-def test_drift_without_vibration_is_not_reliable(paper_camera, noise):
-    frames = noisy_frames(
-        paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0)), 58, noise, columns=256
-    )
+def test_drift_without_vibration_is_not_reliable(paper_camera):
+    motion = Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0))
+    frames = noisy_frames(paper_camera, motion, 58, 0.02, columns=256)
     result = detect_vibration(frames, paper_camera)
     assert not bool(result.reliable.any())
     torch.testing.assert_close(result.vibration.image_motion, torch.tensor([300.0, -200.0]).double(), rtol=0, atol=1.0)
