@@ -9,7 +9,7 @@ import pytest
 import torch
 from benchmark import SECTIONS, module_of
 from benchmarks import error_bars, gpu, live, pipeline, video
-from harness import Timed, defaults, in_turns, read_result, shown_seconds, table, write_result
+from harness import Timed, defaults, in_turns, read_result, shown_seconds, write_result
 
 import rsvib_torch as rsv
 
@@ -138,10 +138,6 @@ def test_one_command_writes_markdown_and_json(tmp_path, capsys):
     text = (tmp_path / "benchmark.md").read_text()
     assert text in capsys.readouterr().out + "\n"
     assert sum(line.startswith("| cpu | 96² | 1 |") for line in text.splitlines()) == 4
-
-
-def test_a_table_has_a_line_for_each_row():
-    assert table(("a", "b"), [(1, "x")]) == ["| a | b |", "| --- | --- |", "| 1 | x |", ""]
 
 
 def test_live():

@@ -143,17 +143,6 @@ def test_only_deterministic_algorithms_are_used(blur, vibration):
         torch.use_deterministic_algorithms(False)
 
 
-def test_state_of_the_blur_is_complete(blur):
-    """Loading the state replaces linear by cubic kernels, including window and size."""
-    scene = torch.rand(64, 60)
-    options = {"frame_width": 40, "origin": (5, 7), "scene_size": (64, 60)}
-    cubic = rsv.RowVaryingBlur(blur.psf, **options)
-    linear = rsv.RowVaryingBlur(type(blur.psf)(blur.psf.first_tap * 0, blur.psf.weights * 0, 1))
-    linear.load_state_dict(cubic.state_dict())
-    assert torch.equal(linear(scene), cubic(scene))
-    assert linear.A_adjoint(cubic(scene)).shape == (64, 60)
-
-
 def test_half_precision_and_autocast(frames, vibration, blur):
     """Autocast changes nothing; half-precision frames are restored in float32 and rounded once."""
     for _, module, arguments in modules(blur, vibration):
