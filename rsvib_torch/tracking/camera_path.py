@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from rsvib_torch.core.splines import spline_taps
 from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
@@ -170,33 +171,14 @@ class WindowPath:
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
-        first, weights = _spline(times, self.start, self.step, len(self.knots), derivative)
-        return np.einsum("nk,nka->na", weights, self.knots[first[:, None] + np.arange(4)])
+        index, weights = spline_taps(times, self.start, self.step, len(self.knots), derivative=derivative)
+        return np.einsum("nk,nka->na", weights, self.knots[index])
 
 
-def _spline(
-    times: Array, start: float, step: float, count: int, derivative: int = 0
-) -> tuple[NDArray[np.int64], Array]:
-    """First of the four cubic B-splines (of ``count``) at each time, and their values or derivatives (..., 4)."""
-    place = np.clip((times - start) / step, 0.0, count - 3.0)
-    first = np.minimum(place.astype(np.int64), count - 4)
-    u = place - first
-    if derivative == 0:
-        values = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-    elif derivative == 1:
-        values = [-3 * (1 - u) ** 2, 9 * u**2 - 12 * u, -9 * u**2 + 6 * u + 3, 3 * u**2]
-    else:
-        values = [6 * (1 - u), 18 * u - 12, -18 * u + 6, 6 * u]
-    return first, np.stack(values, -1) / (6 * step**derivative)
-
-
-def _differences(first: NDArray[np.int64], values: Array, count: int) -> Array:
-    """(N, count), differences between both times (N, 2) of the B-splines from ``_spline``."""
-    basis = np.zeros((len(first), count))
-    for frame, sign in ((0, -1.0), (1, 1.0)):
-        np.add.at(
-            basis, (np.arange(len(first))[:, None], first[:, frame, None] + np.arange(4)), sign * values[:, frame]
-        )
+def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
+    """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
+    basis = np.zeros((len(index), count))
+    np.add.at(basis, (np.arange(len(index))[:, None, None], index), factors * [[-1.0], [1.0]])
     return basis
 
 
@@ -216,7 +198,7 @@ class _WindowFit:
         self.times = corners.times - self.origin
         # Roll and zoom are fitted as the displacement in px at the farthest corner.
         self.reach = max(1.0, float(np.abs(corners.places).max()))
-        first, weights = _spline(corners.times, self.start, self.step, self.count)
+        index, weights = spline_taps(corners.times, self.start, self.step, self.count)
         factors = corners.factors / np.array([1.0, 1.0, self.reach, self.reach])
         # Columns of the path, for the few knots that a pair of frames depends on: every component of a knot at the
         # places of the corners.
@@ -224,8 +206,8 @@ class _WindowFit:
         ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
         for begin, stop in pairwise((0, *ends)):
             part = slice(int(begin), int(stop))
-            low, knots = int(first[part].min()), int(first[part].max()) + 4
-            basis = _differences(first[part] - low, weights[part], knots - low)
+            low, knots = int(index[part].min()), int(index[part].max()) + 1
+            basis = _differences(index[part] - low, weights[part], knots - low)
             columns = np.einsum("nac,nk->anck", factors[part], basis).reshape(2, len(basis), -1)
             unknowns = (np.arange(4)[:, None] * self.count + np.arange(low, knots)).ravel()
             self.pairs.append((part, unknowns, columns))
@@ -315,8 +297,7 @@ class _WindowFit:
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
-        first, values = _spline(times + self.origin, self.start, self.step, self.count)
-        basis = _differences(first, values, self.count)
+        basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
         tones = [tone.columns(times, self.averaged)[:, :2] for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known
