@@ -44,7 +44,7 @@ BEFORE = {"exact": 3.68, "dewarp": 0.98}
 # Parts of the work: functions whose processor time is measured, without that of the others within them.
 PARTS: dict[str, list[tuple[str, str]]] = {
     "motion": [
-        ("rsvib_torch.tracking.camera_path", "CornerFollower.next"),
+        ("rsvib_torch.registration.corners", "CornerFollower.next"),
         ("rsvib_torch.tracking.camera_path", "fit_window"),
     ],
     "restoration": [
