@@ -23,13 +23,14 @@ from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer, recorded_offsets
 from rsvib_torch.tracking import Margins
-from rsvib_torch.tracking.camera_path import CameraPath, CornerFollower, Corners, Tone, camera_path, shake
+from rsvib_torch.tracking.camera_path import CameraPath, Tone, camera_path, shake
 from rsvib_torch.tracking.steadying import steady_places
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part

@@ -82,7 +82,7 @@ def make_frames():
 
 @pytest.fixture(scope="module", name="tracks")
 def make_tracks(frames):
-    return corner_tracks(((frame, None) for frame in frames), TIMING)
+    return corner_tracks(frames, None, TIMING)
 
 
 def aligned(tracks, rates, camera=None):
