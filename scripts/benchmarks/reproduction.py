@@ -280,10 +280,20 @@ def quality(images: Array, still: Array, edges: Sequence[tuple[str, rsv.SlantedE
     return found
 
 
-def trial(scene: Scene, case: dict[str, Any], edges: Sequence[tuple[str, rsv.SlantedEdge]] | None) -> Rows:
-    """Detection and restoration of two frames by all methods; without edges (None) detection only."""
+def trials(
+    scene: Scene, case: dict[str, Any], noises: Sequence[float], edges: Sequence[tuple[str, rsv.SlantedEdge]] | None
+) -> Rows:
+    """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
-    array = counts_of(taken(scene, shake, camera(len(scene.still))), case["noise"], case["seed"])
+    clean = taken(scene, shake, camera(len(scene.still)))
+    return [row for noise in noises for row in trial(scene, shake, clean, case | {"noise": noise}, edges)]
+
+
+def trial(
+    scene: Scene, shake: Shake, clean: Array, case: dict[str, Any], edges: Sequence[tuple[str, rsv.SlantedEdge]] | None
+) -> Rows:
+    """Detection and restoration of two frames with one noise."""
+    array = counts_of(clean, case["noise"], case["seed"])
     frames, timing = torch.from_numpy(array).float(), camera(len(scene.still))
     found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
     results = [
@@ -344,17 +354,17 @@ def rows(options: argparse.Namespace) -> Rows:
         for target in TARGETS:
             scene = draw(target, options.trial_size)
             edges = edges_of(scene.still, options.trial_edges) if target == "chart" else []
+            case: dict[str, Any] = {"target": target, "speed": 0.0}
             for noise in options.trial_noises:
-                case = {"target": target, "noise": noise, "speed": 0.0}
                 still = quality(counts_of(scene.still[None], noise, 0), scene.still, edges)
-                results += [{"part": "restoration", **case, "seed": 0, "method": STILL, **still[0]}]
-                for seed in range(options.trials):
-                    results += trial(scene, case | {"seed": seed}, edges)
+                results += [{"part": "restoration", **case, "noise": noise, "seed": 0, "method": STILL, **still[0]}]
+            for seed in range(options.trials):
+                results += trials(scene, case | {"seed": seed}, options.trial_noises, edges)
         for speed in options.trial_speeds:
             scene = draw("landscape", options.trial_size, speed)
-            case = {"target": "landscape", "noise": options.trial_noises[0], "speed": speed}
+            case = {"target": "landscape", "speed": speed}
             for seed in range(options.trials):
-                results += trial(scene, case | {"seed": seed}, None)
+                results += trials(scene, case | {"seed": seed}, options.trial_noises[:1], None)
         return results + global_shutter()
 
 
