@@ -15,6 +15,7 @@ from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
+from rsvib_torch.commands.run_stack import run
 from rsvib_torch.commands.terminal import (
     Answer,
     error_line,
@@ -25,134 +26,98 @@ from rsvib_torch.commands.terminal import (
 from rsvib_torch.commands.unexpected_errors import in_one_line, system_error
 from rsvib_torch.core.validation import MistakesError
 
-# Commands in the order of the help: name, function, line in the list of commands, and two examples.
-_COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
-    (
-        "init",
+# Commands in the order of the help, with examples.
+_COMMANDS: dict[str, tuple[Callable[..., Answer], str]] = {
+    "init": (
         init,
-        "Write a configuration file for the camera of a stack.",
         """
-        rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
-        rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
-        """,
+  rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
+  rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500""",
     ),
-    (
-        "cameras",
+    "cameras": (
         cameras,
-        "List camera models with known row times.",
         """
-        rsvib cameras iphone 12
-        rsvib cameras gopro --json
-        """,
+  rsvib cameras iphone 12
+  rsvib cameras gopro --json""",
     ),
-    (
-        "run",
-        stack_commands.run,
-        "Detect the vibration, restore the frames, judge the result.",
+    "run": (
+        run,
         """
-        rsvib run frames.tif results --config camera.toml
-        rsvib run long.tif results --config camera.toml --memory 2GB --resume
-        """,
+  rsvib run frames.tif results --config camera.toml
+  rsvib run long.tif results --config camera.toml --memory 2GB --resume""",
     ),
-    (
-        "detect",
+    "detect": (
         stack_commands.detect,
-        "Detect the vibration in a stack of frames.",
         """
-        rsvib detect frames.tif --config camera.toml --out found
-        rsvib detect frames.tif --config camera.toml --out found --overwrite --json
-        """,
+  rsvib detect frames.tif --config camera.toml --out found
+  rsvib detect frames.tif --config camera.toml --out found --overwrite --json""",
     ),
-    (
-        "restore",
+    "restore": (
         stack_commands.restore_frames,
-        "Restore a stack of frames with a detected vibration.",
         """
-        rsvib restore frames.tif restored.tif --config camera.toml \\
-              --vibration found/vibration.json
-        rsvib restore frames.tif still.tif --config camera.toml \\
-              --vibration found/vibration.json --joint all
-        """,
+  rsvib restore frames.tif restored.tif --config camera.toml \\
+        --vibration found/vibration.json
+  rsvib restore frames.tif still.tif --config camera.toml \\
+        --vibration found/vibration.json --joint all""",
     ),
-    (
-        "report",
+    "report": (
         stack_commands.report,
-        "Detect, restore, and write an HTML page with all figures.",
         """
-        rsvib report frames.tif report --config camera.toml
-        rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
-        """,
+  rsvib report frames.tif report --config camera.toml
+  rsvib report chart.tif report --config camera.toml --edge 200,340,60,40""",
     ),
-    (
-        "motion",
+    "motion": (
         motion_commands.motion,
-        "Detect motion that is not a steady vibration.",
         """
-        rsvib motion frames.tif --config camera.toml --out motion.csv
-        rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
-        """,
+  rsvib motion frames.tif --config camera.toml --out motion.csv
+  rsvib motion frames.tif --config camera.toml --out swept.csv --model swept""",
     ),
-    (
-        "known",
+    "known": (
         motion_commands.known,
-        "Restore frames with the recording of a gyroscope.",
         """
-        rsvib known frames.tif restored.tif --config camera.toml \\
-              --motion gyroscope.csv --unit rad/s --focal-length 1800
-        rsvib known frames.tif restored.tif --config camera.toml \\
-              --motion motion.csv --unit px --offset 0
-        """,
+  rsvib known frames.tif restored.tif --config camera.toml \\
+        --motion gyroscope.csv --unit rad/s --focal-length 1800
+  rsvib known frames.tif restored.tif --config camera.toml \\
+        --motion motion.csv --unit px --offset 0""",
     ),
-    (
-        "calibrate",
+    "calibrate": (
         motion_commands.calibrate,
-        "Measure row time and exposure with a flickering light.",
         """
-        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
-              --out camera.toml
-        rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
-        """,
+  rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
+        --out camera.toml
+  rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025""",
     ),
-    (
-        "live",
+    "live": (
         live_session,
-        "Follow the vibration of a running camera, and restore its frames.",
         """
-        rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
-        rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
-              --steady 1
-        """,
+  rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
+  rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
+        --steady 1""",
     ),
-    (
-        "export",
+    "export": (
         export,
-        "Write a detected vibration for other programs.",
         """
-        rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
-              --focal-length 1800
-        rsvib export found/vibration.json frame.json --isd camera.json
-        """,
+  rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
+        --focal-length 1800
+  rsvib export found/vibration.json frame.json --isd camera.json""",
     ),
-    (
-        "simulate",
+    "simulate": (
         stack_commands.simulate,
-        "Simulate frames of a vibrating camera.",
         """
-        rsvib simulate scene.png frames.tif --config camera.toml
-        rsvib simulate scene.png frames.npy --config camera.toml --seed 2
-        """,
+  rsvib simulate scene.png frames.tif --config camera.toml
+  rsvib simulate scene.png frames.npy --config camera.toml --seed 2""",
     ),
-)
+}
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 
 
 # plain help texts: rich would read [sensor] as markup and join the lines of the examples
 app = typer.Typer(name="rsvib", rich_markup_mode=None, context_settings=_SETTINGS, pretty_exceptions_enable=False)
-for _name, _function, _help, _examples in _COMMANDS:
+for _name, (_function, _examples) in _COMMANDS.items():
     app.command(
         _name,
-        short_help=_help,
-        epilog="\b\nExamples:" + _examples.replace("\n        ", "\n  ").rstrip(),  # \b keeps the lines
+        short_help=(_function.__doc__ or "").partition("\n")[0],
+        epilog=f"\b\nExamples:{_examples}",  # \b keeps the lines
         context_settings=_SETTINGS,
     )(flat_command(_name, _function))
 

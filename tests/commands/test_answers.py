@@ -13,7 +13,6 @@ import subprocess
 import sys
 import termios
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -25,7 +24,6 @@ from truth import draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch.commands import main
-from rsvib_torch.commands.answers import step_parts, step_with_force
 from rsvib_torch.commands.terminal import working
 from rsvib_torch.core.progress import listening, steps
 
@@ -411,23 +409,3 @@ def test_answers_fit_the_terminal(place, config, tmp_path, columns):
     assert max(map(len, lines)) <= min(columns, 100)
     assert max(map(len, lines)) > 0.8 * min(columns, 100)
     assert all(line.startswith("  ") for line in lines[1:])
-
-
-@pytest.mark.parametrize(
-    ("restored", "moves", "steps"),
-    [
-        (True, True, []),
-        (False, False, []),  # nothing to look at
-        (
-            False,
-            True,
-            [("Inspect the restored frames nevertheless:", "rsvib report a.tif 'o ut' --row-time 1 --force")],
-        ),
-    ],
-)
-def test_step_to_frames_that_were_not_kept(restored, moves, steps):
-    result = SimpleNamespace(restored=restored, moves=moves)
-    settings = SimpleNamespace(arguments=("--row-time", "1"))
-    found = step_with_force("report", result, Path("a.tif"), Path("o ut"), settings)
-    assert [step_parts(step) for step in found] == steps
-    assert step_parts("follow the remedies") == ("Follow the remedies.", "")
