@@ -115,7 +115,8 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
             if place == parameter.name:
                 values[place] = value
             else:
-                values.setdefault(place, {}).update({} if value in (None, False) else {parameter.name: value})
+                is_given = value is not None and value is not False
+                values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         with output_of(as_json=given["as_json"], quiet=given["quiet"]):
             show_answer(name, command(group(**values)))
 

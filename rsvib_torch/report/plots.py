@@ -128,6 +128,19 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
+def _plot_axes(panel: Axes, x: Any, values: Tensor, std: Tensor | None = None, *, legend: bool = True) -> None:
+    """Draw values (N, 2) of x and y in their colours, with bands of two standard deviations."""
+    for values_of, std_of, (name, colour) in zip(
+        values.detach().cpu().T, [None] * 2 if std is None else std.cpu().T, _AXIS_COLOURS.items(), strict=True
+    ):
+        panel.plot(x, values_of, color=colour, linewidth=1.3, label=name)
+        if std_of is not None:
+            low, high = values_of - 2 * std_of, values_of + 2 * std_of
+            panel.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
+    if legend:
+        panel.legend(fontsize=9, frameon=False, ncols=2)
+
+
 def _symbol(label: str, **style: Any) -> Line2D:
     """An entry of a legend: a point, or a line if its style is given."""
     return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
@@ -186,8 +199,14 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
-    """Add the legend and the colour bar."""
+def _offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Any]:
+    """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
+    _check_one(result)
+    sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
+    figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
+    points: Any = None
+    for column, axis in enumerate(axes):
+        points = _draw_offsets(panels[0, column], panels[1, column], result, axis)
     symbols = [
         _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
         _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
@@ -197,6 +216,7 @@ def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
+    return figure, panels
 
 
 @checks_arguments
@@ -219,14 +239,9 @@ def offset_figure(result: DetectionResult) -> Figure:
         >>> [panel.get_ylabel() for panel in rsv.offset_figure(detection).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
-    _check_one(result)
     axes = result.vibration.num_axes
-    all_shown = len(result.offsets.pairs) <= _MOST_PAIRS
-    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=all_shown or "row", height_ratios=(3, 1))
-    points: Any = None
-    for axis, name in enumerate(AXIS_NAMES[:axes]):
-        upper, lower = panels[0, axis], panels[1, axis]
-        points = _draw_offsets(upper, lower, result, axis)
+    figure, panels = _offset_panels(result, range(axes), 6.5 * axes, 6.4)
+    for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
         heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
         upper.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
         text = ",  ".join(tones_text(result, axis))
@@ -235,7 +250,6 @@ def offset_figure(result: DetectionResult) -> Figure:
         text = "\n".join(textwrap.wrap(text, 76, max_lines=2, placeholder=" …"))
         note = upper.annotate(text, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
         note.set_in_layout(False)  # a long text would reduce the size of the panels
-    _finish_offsets(figure, panels, points)
     return figure
 
 
@@ -256,17 +270,11 @@ def windows_figure(
         time_label: Label of the horizontal axis.
 
     Example:
-        >>> import tempfile
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> folder = tempfile.mkdtemp()
-        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
-        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
-        >>> manifest = rsv.read_manifest(report.manifest)
-        >>> starts = [window.start_time for window in manifest.windows]
-        >>> figure = rsv.windows_figure(starts, manifest.detections())
+        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> figure = rsv.windows_figure([0.0, 2 * timing.frame_period], parts)
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
@@ -339,33 +347,21 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     displacement = motion.displacement(times).detach().cpu()
     further = motion.num_axes - 2
     figure, panels = _panels(8, 3.6 + 2.0 * further, 1 + further, sharex=True)
-    _draw_displacement(panels[0, 0], times.cpu(), displacement)
+    _plot_axes(panels[0, 0], 1e3 * times.cpu(), displacement[:, :2])
+    plain_axes(panels[0, 0], "time (ms)", "displacement (px)")
     for axis, panel in enumerate(panels[1:, 0], start=2):
         panel.plot(1e3 * times.cpu(), displacement[:, axis], color=_INK, linewidth=1.3)
         plain_axes(panel, "time (ms)", f"{AXIS_NAMES[axis]} ({AXIS_UNITS[axis]})")
     return figure
 
 
-def _draw_displacement(panel: Axes, times: Tensor, displacement: Tensor, std: Tensor | None = None) -> None:
-    """Draw displacements (N, 2) in px at times (N,) in seconds, with a band of two standard deviations."""
-    for axis, name in enumerate("xy"):
-        values = displacement[:, axis]
-        panel.plot(1e3 * times, values, color=_AXIS_COLOURS[name], linewidth=1.3, label=name)
-        if std is not None:
-            low, high = values - 2 * std[:, axis], values + 2 * std[:, axis]
-            panel.fill_between(1e3 * times, low, high, color=_AXIS_COLOURS[name], alpha=0.2, linewidth=0)
-    panel.legend(fontsize=9, frameon=False, ncols=2)
-    plain_axes(panel, "time (ms)", "displacement (px)")
-
-
 def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
     """State above a figure which axes are not reliable, with the first reason."""
-    refused = [
-        f"{name}: not reliable: {reasons[0]}"
+    lines = [
+        textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
         for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
         if not bool(good)
     ]
-    lines = [line for text in refused for line in textwrap.wrap(text, 100, max_lines=1, placeholder=" …")]
     panel.set_title("\n".join(lines), loc="left", fontsize=9.5, color=_INK)
 
 
@@ -378,10 +374,9 @@ def _swept_figure(result: SweptTone) -> Figure:
 def free_motion_figure(result: MotionDetection) -> Figure:
     """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
     figure, ((panel,),) = _panels(8, 3.6)
-    for frame in range(len(result.times)):
-        parts = (values[frame].cpu() for values in (result.times, result.displacement, result.std))
-        _draw_displacement(panel, *parts)
-    panel.legend(panel.lines[:2], "xy", fontsize=9, frameon=False, ncols=2)
+    for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
+        _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
+    plain_axes(panel, "time (ms)", "displacement (px)")
     _title_refusal(panel, result)
     return figure
 
@@ -411,11 +406,7 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
 
 def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     """Draw the offset curve of one axis of a detection (not a batch) with its fit and residuals."""
-    _check_one(result)
-    all_shown = len(result.offsets.pairs) <= _MOST_PAIRS
-    figure, panels = _panels(5.6, 4.4, 2, sharex=all_shown, height_ratios=(3, 1))
-    _finish_offsets(figure, panels, _draw_offsets(panels[0, 0], panels[1, 0], result, axis))
-    return figure
+    return _offset_panels(result, [axis], 5.6, 4.4)[0]
 
 
 @checks_arguments
@@ -500,10 +491,8 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     figure, panels = _panels(5.6, 4.6, 2, sharex=True)
     curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
     for panel, values, label in zip(panels[:, 0], curves, ("displacement (px)", "motion blur (px)"), strict=True):
-        for axis, name in enumerate("xy"):
-            panel.plot(np.arange(num_rows), values[:, axis].numpy(), color=_AXIS_COLOURS[name], lw=1.3, label=name)
+        _plot_axes(panel, np.arange(num_rows), values, legend=panel is panels[0, 0])
         plain_axes(panel, "row (in readout order)" if panel is panels[1, 0] else "", label)
-    panels[0, 0].legend(fontsize=9, frameon=False, ncols=2)
     panels[1, 0].set_ylim(bottom=0)
     return figure
 
