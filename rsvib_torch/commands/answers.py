@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.core.text import number_of, printable, wrapped
 
@@ -50,7 +51,7 @@ def stack_answer(
         answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [found.physical_summary(pixel_size)]
     if restored is not None:
         answer.results["Restoration"] = restoration_lines(restored, count)
-        answer.data["restoration"] = restoration_data(restored)
+        answer.data["restoration"] = reports.restoration_data(restored)
     return answer
 
 
@@ -97,21 +98,6 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
         for reason in result.left_alone
     ]
     return [wrapped(line) for line in lines]
-
-
-def restoration_data(result: RestoredFrames) -> dict[str, Any]:
-    """The same as ``restoration_lines`` for JSON."""
-    from rsvib_torch.core.presentation import plain_values  # noqa: PLC0415
-
-    verdict = result.verdict
-    return {
-        "frames": "restored" if result.restored else "as taken",
-        "axes": result.restored_axes(),
-        "left_alone": plain_values(result.left_alone),
-        "outcome": verdict and verdict.overall,
-        "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-        "summary": verdict and verdict.sentence,
-    }
 
 
 def next_step(sentence: str, command: str) -> str:

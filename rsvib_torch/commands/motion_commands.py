@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
-from rsvib_torch.commands.answers import command_text, next_step, restoration_data, restoration_lines
+from rsvib_torch import report as reports
+from rsvib_torch.commands.answers import command_text, next_step, restoration_lines
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.shared_options import (
@@ -202,7 +203,7 @@ def known(given: KnownOptions) -> Answer:
         data["check"] = _without_curve(check)
     result = restore_and_save(given.restored, stack, placed, options, given.force)
     results["Restoration"] = restoration_lines(result, len(stack.frames))
-    data["restoration"] = restoration_data(result)
+    data["restoration"] = reports.restoration_data(result)
     return Answer(results, data, [given.restored])
 
 

@@ -15,7 +15,6 @@ from rsvib_torch.commands.answers import (
     command_text,
     next_step,
     page_step,
-    restoration_data,
     restoration_lines,
     stack_answer,
     step_parts,
@@ -291,7 +290,7 @@ def restore_frames(given: RestoreOptions) -> Answer:
     result = restore_and_save(restored, stack, detected, options, given.force, report)
     return Answer(
         {"Vibration": [detected.summary()], "Restoration": restoration_lines(result, len(stack.frames))},
-        {"detection": detected.to_dict(), "restoration": restoration_data(result)},
+        {"detection": detected.to_dict(), "restoration": reports.restoration_data(result)},
         [restored, *([] if report is None else [report])],
         [page_step(frames, frames.with_name("report"), settings)] * result.restored,
     )

@@ -5,7 +5,7 @@ import math
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,16 +14,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.figures import FIGURES
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, Result
 from rsvib_torch.core.text import measured_text
+from rsvib_torch.core.validation import Count
 from rsvib_torch.detection import (
     ClockAlignment,
     DetectionResult,
@@ -45,6 +46,7 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 
+_Resolution = Annotated[int, Field(ge=1, le=10_000)]
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
 _AXIS_COLOURS = {"x": "#14487a", "y": "#c8102e"}
 _FIT_COLOUR = _AXIS_COLOURS["y"]
@@ -80,7 +82,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 
 
 @checks_arguments
-def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
+def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: _Resolution = 150) -> None:
     """Write a figure as an image file, atomically.
 
     Args:
@@ -100,7 +102,6 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         >>> path.exists()
         True
     """
-    check_whole_number("dpi", dpi, at_least=1, at_most=10_000)
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
@@ -471,7 +472,7 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
 
 
 @checks_arguments
-def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
+def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw mean displacement and motion blur of every row of frame 0.
 
     Args:
@@ -498,7 +499,7 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
 
 
 @checks_arguments
-def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
+def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
 
     Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
@@ -517,7 +518,6 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
         24
     """
     _check_one(vibration)
-    check_whole_number("num_rows", num_rows, at_least=1)
     vibration = vibration.detached()
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()
@@ -608,7 +608,12 @@ def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[
 
 @checks_arguments
 def comparison_figure(
-    raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("input", "restored")
+    raw: Tensor,
+    restored: Tensor,
+    *,
+    count: Count = 3,
+    size: Count = 160,
+    names: tuple[str, str] = ("input", "restored"),
 ) -> Figure:
     """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
@@ -626,8 +631,6 @@ def comparison_figure(
     """
     raw, restored = (frame[None] if frame.ndim == 2 else frame for frame in (raw, restored))
     check_shapes({"raw": raw, "restored": restored}, {"raw": "C H W", "restored": "C H W"})
-    check_whole_number("count", count, at_least=1)
-    check_whole_number("size", size, at_least=1)
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border

@@ -193,18 +193,28 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
         >>> import tempfile
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
-        >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> folder = tempfile.mkdtemp()
-        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
-        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
-        >>> rsv.write_table(f"{folder}/tones.csv", rsv.read_manifest(report.manifest))
-        >>> with open(f"{folder}/tones.csv") as file:
-        ...     print(len(file.readlines()))  # two windows with a tone along x and y each, below the header
-        5
+        >>> frames, timing, _ = example_frames()
+        >>> path = tempfile.mkdtemp() + "/tones.csv"
+        >>> rsv.write_table(path, rsv.detect_vibration(frames, timing, tones=1))
+        >>> with open(path) as file:
+        ...     print(len(file.readlines()))  # a tone along x and y each, below the header
+        3
     """
     columns = result.table(pixel_size=pixel_size)
     _write_csv(path, columns, zip(*columns.values(), strict=True))
+
+
+def restoration_data(result: RestoredFrames) -> dict[str, Any]:
+    """What was restored, and whether that helped, as values that JSON can store."""
+    verdict = result.verdict
+    return {
+        "frames": "restored" if result.restored else "as taken",
+        "axes": result.restored_axes(),
+        "left_alone": plain_values(result.left_alone),
+        "outcome": None if verdict is None else verdict.overall,
+        "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+        "summary": None if verdict is None else verdict.sentence,
+    }
 
 
 def write_restoration(
@@ -222,16 +232,8 @@ def write_restoration(
         OSError: If the file cannot be written.
     """
     verdict = result.verdict
-    content: dict[str, Any] = {
-        "format": "rsvib restoration",
-        "version": 1,
-        "frames": "restored" if result.restored else "as taken",
-        "options": options,
-        "left_alone": plain_values(result.left_alone),
-        "outcome": None if verdict is None else verdict.overall,
-        "summary": None if verdict is None else verdict.sentence,
-        "not_kept": list(not_kept),
-    }
+    content: dict[str, Any] = {"format": "rsvib restoration", "version": 1, "options": options}
+    content |= {**restoration_data(result), "not_kept": list(not_kept)}
     if verdict is not None:
         pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
         content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "findings": plain_values(verdict.findings)}

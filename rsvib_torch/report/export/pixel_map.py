@@ -13,19 +13,19 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.validation import Count
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import StmapConvention
-from rsvib_torch.report.export.exported import check_exportable, num_rows_of
+from rsvib_torch.report.export.exported import Size, num_rows_of
 from rsvib_torch.restoration.frame_motion import frame_motion
 
 
 @checks_arguments
-def sampling_map(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int) -> Tensor:
+def sampling_map(motion: Motion, timing: SensorTiming, size: Size, num_frames: Count) -> Tensor:
     """Position in the recorded frame that shows each pixel of the restored frame.
 
     The pixel at s of the restored frame shows the scene at ``s - shift``, which the recorded frame shows at
@@ -55,14 +55,12 @@ def sampling_map(motion: Motion, timing: SensorTiming, size: tuple[int, int], nu
         >>> round(x, 2), y
         (32.0, 25.0)
     """
-    check_whole_number("num_frames", num_frames, at_least=1)
     return torch.stack(list(_maps(motion, timing, size, num_frames)))
 
 
 def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int) -> Iterator[Tensor]:
     """Positions (H, W, 2) for each frame."""
-    check_exportable(motion)
-    rows = num_rows_of(timing, size)
+    rows = num_rows_of(motion, timing, size)
     columns = size[0] * size[1] // rows
     row_timing = timing.in_row_order()
     bounding: Motion = motion.to_row_order(timing).detached().expanded(1)
@@ -91,8 +89,8 @@ def write_stmap(
     folder: str | os.PathLike[str],
     motion: Motion,
     timing: SensorTiming,
-    size: tuple[int, int],
-    num_frames: int,
+    size: Size,
+    num_frames: Count,
     *,
     convention: StmapConvention = "nuke",
 ) -> list[Path]:
@@ -137,7 +135,6 @@ def write_stmap(
         >>> round(float(cv2.remap(frame, map_x, map_y, cv2.INTER_LINEAR)[25, 30]), 2)  # a quarter of a period: X = 2 px
         32.0
     """
-    check_whole_number("num_frames", num_frames, at_least=1)
     digits = max(4, math.ceil(math.log10(num_frames + 1)))
     names = []
     with whole_folder(folder) as part:
