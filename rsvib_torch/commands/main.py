@@ -23,7 +23,6 @@ from rsvib_torch.commands.terminal import (
     running,
     warnings_in_one_line,
 )
-from rsvib_torch.commands.unexpected_errors import in_one_line, system_error
 from rsvib_torch.core.validation import MistakesError
 
 # Commands in the order of the help, with examples.
@@ -121,6 +120,16 @@ for _name, (_function, _examples) in _COMMANDS.items():
         context_settings=_SETTINGS,
     )(flat_command(_name, _function))
 
+_NO_MEMORY = "not enough memory for a stack of this size: process fewer frames at a time"
+# Lines that replace errors without a message for users, by a part of their type and text.
+_REPLACED = {
+    "RecursionError": "the input is nested too deeply",
+    "can't start new thread": "the system cannot start another thread: use fewer workers, or raise the limit of "
+    "processes (ulimit -u)",
+    "MemoryError": _NO_MEMORY,
+    "allocate": _NO_MEMORY,
+    "out of memory": _NO_MEMORY,
+}
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 
 
@@ -178,8 +187,9 @@ def _lines_of(error: Exception) -> Sequence[str]:
         message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
         several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
         return [f"{message}{several}"]
-    is_known = isinstance(error, RecursionError) or system_error(error) is not None
-    return [in_one_line(error) if is_known else f"{in_one_line(error)} (--debug prints the traceback)"]
+    text = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
+    replaced = [line for part, line in _REPLACED.items() if part in text]
+    return replaced[:1] or [f"unexpected {text} (--debug prints the traceback)"]
 
 
 def main() -> None:

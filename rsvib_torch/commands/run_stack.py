@@ -17,7 +17,7 @@ from rsvib_torch.commands.answers import (
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand
 from rsvib_torch.commands.stack_commands import print_notes
-from rsvib_torch.commands.terminal import Answer, counting, error_line, working
+from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.commands.written_results import (
     OF_DETECTION,
     OF_WINDOWS,
@@ -122,8 +122,8 @@ def _run_windows(
     settings, frames, out = given.settings, given.stack, given.out
     common |= {"window": chosen.window, "detection": settings.detection, "force": given.force}
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
-    description = f"restoring {frames.name}"
-    with working(description) if info.shape[0] <= chosen.window else counting(description) as progress:
+    counts = info.shape[0] > chosen.window
+    with working(f"restoring {frames.name}", counts=counts) as progress:
         result = stacks.process_stack(
             frames,
             restored,
@@ -132,7 +132,7 @@ def _run_windows(
             **given.processing,
             bad_frames=chosen.bad_frames,
             manifest=out / "manifest.json",
-            progress=progress,
+            progress=progress if counts else None,
         )
     first = result.first
     if first is None:  # the run was complete before, or its first window was
@@ -246,7 +246,7 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = out / "manifest.json"
-    with counting(f"restoring {frames.name}") as progress:
+    with working(f"restoring {frames.name}", counts=True) as progress:
         result = stacks.process_video(
             frames,
             restored,

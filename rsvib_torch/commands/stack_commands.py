@@ -34,7 +34,7 @@ from rsvib_torch.commands.shared_options import (
     restored_argument,
     restored_shape,
 )
-from rsvib_torch.commands.terminal import Answer, counting, note, running_command, working
+from rsvib_torch.commands.terminal import Answer, note, running_command, working
 from rsvib_torch.commands.written_results import (
     OF_DETECTION,
     OF_WINDOWS,
@@ -233,7 +233,7 @@ def detect(given: DetectOptions) -> Answer:
         info = io.read_stack_info(frames)
         print_notes(info, settings)
         with whole_folder(out) as folder:
-            with counting(f"detecting in {frames.name}") as progress:
+            with working(f"detecting in {frames.name}", counts=True) as progress:
                 stacks.detect_stack(
                     frames,
                     folder / "manifest.json",
@@ -318,7 +318,7 @@ def _restore_windows(given: RestoreOptions) -> Answer:
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
     info, scale, options = given.planned_restoration(given.restoration)
     print_notes(info, given.settings)
-    with counting(f"restoring {given.stack.name}") as progress:
+    with working(f"restoring {given.stack.name}", counts=True) as progress:
         result = stacks.process_stack(
             given.stack,
             given.restored,

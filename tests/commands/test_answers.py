@@ -316,7 +316,7 @@ def in_terminal(arguments, columns):
 
 LOOPS = """
 import time
-from rsvib_torch.commands.terminal import counting, output_of, working
+from rsvib_torch.commands.terminal import output_of, working
 from rsvib_torch.core.progress import listening, steps
 
 with working("restoring"):
@@ -325,7 +325,7 @@ with working("restoring"):
         time.sleep(0.15)
         advance()
     time.sleep(0.3)
-with counting("restoring frames.tif") as progress:
+with working("restoring frames.tif", counts=True) as progress:
     progress(10, 100)  # frames of the interrupted run
     time.sleep(0.3)
     progress(20, 100)

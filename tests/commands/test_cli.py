@@ -467,7 +467,7 @@ def test_usage_errors(capsys, tmp_path):
             "expected a number such as 29.97 or 30000/1001",
         ),
         (["paint"], "No such command 'paint'"),
-        (["run", "a.png", "b.png", "out"], "extra argument (out); give a sequence of files as their folder"),
+        (["run", "a.png", "b.png", "out"], "(out); give a sequence of files as their folder"),
         (["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--device", "tpu"], "'tpu' is not one of"),
         (
             ["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--full-scale", "x"],
