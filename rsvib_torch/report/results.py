@@ -1,13 +1,13 @@
 """Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and tables."""
 
 import csv
-import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
@@ -44,10 +44,7 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
         [111.0, 90.0]
     """
-    if result.batch_shape:
-        raise ValueError(
-            f"result is a batch of shape {tuple(result.batch_shape)}; write one: write_vibration(path, result[0])"
-        )
+    _check_one(result)
     timing = timing or result.timing
     if timing is None:
         raise ValueError("timing unknown: pass timing=SensorTiming(...) of the frames")
@@ -105,12 +102,15 @@ def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -
 
 
 def _equal(first: Any, second: Any) -> bool:
-    """Whether two values of a timing are equal up to rounding."""
-    if isinstance(first, list) and isinstance(second, list):
-        return len(first) == len(second) and all(map(_equal, first, second))
-    if isinstance(first, float) and isinstance(second, float):
-        return math.isclose(first, second, rel_tol=1e-9)
-    return bool(first == second)
+    """Whether two values of a timing are equal, numbers up to rounding."""
+    if np.shape(first) != np.shape(second) or {str, type(None)} & {type(first), type(second)}:
+        return bool(first == second)
+    return np.allclose(first, second, rtol=1e-9, atol=0.0)
+
+
+def _check_one(result: DetectionResult) -> None:
+    if result.batch_shape:
+        raise ValueError(f"result is a batch of shape {tuple(result.batch_shape)}; write one: result[0]")
 
 
 @checks_arguments
@@ -144,10 +144,7 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         >>> columns[6:]
         ['fitted_x_px', 'fitted_y_px', 'residual_x_px', 'residual_y_px', 'quality']
     """
-    if result.batch_shape:
-        raise ValueError(
-            f"result is a batch of shape {tuple(result.batch_shape)}; write one: write_offsets(path, result[0])"
-        )
+    _check_one(result)
     curve = result.offsets
     count = curve.times.shape[-1]
     columns = {

@@ -163,7 +163,7 @@ def test_failed_write_leaves_no_files(tmp_path):
 def test_images_are_bounded_and_have_a_common_grey_scale(shape):
     ramp = torch.linspace(0, 1, shape[-1]).expand(shape)
     pair = before_after(0.5 * ramp, ramp, names=("a", "b"), caption="", longest=600, exact=True)
-    first, second = decoded(pair.before).astype(float), decoded(pair.after).astype(float)
+    first, second = decoded(pair.images[0]).astype(float), decoded(pair.images[-1]).astype(float)
     assert max(first.shape[:2]) <= 600
     assert (pair.height, pair.width) == first.shape[:2] == second.shape[:2]
     assert (first.ndim == 3) == (shape[0] == 3)
@@ -174,7 +174,7 @@ def test_images_are_bounded_and_have_a_common_grey_scale(shape):
 def test_colours_are_in_order_and_missing_pixels_black():
     frame = torch.zeros(3, 40, 40)
     frame[0, :20], frame[2, 20:], frame[:, 30] = 1.0, 1.0, torch.nan
-    shown = decoded(before_after(frame, frame, names=("a", "b"), caption="", exact=True).after)
+    shown = decoded(before_after(frame, frame, names=("a", "b"), caption="", exact=True).images[-1])
     np.testing.assert_array_equal(shown[[5, 35, 30], 5], [[0, 0, 255], [255, 0, 0], [0, 0, 0]])  # blue, green, red
 
 
