@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -25,98 +26,64 @@ from rsvib_torch.commands.terminal import (
 )
 from rsvib_torch.core.validation import MistakesError
 
-# Commands in the order of the help, with examples.
-_COMMANDS: dict[str, tuple[Callable[..., Answer], str]] = {
-    "init": (
-        init,
-        """
+_COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
+    "init": init,
+    "cameras": cameras,
+    "run": run,
+    "detect": stack_commands.detect,
+    "restore": stack_commands.restore_frames,
+    "report": stack_commands.report,
+    "motion": motion_commands.motion,
+    "known": motion_commands.known,
+    "calibrate": motion_commands.calibrate,
+    "live": live_session,
+    "export": export,
+    "simulate": stack_commands.simulate,
+}
+_EXAMPLES = """
   rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
-  rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500""",
-    ),
-    "cameras": (
-        cameras,
-        """
+  rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
   rsvib cameras iphone 12
-  rsvib cameras gopro --json""",
-    ),
-    "run": (
-        run,
-        """
+  rsvib cameras gopro --json
   rsvib run frames.tif results --config camera.toml
-  rsvib run long.tif results --config camera.toml --memory 2GB --resume""",
-    ),
-    "detect": (
-        stack_commands.detect,
-        """
+  rsvib run long.tif results --config camera.toml --memory 2GB --resume
   rsvib detect frames.tif --config camera.toml --out found
-  rsvib detect frames.tif --config camera.toml --out found --overwrite --json""",
-    ),
-    "restore": (
-        stack_commands.restore_frames,
-        """
+  rsvib detect frames.tif --config camera.toml --out found --overwrite --json
   rsvib restore frames.tif restored.tif --config camera.toml \\
         --vibration found/vibration.json
   rsvib restore frames.tif still.tif --config camera.toml \\
-        --vibration found/vibration.json --joint all""",
-    ),
-    "report": (
-        stack_commands.report,
-        """
+        --vibration found/vibration.json --joint all
   rsvib report frames.tif report --config camera.toml
-  rsvib report chart.tif report --config camera.toml --edge 200,340,60,40""",
-    ),
-    "motion": (
-        motion_commands.motion,
-        """
+  rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
   rsvib motion frames.tif --config camera.toml --out motion.csv
-  rsvib motion frames.tif --config camera.toml --out swept.csv --model swept""",
-    ),
-    "known": (
-        motion_commands.known,
-        """
+  rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
   rsvib known frames.tif restored.tif --config camera.toml \\
         --motion gyroscope.csv --unit rad/s --focal-length 1800
   rsvib known frames.tif restored.tif --config camera.toml \\
-        --motion motion.csv --unit px --offset 0""",
-    ),
-    "calibrate": (
-        motion_commands.calibrate,
-        """
+        --motion motion.csv --unit px --offset 0
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
-  rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025""",
-    ),
-    "live": (
-        live_session,
-        """
+  rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
   rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
   rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
-        --steady 1""",
-    ),
-    "export": (
-        export,
-        """
+        --steady 1
   rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
         --focal-length 1800
-  rsvib export found/vibration.json frame.json --isd camera.json""",
-    ),
-    "simulate": (
-        stack_commands.simulate,
-        """
+  rsvib export found/vibration.json frame.json --isd camera.json
   rsvib simulate scene.png frames.tif --config camera.toml
-  rsvib simulate scene.png frames.npy --config camera.toml --seed 2""",
-    ),
-}
+  rsvib simulate scene.png frames.npy --config camera.toml --seed 2
+"""
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 
 
 # plain help texts: rich would read [sensor] as markup and join the lines of the examples
 app = typer.Typer(name="rsvib", rich_markup_mode=None, context_settings=_SETTINGS, pretty_exceptions_enable=False)
-for _name, (_function, _examples) in _COMMANDS.items():
+for _name, _function in _COMMANDS.items():
+    _examples = re.findall(rf"^  rsvib {_name} .*(?:\n    .*)*", _EXAMPLES, flags=re.MULTILINE)
     app.command(
         _name,
         short_help=(_function.__doc__ or "").partition("\n")[0],
-        epilog=f"\b\nExamples:{_examples}",  # \b keeps the lines
+        epilog="\n".join(["\b\nExamples:", *_examples]),  # \b keeps the lines
         context_settings=_SETTINGS,
     )(flat_command(_name, _function))
 
