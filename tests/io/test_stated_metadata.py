@@ -174,7 +174,8 @@ def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, capsy
     np.testing.assert_allclose(read_stack(tmp_path / "frames") * 255, frames, atol=9)
     (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
     config = ("--config", tmp_path / "camera.toml")
-    for output in ("images", "restored.tif", "restored.h5", "restored.zarr", "restored.raw", "restored.mp4"):
+    outputs = {"jpg": ("images", "restored.mp4"), "png": ("restored.h5", "restored.zarr", "restored.raw")}
+    for output in outputs.get(ending, ("images", "restored.tif")):
         name = tmp_path / "out" / output
         assert rsvib("run", tmp_path / "frames", tmp_path / "out", *config, "--output", output, "--overwrite") == 0
         assert "displayed rotated by 90 degrees clockwise" in capsys.readouterr().out
@@ -182,8 +183,9 @@ def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, capsy
         restored = read_stack(name)
         restored = restored.mean(1) if restored.ndim == 4 else restored
         assert min(decibel(frame, STILL, 12) for frame in restored.numpy()) > 34
-    with Image.open(tmp_path / "out" / "images" / "frame_0000.png") as image:
-        assert image.getexif()[ExifTags.Base.Orientation] == 6
+    if ending == "jpg":
+        with Image.open(tmp_path / "out" / "images" / "frame_0000.png") as image:
+            assert image.getexif()[ExifTags.Base.Orientation] == 6
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png"])
