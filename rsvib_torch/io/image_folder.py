@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.jpeg import decode_jpeg, jpeg_info
-from rsvib_torch.io.png import decode_png, encode_png, png_info
+from rsvib_torch.io.images import decode_image, encode_png, image_info
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
@@ -62,10 +62,8 @@ def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
 
 
 def _read_info(file: Path) -> StackInfo:
-    if file.suffix.lower() in _PNG:
-        return png_info(file)
-    if file.suffix.lower() in _JPEG:
-        return jpeg_info(file)
+    if file.suffix.lower() not in _TIFF:
+        return image_info(file)
     reader = open_tiff(file)
     reader.close()
     if reader.info.shape[0] != 1:
@@ -74,15 +72,10 @@ def _read_info(file: Path) -> StackInfo:
 
 
 def _read_frame(file: Path) -> NDArray[Any]:
-    if file.suffix.lower() in _PNG:
-        return decode_png(file)
-    if file.suffix.lower() in _JPEG:
-        return decode_jpeg(file)
-    reader = open_tiff(file)
-    try:
+    if file.suffix.lower() not in _TIFF:
+        return decode_image(file)
+    with closing(open_tiff(file)) as reader:
         return reader.frame(0)
-    finally:
-        reader.close()
 
 
 def _without_position(info: StackInfo) -> StackInfo:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from rsvib_torch.core.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import info_from_attributes
-from rsvib_torch.io.contiguous import ContiguousReader
+from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 
@@ -36,7 +36,7 @@ def _sidecar_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def open_raw(path: Path) -> ContiguousReader:
+def open_raw(path: Path) -> BlockReader:
     """Open a file of pixels whose layout its sidecar states."""
     beside = _sidecar_path(path)
     if not beside.exists():
@@ -48,7 +48,7 @@ def open_raw(path: Path) -> ContiguousReader:
     dtype = np.dtype(sidecar.dtype)
     with readable_stack(path, "raw"):
         info = info_from_attributes(attributes, tuple(sidecar.shape), dtype)
-        return ContiguousReader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
+        return contiguous_reader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
 
 
 def write_raw(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:

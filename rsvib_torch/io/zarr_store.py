@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
-from rsvib_torch.io.blocks import ArrayReader
+from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
@@ -72,7 +72,7 @@ def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
         )
 
 
-def open_zarr(path: Path) -> ArrayReader:
+def open_zarr(path: Path) -> BlockReader:
     """Open the array of a folder that has the shape of a stack."""
     zarr = _zarr()
     with readable_stack(path, "Zarr"):
@@ -92,7 +92,7 @@ def open_zarr(path: Path) -> ArrayReader:
         if chunks > _MAX_CHUNKS:
             raise ValueError(f"a frame is divided into {chunks} chunks; expected at most {_MAX_CHUNKS}")
         chunk_bytes = math.prod(array.chunks) * array.dtype.itemsize
-        return ArrayReader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
+        return array_reader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
 
 
 _DIMENSIONS = {"T": "frame", "C": "channel", "H": "y", "W": "x"}

@@ -152,5 +152,5 @@ def test_png_header_larger_than_the_file_is_refused(tmp_path):
     header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 16, 0, 0, 0, 0))
     data = b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", zlib.compress(b"\0" * 99)) + png_chunk(b"IEND", b"")
     (tmp_path / "huge.png").write_bytes(data)
-    with pytest.raises(ValueError, match=r"huge\.png: its header states 2000000 x 2000000 px"):
+    with pytest.raises(ValueError, match=r"huge\.png: .*its header states 2000000 x 2000000 px"):
         read_stack(tmp_path / "huge.png")
