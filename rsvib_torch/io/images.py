@@ -1,6 +1,6 @@
 """Frames in PNG and JPEG files: what they state, and decoding and encoding of pixels.
 
-Pillow reads headers and metadata and verifies PNG files. OpenCV decodes PNG files: Pillow reduces colours of 16 bits to 8.
+Pillow reads headers and metadata and verifies PNG files; OpenCV decodes them: Pillow reduces 16-bit colours to 8 bits.
 """
 
 import io

@@ -1,6 +1,7 @@
 """Stacks in NumPy ``.npy`` files; the file has no room for the full scale."""
 
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ def open_npy(path: Path) -> BlockReader:
     """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with readable_stack(path, ".npy"):
         with path.open("rb") as file:
-            first = np.lib.format.read_magic(file) == (1, 0)
-            read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-            shape, fortran_order, dtype = read(file)
-            offset = file.tell()
+            head = BytesIO(file.read(1 << 14))  # bytes; NumPy accepts headers of up to 10,000
+        first = np.lib.format.read_magic(head) == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read(head)
         check_dtype(dtype)
         if len(shape) == 2:
             shape = (1, *shape)
@@ -29,7 +30,7 @@ def open_npy(path: Path) -> BlockReader:
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
         info = StackInfo(shape, dtype.name, known_full_scale(dtype))
-        reader = contiguous_reader(path, info, offset, dtype)
+        reader = contiguous_reader(path, info, head.tell(), dtype)
         if not fortran_order:
             return reader
         reader.close()
