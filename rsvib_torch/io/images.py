@@ -34,14 +34,14 @@ def image_info(path: Path) -> StackInfo:
         return replace(info, **exif_fields(image.info.get("exif", b"")))
 
 
-def _jpeg_info(image: JpegImageFile) -> StackInfo:
+def _jpeg_info(image: Any) -> StackInfo:
     if image.mode not in ("L", "RGB"):
         raise ValueError(f"pixels are {image.mode}; expected grey or RGB")
     shape = (1, 3, image.height, image.width) if image.mode == "RGB" else (1, image.height, image.width)
     return StackInfo(shape, "uint8", 255.0, channels_last=image.mode == "RGB")
 
 
-def _png_info(path: Path, image: PngImageFile) -> StackInfo:
+def _png_info(path: Path, image: Any) -> StackInfo:
     if image.is_animated:
         raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
     with path.open("rb") as file:
