@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.core.atomic import (
-    check_kind,
-    check_name,
-    check_not_special,
-    check_writable,
-    make_folder,
-    move_into_place,
-    sync_tree,
-    temporary_folder,
-)
+from rsvib_torch.core.atomic import check_target, check_writable, whole
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
@@ -54,9 +45,8 @@ def check_info_target(
         compression: As in ``write_stack``.
         check_folder: Whether to check that the folder exists and is writable.
     """
-    check_name(path)
-    check_not_special(path)
     form = target_format(path)
+    check_target(path, form.kind, parent_exists=False)
     if form.write is None:
         raise ValueError(
             f"{path}: {form.name} files can only be read; write .tif, .png, .npy, .mkv or a folder of PNG files"
@@ -73,8 +63,6 @@ def check_info_target(
         raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
     if check_folder:
         check_writable(path, folder=form.kind != "file")
-    else:
-        check_kind(path, folder=form.kind != "file")
     return form
 
 
@@ -170,12 +158,8 @@ def write_frames(
         compression: As in ``write_stack``.
     """
     assert form.write is not None
-    with temporary_folder(path) as folder:
-        part = folder / path.name
+    with whole(path, form.kind, form.companions) as part:
         form.write(part, info, frames, compression)
-        sync_tree(folder)
-        make_folder(path.parent)
-        move_into_place(part, path, form.kind, form.companions)
 
 
 def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
