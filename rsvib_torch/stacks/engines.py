@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import torch
 
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.stacks.heap import keep_freed_memory, share_one_heap
+from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
 from rsvib_torch.stacks.windows import Window
 
@@ -88,8 +88,7 @@ def compute_here(
 
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
     """Read and compute one window on a Dask worker."""
-    share_one_heap()
-    keep_freed_memory()
+    share_one_heap(keep_freed=True)
     default_threads = torch.get_num_threads()
     if one_thread:
         torch.set_num_threads(1)
