@@ -1,6 +1,5 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
-import time
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -21,7 +20,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
-from rsvib_torch.stacks.manifest import manifest_header, write_manifest
+from rsvib_torch.stacks.manifest import manifest_header, manifest_text
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, check_space, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
@@ -100,7 +99,7 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
             yield record
 
     with whole_file(sink) as part:
-        write_manifest(part, manifest_header(job, None, None), records())
+        part.write_text(manifest_text(manifest_header(job, None, None), records()), encoding="utf-8")
 
 
 @file_options(ProcessStackOptions)
@@ -148,7 +147,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         >>> rsv.read_stack(f"{folder}/restored.npy").shape == frames.shape
         True
     """
-    start, sink = time.perf_counter(), Path(sink)
+    sink = Path(sink)
     scheduler, compression, given = options.scheduler, options.compression, options.given
     job, windows, at_once = plan_job(source, timing, options, here=scheduler in (None, "local"))
     if given is not None and len(given) != len(windows):
@@ -201,7 +200,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         write=write,
         not_kept=lambda count: metadata_not_kept(job.info, sink, (count, *out.shape[1:])),
     )
-    return replace(report, first=first, seconds=time.perf_counter() - start)
+    return replace(report, first=first)
 
 
 def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window]) -> None:
@@ -224,12 +223,13 @@ def _store_windows(
 
     def store(stored: StoredWindow) -> None:
         names = [f"{stored.record['window']:06d}.npy"] if stored.frames else []
-        for name in names:
-            stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
-            with folder.create(name) as file:
-                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
-                file.write(stack.data)  # errors of np.save do not contain the reason
-        folder.add(stored.record, names)
+        with disk_errors_named(folder):
+            for name in names:
+                stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
+                with folder.create(name) as file:
+                    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
+                    file.write(stack.data)  # errors of np.save do not contain the reason
+            folder.add(stored.record, names)
 
     if progress is not None:
         progress(done, total)
@@ -238,8 +238,7 @@ def _store_windows(
         for window, stored in zip(remaining, results, strict=True):
             errors.append(stored.record["error"])
             if previous is not None:
-                with disk_errors_named(folder):
-                    previous.result()
+                previous.result()
             try:
                 _check_not_all_failed(errors, windows)
             except ValueError:
@@ -250,8 +249,7 @@ def _store_windows(
                 done += window.kept
                 progress(done, total)
         if previous is not None:
-            with disk_errors_named(folder):
-                previous.result()
+            previous.result()
 
 
 def _stored_frames(folder: RunFolder) -> Iterator[NDArray[Any]]:

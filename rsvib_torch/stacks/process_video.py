@@ -1,6 +1,5 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -82,7 +81,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Example:
         >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
     """
-    begin, source, sink = time.perf_counter(), Path(source), Path(sink)
+    source, sink = Path(source), Path(sink)
     border = options.border
     video, at_once = _planned(source, timing, options)
     job = video.job
@@ -117,7 +116,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         with whole_file(sink) as part:
             join_parts(part, content, (folder.open(name) for name in folder.files() if not name.endswith(".npy")))
 
-    report = run_to_file(
+    return run_to_file(
         sink,
         target,
         header,
@@ -127,7 +126,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         write=write,
         not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
     )
-    return replace(report, seconds=time.perf_counter() - begin)
 
 
 class _Encoder:
