@@ -110,3 +110,32 @@ def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype[
         return info.from_stored(pixels.reshape(info.stored_shape[1:]))[None]
 
     return BlockReader(path, info, read, close=file.close)
+
+
+def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader:
+    """Reader of frames ``start`` to ``end`` (exclusive; None for the last) of an open stack.
+
+    Raises:
+        ValueError: If the stack does not have these frames.
+    """
+    info, count = reader.info, reader.info.shape[0]
+    last = count if end is None else end
+    if not start < last <= count:
+        reader.close()
+        raise ValueError(
+            f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
+            f"START:END with START < END <= {count}"
+        )
+    numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
+    part = replace(
+        info,
+        shape=(last - start, *info.shape[1:]),
+        frame_times=None if info.frame_times is None else info.frame_times[start:last],
+        frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
+        path=None,  # the sound of a video, and metadata of all frames, are not those of a part
+        metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
+    )
+    path = info.path or Path()
+    return BlockReader(
+        path, part, lambda first, _: reader.frame(start + first)[None], 1, info.decoding_bytes, reader.close
+    )
