@@ -183,7 +183,7 @@ def write_stack(
 ) -> None:
     """Write a stack of frames: floats whose full scale is 1, or integer counts.
 
-    The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``, ``.avi``; without loss) or
+    The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``; without loss) or
     H.264 (``.mp4``, ``.mov``; 8 bits, with loss; also of floats). A path without an ending is a folder of PNG files
     (frame_0000.png ...), or of TIFF files if PNG does not support the data type. Integers are multiplied by the full
     scale, rounded and clipped to 0 ... full scale; all formats except ``.npy`` store the full scale. The file replaces

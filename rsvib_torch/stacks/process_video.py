@@ -60,7 +60,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Args:
         source: A video, or another stack as in ``read_stack``.
-        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv, .avi (FFV1, without loss). Times, sound and metadata
+        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv (FFV1, without loss). Times, sound and metadata
             are those of the source.
         timing: As in ``process_stack``.
         options: Options. A part of the video is a window in the manifest; its detection is that of its middle, with the

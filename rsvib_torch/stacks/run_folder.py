@@ -26,7 +26,7 @@ from rsvib_torch.core.free_memory import size_text
 
 _HEADER = "run.json"
 _NAMES = re.compile(
-    r"run\.json(\.part)?|\d{6,}\.(done|done\.part|npy|mkv|avi|mp4|mov|m4v)"
+    r"run\.json(\.part)?|\d{6,}\.(done|done\.part|npy|mkv|mp4|mov|m4v)"
 )  # of the files that a run makes
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
 

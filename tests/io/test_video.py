@@ -35,17 +35,16 @@ def write_config(tmp_path):
 
 
 @pytest.mark.parametrize(("bits", "layout"), [(8, "gray"), *((bits, f"gray{bits}le") for bits in (10, 12, 14, 16))])
-@pytest.mark.parametrize("ending", [".mkv", ".avi"])
-def test_grey_videos_keep_their_depth(tmp_path, bits, layout, ending):
+def test_grey_videos_keep_their_depth(tmp_path, bits, layout):
     counts = noise(bits)
-    write_video(tmp_path / f"a{ending}", counts, TIMES, layout=layout, unit=Fraction(1, 30))
-    info = read_stack_info(tmp_path / f"a{ending}")
+    write_video(tmp_path / "a.mkv", counts, TIMES, layout=layout, unit=Fraction(1, 30))
+    info = read_stack_info(tmp_path / "a.mkv")
     assert (info.shape, info.full_scale) == ((6, 48, 64), 2**bits - 1)
-    frames = read_stack(tmp_path / f"a{ending}")
+    frames = read_stack(tmp_path / "a.mkv")
     np.testing.assert_array_equal((frames.double() * info.full_scale).round(), counts)
-    write_stack(tmp_path / f"b{ending}", frames, dtype=info.dtype, full_scale=info.full_scale, like=info)
-    assert torch.equal(read_stack(tmp_path / f"b{ending}"), frames)
-    assert read_stack_info(tmp_path / f"b{ending}") == info
+    write_stack(tmp_path / "b.mkv", frames, dtype=info.dtype, full_scale=info.full_scale, like=info)
+    assert torch.equal(read_stack(tmp_path / "b.mkv"), frames)
+    assert read_stack_info(tmp_path / "b.mkv") == info
 
 
 @pytest.mark.parametrize(
@@ -108,10 +107,8 @@ def test_all_orientations_are_kept(tmp_path):
             assert read_stack_info(tmp_path / f"a{ending}").orientation == orientation
     with av.open(str(tmp_path / "a.mp4")) as video:
         assert next(video.decode(video=0)).rotation == 90  # orientation 8: anticlockwise
-    for ending, tag, better in ((".avi", 6, r"\.mkv or \.mp4"), (".mkv", 2, r"\.mp4")):
-        message = rf"{ending} cannot hold the orientation {tag} of the input; write {better}"
-        with pytest.raises(ValueError, match=message):
-            write_stack(tmp_path / f"b{ending}", frames, dtype="uint8", like=replace(like, orientation=tag))
+    with pytest.raises(ValueError, match=r"\.mkv cannot hold the orientation 2 of the input; write \.mp4"):
+        write_stack(tmp_path / "b.mkv", frames, dtype="uint8", like=replace(like, orientation=2))
 
 
 def test_a_rotated_video_is_read_as_stored_and_restored_in_the_same_orientation(place, capsys):
@@ -203,9 +200,8 @@ def test_frames_can_be_read_in_any_order(tmp_path):
     reader.close()
 
 
-@pytest.mark.parametrize("ending", [".avi", ".mkv"])
-def test_damage_does_not_affect_other_frames(tmp_path, ending):
-    path = tmp_path / f"a{ending}"
+def test_damage_does_not_affect_other_frames(tmp_path):
+    path = tmp_path / "a.mkv"
     frames = torch.from_numpy(noise(8) / np.float32(255))
     write_stack(path, frames, dtype="uint8", like=StackInfo((6, 48, 64), "uint8", 255.0, frame_rate=25.0))
     data = bytearray(path.read_bytes())
@@ -270,34 +266,11 @@ def test_what_a_video_cannot_hold_is_refused(tmp_path, name, shape, dtype, messa
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "times", "unit", "sound", "output", "message"),
-    [
-        (
-            "clip.mkv",
-            VARIABLE,
-            Fraction(1, 1000),
-            "aac",
-            "a.avi",
-            "a.avi: .avi cannot hold a variable frame rate; write .mkv",
-        ),
-        (
-            "clip.avi",
-            np.arange(8) * PERIOD,
-            Fraction(13, 1250),
-            "pcm_u8",
-            "a.mp4",
-            "a.mp4: .mp4 cannot hold the audio (pcm_u8) of",
-        ),
-    ],
-)
-def test_what_a_container_cannot_hold_is_refused_before_the_computation(
-    place, capsys, name, times, unit, sound, output, message
-):
-    write_clip(place / name, times, sound=sound, unit=unit)
-    arguments = ("--config", place / "camera.toml", "--output", output)
-    assert rsvib("run", place / name, place / "out", *arguments) == 2
-    assert message in capsys.readouterr().err
+def test_what_a_container_cannot_hold_is_refused_before_the_computation(place, capsys):
+    write_clip(place / "clip.avi", np.arange(8) * PERIOD, sound="pcm_u8", unit=Fraction(13, 1250))
+    arguments = ("--config", place / "camera.toml", "--output", "a.mp4")
+    assert rsvib("run", place / "clip.avi", place / "out", *arguments) == 2
+    assert "a.mp4: .mp4 cannot hold the audio (pcm_u8) of" in capsys.readouterr().err
     assert not (place / "out").exists()
 
 
