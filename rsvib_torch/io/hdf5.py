@@ -1,5 +1,6 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -28,24 +29,18 @@ def _h5py() -> Any:
 def _find_dataset(file: Any) -> Any:
     """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
     h5py = _h5py()
-    found, groups = [], [file]
-    visited = {file.id}  # a group may be a member of several groups, also of itself
-    count = 0
-    for group in groups:  # grows
-        for name in group:
-            count += 1
-            if count > _MAX_MEMBERS:
-                raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                if name == _DATASET:
-                    raise ValueError(f"its dataset {name!r} is a link; frames must be in the file itself")
-                continue
-            member = group[name]
-            if isinstance(member, h5py.Group) and member.id not in visited:
-                visited.add(member.id)
-                groups.append(member)
-            elif isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
-                found.append(member)
+    found: list[Any] = []
+    members = itertools.count(1)
+
+    def visit(_: str, member: Any) -> None:
+        if next(members) > _MAX_MEMBERS:
+            raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
+        if isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
+            found.append(member)
+
+    file.visititems(visit)  # every member once, without links
+    if not isinstance(file.get(_DATASET, getlink=True, default=h5py.HardLink()), h5py.HardLink):
+        raise ValueError(f"its dataset {_DATASET!r} is a link; frames must be in the file itself")
     named = [member for member in found if member.name == f"/{_DATASET}"]
     stacks = named or [member for member in found if member.ndim > 2] or found
     if len(stacks) != 1:
