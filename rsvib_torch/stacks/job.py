@@ -1,7 +1,8 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,6 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
-from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -231,41 +231,24 @@ class StackJob:
         }
 
 
-class WindowReader:
-    """Reads the frames of windows in order; the frame that neighbours share is read once.
+def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
+    """Windows with the pixels of their frames as stored, or why they cannot be read.
 
-    Args:
-        source: The stack.
-        info: What its file stated when the job was planned.
+    The frame that neighbours share is read once.
     """
-
-    def __init__(self, source: Path, info: StackInfo) -> None:
-        self._source, self._info = source, info
-        self._reader: FrameReader | None = None
-        self._last: tuple[int, NDArray[Any] | str] | None = None
-
-    def read(self, window: Window) -> WindowFrames:
-        """Pixels of the frames of a window as stored, or why they cannot be read."""
-        if self._reader is None:
-            self._reader = open_stack(self._source)
-            if self._reader.info != self._info:
-                raise ValueError(f"{self._source} has changed since it was first opened; start again")
-        frames = [self._frame(self._reader, index) for index in window.frames]
-        self._last = (window.last, frames[-1])
-        return frames
-
-    def _frame(self, reader: FrameReader, index: int) -> NDArray[Any] | str:
-        if self._last is not None and self._last[0] == index:
-            return self._last[1]
-        try:
-            return reader.frame(index)
-        except FrameError as error:
-            return " ".join(str(error).split())
-
-    def close(self) -> None:
-        """Close the stack."""
-        if self._reader is not None:
-            self._reader.close()
+    with closing(open_stack(job.source)) as reader:
+        if reader.info != job.info:
+            raise ValueError(f"{job.source} has changed since it was first opened; start again")
+        last: dict[int, NDArray[Any] | str] = {}  # the last frame of the window before
+        for window in windows:
+            frames: WindowFrames = []
+            for index in window.frames:
+                try:
+                    frames.append(last[index] if index in last else reader.frame(index))
+                except FrameError as error:
+                    frames.append(" ".join(str(error).split()))
+            last = {window.last: frames[-1]}
+            yield window, frames
 
 
 def plan_job(

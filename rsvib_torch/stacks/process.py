@@ -1,7 +1,6 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -220,36 +219,27 @@ def _store_windows(
     remaining = [window for window in windows if window.index not in folder]
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
-
-    def store(stored: StoredWindow) -> None:
-        names = [f"{stored.record['window']:06d}.npy"] if stored.frames else []
-        with disk_errors_named(folder):
-            for name in names:
-                stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
-                with folder.create(name) as file:
-                    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
-                    file.write(stack.data)  # errors of np.save do not contain the reason
-            folder.add(stored.record, names)
-
     if progress is not None:
         progress(done, total)
-    with ThreadPoolExecutor(1, "rsvib-write") as writing, closing(results):
-        previous: Future[None] | None = None
+    with closing(results):
         for window, stored in zip(remaining, results, strict=True):
             errors.append(stored.record["error"])
-            if previous is not None:
-                previous.result()
             try:
                 _check_not_all_failed(errors, windows)
             except ValueError:
                 folder.remove()
                 raise
-            previous = writing.submit(store, stored)
+            names = [f"{window.index:06d}.npy"] if stored.frames else []
+            with disk_errors_named(folder):
+                for name in names:
+                    stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
+                    with folder.create(name) as file:
+                        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
+                        file.write(stack.data)  # errors of np.save do not contain the reason
+                folder.add(stored.record, names)
+            done += window.kept
             if progress is not None:
-                done += window.kept
                 progress(done, total)
-        if previous is not None:
-            previous.result()
 
 
 def _stored_frames(folder: RunFolder) -> Iterator[NDArray[Any]]:
