@@ -15,7 +15,6 @@ from rsvib_torch.io import (
     FrameError,
     StackFormat,
     StackInfo,
-    check_stack_target,
     formats,
     open_stack,
     read_stack,
@@ -159,42 +158,25 @@ def test_format_can_be_added_and_removed(tmp_path, monkeypatch):
         open_stack(tmp_path / "a.toy")
 
 
-def test_format_checks_the_full_scale_before_frames_are_computed(tmp_path):
-    def refuse(path, info):
-        if info.full_scale != 255:
-            raise ValueError(f"{path}: full scale {info.full_scale}")
-
-    register_format(StackFormat("toy", (".toy",), ToyReader, write=lambda *_: None, check=refuse))
-    try:
-        assert check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint8") == 255
-        with pytest.raises(ValueError, match=r"a\.toy: full scale 4095"):
-            check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint16", full_scale=4095)
-    finally:
-        del formats.FORMATS[".toy"]
-
-
 @pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
 def test_format_without_a_valid_ending_is_refused(ending, message):
     with pytest.raises(ValueError, match=message):
         register_format(StackFormat("toy", () if ending is None else (ending,), ToyReader))
 
 
-def test_npy_of_a_stack_with_channels_last_has_channels_second(tmp_path):
-    frames = torch.rand(2, 3, 9, 7, generator=torch.Generator().manual_seed(1))
-    write_stack(tmp_path / "a.npy", frames, like=StackInfo((2, 3, 9, 7), "uint8", 255.0, channels_last=True))
-    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), frames)
-
-
-@pytest.mark.parametrize(("ending", "package"), [(".h5", "h5py"), (".zarr", "zarr")])
-def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package):
+@pytest.mark.parametrize(
+    ("ending", "package", "extra"), [(".h5", "h5py", "formats"), (".zarr", "zarr", "formats"), (".mp4", "av", "video")]
+)
+def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package, extra):
     monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "a.h5").write_bytes(b"")
+    (tmp_path / "a.mp4").write_bytes(b"")
     (tmp_path / "a.zarr").mkdir()
-    message = rf"needs the package {package}: pip install rsvib_torch\[formats\]"
+    message = rf"needs the package {package}: pip install rsvib_torch\[{extra}\]"
     with pytest.raises(ModuleNotFoundError, match=message):
         read_stack(tmp_path / f"a{ending}")
     with pytest.raises(ModuleNotFoundError, match=message):
-        write_stack(tmp_path / f"b{ending}", torch.rand(2, 4, 4))
+        write_stack(tmp_path / f"b{ending}", torch.rand(2, 4, 4), dtype="uint8")
 
 
 def test_hdf5_links_to_other_files_are_refused(tmp_path):

@@ -1,7 +1,6 @@
 """Videos: depth, time stamps, orientation and sound, read and written."""
 
 import json
-import sys
 import tomllib
 from dataclasses import replace
 from fractions import Fraction
@@ -295,16 +294,6 @@ def test_files_that_are_not_videos_are_refused(tmp_path, monkeypatch):
     ):
         with pytest.raises(ValueError, match=rf"^{name}: not a readable video stack: {reason}"):
             read_stack(name)
-
-
-def test_missing_package_names_the_extra(tmp_path, monkeypatch):
-    (tmp_path / "a.mp4").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "av", None)
-    message = r"reading and writing video needs the package av: pip install rsvib_torch\[video\]"
-    with pytest.raises(ModuleNotFoundError, match=message):
-        read_stack(tmp_path / "a.mp4")
-    with pytest.raises(ModuleNotFoundError, match=message):
-        write_stack(tmp_path / "b.mp4", torch.rand(2, 48, 64), dtype="uint8")
 
 
 def test_frames_keep_their_places_behind_one_that_cannot_be_decoded(tmp_path):
