@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 
 from rsvib_torch.core.atomic import PART, make_folder, nearest_folder, sync
 from rsvib_torch.core.free_memory import size_text
+from rsvib_torch.core.text import one_line
 
 _HEADER = "run.json"
 _NAMES = re.compile(
@@ -38,18 +39,14 @@ def work_folder(sink: Path) -> Path:
 
 def describe_difference(old: Any, new: Any, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
-
-    def shortened(value: Any) -> str:
-        text = json.dumps(value)
-        return text if len(text) <= 60 else f"{text[:57]}..."
-
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*new, *old]):
             difference = describe_difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
             if difference:
                 return difference
         return None
-    return None if old == new else f"{path} was {shortened(old)}, now it is {shortened(new)}"
+    texts = (one_line(json.dumps(value), 60) for value in (old, new))
+    return None if old == new else "{} was {}, now it is {}".format(path, *texts)
 
 
 def check_space(path: Path, needed: int) -> None:
@@ -58,13 +55,6 @@ def check_space(path: Path, needed: int) -> None:
     if needed > free:
         reason = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
         raise OSError(errno.ENOSPC, reason, str(path))
-
-
-def _digest(file: BinaryIO) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    while block := file.read(1 << 20):
-        digest.update(block)
-    return digest.hexdigest()
 
 
 class RunFolder:
@@ -198,13 +188,18 @@ class RunFolder:
     def _is_whole(self, window: int) -> bool:
         """Whether the files of a window are those that were written."""
         try:
-            for name, digest in self._entry(window)["files"].items():
-                with self.open(name) as file:
-                    if _digest(file) != digest:
-                        return False
+            return all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
         except OSError:
             return False
-        return True
+
+    def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
+        with self.open(name) as file:
+            if synchronised:
+                os.fsync(file.fileno())
+            digest = hashlib.blake2b(digest_size=16)
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+            return digest.hexdigest()
 
     def _entry(self, window: int) -> dict[str, Any]:
         """Content of the marker of a window.
@@ -238,11 +233,7 @@ class RunFolder:
 
     def add(self, record: Mapping[str, Any], names: Iterable[str]) -> None:
         """Enter the ``WindowRecord`` of a window with its closed files; it is on the disk when the function returns."""
-        digests = {}
-        for name in names:
-            with self.open(name) as file:
-                os.fsync(file.fileno())
-                digests[name] = _digest(file)
+        digests = {name: self._digest_of(name, synchronised=True) for name in names}
         os.fsync(self._folder)  # their names
         body = json.dumps({"record": record, "files": digests}, allow_nan=False).encode()
         self._write(_marker(record["window"]), body + b"\n" + self._checksum(body))
