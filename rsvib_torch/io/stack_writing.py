@@ -39,11 +39,7 @@ def check_info_target(
 ) -> StackFormat:
     """The format in which ``path`` is written; raises the error that writing would raise.
 
-    Args:
-        path: The stack to write.
-        info: Its content.
-        compression: As in ``write_stack``.
-        check_folder: Whether to check that the folder exists and is writable.
+    Without ``check_folder``, its folder need not exist.
     """
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
@@ -91,13 +87,6 @@ def check_stack_target(
     like: StackInfo | None = None,
 ) -> float | None:
     """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed.
-
-    Args:
-        path: The file or folder to write.
-        shape: (T, H, W) or (T, C, H, W).
-        dtype: As in ``write_stack``.
-        full_scale: As in ``write_stack``.
-        like: As in ``write_stack``.
 
     Returns:
         The full scale that would be used; None for floats.
@@ -148,15 +137,7 @@ def metadata_not_kept(
 def write_frames(
     form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
 ) -> None:
-    """Write a stack; it gets its name when it is complete and on the disk.
-
-    Args:
-        form: Its format.
-        path: The file or folder.
-        info: Its content.
-        frames: Pixels as stored, one frame at a time.
-        compression: As in ``write_stack``.
-    """
+    """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
     with whole(path, form.kind, form.companions) as part:
         form.write(part, info, frames, compression)

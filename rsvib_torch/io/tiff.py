@@ -177,14 +177,9 @@ def _page_reader(
 ) -> BlockReader:
     """Reader of frames of equal numbers of pages, one frame after another.
 
-    Args:
-        path: The file.
-        info: The stack.
-        page: Returns a page by its number.
-        complete: Whether the stored pixels of each page lie within the file.
-        shape: Shape of the pages of a frame together.
-        order: Permutation of its axes to (..., H, W) or (..., C, H, W) with leading axes of length 1.
-        close: Closes the file.
+    ``page`` returns a page by its number, ``complete`` states whether its stored pixels lie within the file. The pages
+    of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with leading
+    axes of length 1.
     """
     count = len(complete) // info.shape[0]
 

@@ -306,17 +306,9 @@ def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
 
 
 def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: str) -> Any:
-    """Add a video stream to an open container, with the metadata of ``source``, a container or None.
+    """Add a video stream to an open container, with the metadata of ``source``, an open video or None.
 
-    Args:
-        output: The container.
-        path: Name of the video, whose ending selects the codec.
-        info: Its content.
-        source: The video from which it was computed.
-        **options: Options of the encoder in addition.
-
-    Returns:
-        The stream.
+    The ending of ``path`` selects the codec; ``options`` are those of the encoder in addition.
     """
     lossy = path.suffix.lower() in H264
     unit, ticks = presentation_times(info)
