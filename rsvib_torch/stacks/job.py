@@ -19,7 +19,7 @@ from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
-from rsvib_torch.io.frame_times import timing_of_stack
+from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.full_scale import (
     check_dtype,
     counts_to_frames,
@@ -121,6 +121,12 @@ class StackJob:
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
         return enlarged(frames if self.mosaic is None else colour_frames(frames, self.mosaic), self.scale)
+
+    def content(self, out: StackInfo, timing: SensorTiming) -> StackInfo:
+        """The output ``out`` with full scale, times and frame rate; ``timing`` is that of the caller."""
+        times = None if out.frame_times is None else exposure_times(self.info, timing)
+        rate = out.frame_rate or timing.frame_rate
+        return replace(out, full_scale=self.full_scale, frame_times=times, time_error=0.0, frame_rate=rate)
 
     def of_window(self, window: Window) -> "StackJob":
         """The job with only those given detections that ``window`` needs."""

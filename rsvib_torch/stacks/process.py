@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.frames.entry_points import file_options, source_options
-from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.timing import SensorTiming
@@ -148,13 +147,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "pass one for each window"
         )
     out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
-    out = replace(
-        out,
-        full_scale=job.full_scale,
-        frame_times=None if out.frame_times is None else exposure_times(job.info, timing),
-        time_error=0.0,
-        frame_rate=out.frame_rate or timing.frame_rate,
-    )
+    out = job.content(out, timing)
     form = check_info_target(sink, out, compression, check_folder=False)
     target = manifest_path(sink, options)
     check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))

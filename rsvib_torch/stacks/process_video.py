@@ -16,7 +16,6 @@ from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.validation import fields_of
 from rsvib_torch.frames.entry_points import file_options
-from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack
@@ -27,7 +26,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
-from rsvib_torch.stacks.job import StackJob, plan_job
+from rsvib_torch.stacks.job import plan_job
 from rsvib_torch.stacks.manifest import manifest_header, rms_shaking
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
@@ -89,7 +88,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     target = manifest_path(sink, options)
     check_outputs([sink, work_folder(sink), target], stack_files(source))
-    content = _content(job, timing)
+    content = job.content(job.info, timing)
     if border != "crop":
         check_info_target(sink, content, check_folder=False)
     header = manifest_header(job, sink.name, None)
@@ -228,16 +227,6 @@ def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
     return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit), at_once
-
-
-def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
-    return replace(
-        job.info,
-        full_scale=job.full_scale,
-        frame_times=None if job.info.frame_times is None else exposure_times(job.info, timing),
-        time_error=0.0,
-        frame_rate=job.info.frame_rate or timing.frame_rate,
-    )
 
 
 def _restore_parts(

@@ -65,14 +65,6 @@ def test_compressed_tiff_of_other_programs_is_read(tmp_path, compression, big):
     np.testing.assert_allclose(read_stack(path, full_scale=4095).numpy(), COUNTS / 4095, rtol=1e-6)
 
 
-def test_bigtiff_and_resolution(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", COUNTS, bigtiff=True, photometric="minisblack", resolution=(300, 150, "INCH"))
-    info = read_stack_info(tmp_path / "a.tif")
-    assert info.resolution == (300.0, 150.0, "inch")
-    tifffile.imwrite(tmp_path / "b.tif", COUNTS, photometric="minisblack", byteorder=">", metadata=None)
-    np.testing.assert_allclose(read_stack(tmp_path / "b.tif", full_scale=4095).numpy(), COUNTS / 4095, rtol=1e-6)
-
-
 def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", COUNTS, photometric="minisblack", compression="zlib")
     np.save(tmp_path / "a.npy", COUNTS)

@@ -1,7 +1,6 @@
 """Videos: depth, time stamps, orientation and sound, read and written."""
 
 import json
-import tomllib
 from dataclasses import replace
 from fractions import Fraction
 
@@ -121,19 +120,6 @@ def test_a_rotated_video_is_read_as_stored_and_restored_in_the_same_orientation(
     assert read_stack_info(place / "out" / "restored.mp4").orientation == 6
     frames = read_stack(place / "out" / "restored.mp4").mean(1).numpy()
     assert min(decibel(frame, STILL, 12) for frame in frames) > 34
-
-
-def test_the_bands_of_a_rotated_video_give_the_row_time_of_the_stored_rows(place, capsys):
-    times = np.arange(2) / 30
-    light = 0.5 + 0.4 * np.sin(2 * np.pi * 1000 * (times[:, None] + 3e-5 * np.arange(480)))
-    frames = np.broadcast_to((255 * light).astype(np.uint8)[:, :, None, None], (2, 480, 320, 3))
-    options = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "rate": 30, "rotation": -90}
-    write_video(place / "led.mov", frames, times, **options)
-    assert rsvib("calibrate", place / "led.mov", "--frequency", 1000, "--out", place / "sensor.toml") == 0
-    assert "displayed rotated by 90 degrees clockwise" in capsys.readouterr().out
-    sensor = tomllib.loads((place / "sensor.toml").read_text())["sensor"]
-    assert sensor["scan_axis"] == "y"
-    assert sensor["row_time"] == pytest.approx(3e-5, rel=2e-3)
 
 
 @pytest.mark.parametrize("times", [VARIABLE, DROPPED], ids=["variable", "dropped"])
