@@ -229,7 +229,7 @@ def test_transposed_frames_have_the_same_verdict_with_swapped_axes(scene):
 def test_colour_integers_and_missing_pixels_are_judged(scene):
     timing, motion = camera(), scaled_motion()
     grey = frames_of(scene("city"), timing, motion, 0.005)
-    colour = torch.stack([grey, 0.5 * grey], dim=1)
+    colour = torch.stack([grey, 0.5 * grey, 0.8 * grey], dim=1)
     assert judged(colour, timing, motion.vibration())[0].overall == "helps"
     counts = (grey.clamp(0, 1) * 4095).round().to(torch.int32)
     restored = restore(counts, timing, motion.vibration(), full_scale=4095)
