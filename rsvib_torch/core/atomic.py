@@ -130,9 +130,7 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
     """
     size = len(os.fsencode(path.name))
     if size > _LONGEST_NAME:
-        raise OSError(
-            f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} are possible"
-        )
+        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} fit")
     check_not_special(path)
     if kind == "file" and path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
