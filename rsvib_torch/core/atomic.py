@@ -15,6 +15,7 @@ from typing import Any, Literal
 from rsvib_torch.core.text import json_text
 
 PART = ".part"  # ending of temporary folders: .NAME.########.part
+_LONGEST_NAME = 255 - len("..12345678.part")  # bytes; of names of which temporary files have longer ones
 Kind = Literal["file", "folder", "tree"]
 
 
@@ -127,6 +128,9 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
         kind: As in ``StackFormat``.
         parent_exists: Whether the folder of a file must exist.
     """
+    size = len(os.fsencode(path.name))
+    if size > _LONGEST_NAME:
+        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} fit")
     check_not_special(path)
     if kind == "file" and path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
