@@ -102,11 +102,12 @@ def live_session(
     check_number("steady", steady, at_least=0.0)
     _check_options(source, out, size, realtime, border, steady, is_file=is_file)
     pipe_out = out is not None and str(out) == "-"
-    written = [] if out is None or pipe_out else [out]
+    files = [] if out is None or pipe_out else [out]
+    saved = []
     if spectrogram is not None:
-        written += [spectrogram.with_name(spectrogram.name + ending) for ending in (".png", ".zarr")]
-    check_new(written, overwrite, [*(io.stack_files(Path(source)) if is_file else []), settings.path])
-    for path in written:
+        saved = [spectrogram.with_name(spectrogram.name + ending) for ending in (".png", ".zarr")]
+    check_new([*files, *saved], overwrite, [*(io.stack_files(Path(source)) if is_file else []), settings.path])
+    for path in [*files, *saved]:
         check_writable(path)
     options = dict(settings.restoration)
     name: Any = method or options.get("method", "dewarp")
@@ -142,6 +143,12 @@ def live_session(
         outputs = _outputs(settings, preview, page, stream, None if pipe_out else out, overwrite)
         shown = [output for output in outputs if isinstance(output, live.PageOutput)]
         collected = None if spectrogram is None else live.Spectrogram(settings.timing, max_frequency=max_frequency)
+
+        def save() -> None:
+            if collected is not None and spectrogram is not None:
+                check_new(saved, overwrite, [])  # another program may have written them meanwhile
+                live.save_spectrogram(spectrogram, collected)
+
         report = live.run_live(
             frames_of,
             tracker(frames_of.full_scale),
@@ -152,15 +159,13 @@ def live_session(
             max_frames=num_frames,
             spectrogram=collected,
             progress=_StateText(shown[0]) if shown else None,
+            save=save,
         )
     if report.frames == 0:
         raise ValueError(f"{source}: no frame was read")
-    files = [] if out is None or pipe_out else [out]
-    if collected is not None and spectrogram is not None:
-        files += live.save_spectrogram(spectrogram, collected)
     if report.dropped or report.lost:
         error_line(_missing(report), "warning")
-    return _answer(source, report, files, drops=drops)
+    return _answer(source, report, [*files, *saved], drops=drops)
 
 
 def _check_options(

@@ -160,7 +160,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "images": frames,
     }
     pool |= {"visible": torch.ones(96, 64, dtype=torch.bool), "other": rsv.Margins(1, 2, 3, 4), "place": torch.zeros(2)}
-    pool |= {"stated": timing, "agreeing": timing}
+    pool |= {"stated": timing, "agreeing": timing, "row_time": 1e-4, "pixel_size": 5e-6}
     pool |= {"exposure_times": [1e-3, 2.5e-4], "frame_rate": 30.0, "detections": [detected], "source": stack}
 
     def call(function: Callable[..., Any], **others: Any) -> Call:
