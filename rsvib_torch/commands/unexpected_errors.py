@@ -2,6 +2,8 @@
 
 import errno
 
+from rsvib_torch.core.text import one_line
+
 
 def system_error(error: BaseException) -> OSError | None:
     """The error of the system that exhausted memory or threads stand for, with the remedy; None for others."""
@@ -28,4 +30,4 @@ def in_one_line(error: BaseException) -> str:
         return str(known.strerror)
     if isinstance(error, RecursionError):
         return "the input is nested too deeply"
-    return f"unexpected {type(error).__name__}: {' '.join(str(error).split())[:500]}"
+    return f"unexpected {type(error).__name__}: {one_line(error)}"

@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 
 from rsvib_torch.core.atomic import PART, make_folder, nearest_folder, sync, sync_tree, temporary_folder
 from rsvib_torch.core.free_memory import size_text
+from rsvib_torch.core.text import quoted
 
 _HEADER = "run.json"
 _NAMES = re.compile(r"run\.json|\d{6,}\.(done|done\.part|npy|mkv|avi|mp4|mov|m4v)")  # of the files that a run makes
@@ -36,18 +37,13 @@ def work_folder(sink: Path) -> Path:
 
 def describe_difference(old: Any, new: Any, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
-
-    def shortened(value: Any) -> str:
-        text = json.dumps(value)
-        return text if len(text) <= 60 else f"{text[:57]}..."
-
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*new, *old]):
             difference = describe_difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
             if difference:
                 return difference
         return None
-    return None if old == new else f"{path} was {shortened(old)}, now it is {shortened(new)}"
+    return None if old == new else f"{path} was {quoted(old)}, now it is {quoted(new)}"
 
 
 def check_space(path: Path, needed: int) -> None:

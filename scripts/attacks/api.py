@@ -245,16 +245,20 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "VibrationRestorer": call(rsv.VibrationRestorer, joint=False),
         "VideoBorder": call(rsv.VideoBorder),
         "VibrationTracker": call(rsv.VibrationTracker, timing=rsv.SensorTiming(1e-4, 6, 104)),
+        "VibrationCorrector": call(rsv.VibrationCorrector, detection=fast, restoration={"method": "dewarp"}),
     }
     result |= constructed
     modules = {"VibrationDetector": detector, "VibrationRestorer": restorer, "RollingShutterVibration": augmentation}
     for name, module in modules.items():
         result[f"{name}.forward"] = call(module.forward)
+    corrector = rsv.VibrationCorrector(timing, detection=fast, restoration={"method": "dewarp"})
+    result["VibrationCorrector.forward"] = Call(corrector.forward, {"frames": frames[None, :, None]})
     result["FixedDewarp.forward"] = Call(rsv.FixedDewarp(timing, vibration, (96, 64), 3).forward, {"frames": frames})
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
     described += (tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
+    described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     described += (rsv.TimingDiagnosis("frame_rows", 104.0, 110.0, timing),)
     described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
     for value in described:

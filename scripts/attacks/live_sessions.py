@@ -351,6 +351,9 @@ _WAYS: dict[str, Callable[[str, Path, int], Trial]] = {
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """All ways in turn, with .mkv and .mp4; the number of frames before the end is random."""
     choice = random.Random(seed)
+    for ignored in (signal.SIGINT, signal.SIGHUP):  # by nohup, or in the background of a script; sessions inherit it
+        if signal.getsignal(ignored) is signal.SIG_IGN:
+            signal.signal(ignored, signal.SIG_DFL)
     for number in range(count):
         way, ending = list(_WAYS)[number % len(_WAYS)], (".mkv", ".mp4")[number // len(_WAYS) % 2]
         frames, place = choice.randint(*_RECORDED), folder / "trial"
