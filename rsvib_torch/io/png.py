@@ -72,7 +72,9 @@ def _info(chunks: dict[bytes, bytes], size: int, path: Path, *, largest_ratio: i
         try:
             stated = float(chunks[_FULL_SCALE_KEY])
         except ValueError as error:
-            raise ValueError(f"{path}: full_scale in the file is {quoted(chunks[_FULL_SCALE_KEY])}, not a number") from error
+            raise ValueError(
+                f"{path}: full_scale in the file is {quoted(chunks[_FULL_SCALE_KEY])}, not a number"
+            ) from error
     shape = (1, height, width) if channels == 1 else (1, channels, height, width)
     full_scale = known_full_scale(dtype, stated)
     return StackInfo(shape, dtype.name, full_scale, resolution=_resolution(chunks), channels_last=channels > 1)
