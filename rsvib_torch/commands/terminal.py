@@ -115,8 +115,9 @@ def note(message: str) -> None:
 
 
 def error_line(message: str, kind: str = "error") -> None:
-    """Print a message to standard error, with the prefix ``rsvib: error:``; control codes are escaped, and long texts are shortened.
+    """Print a message to standard error, with the prefix ``rsvib: error:``.
 
+    Control codes are escaped, and long texts are shortened.
     Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
     end of a terminal, the command continues.
     """

@@ -83,8 +83,8 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
     data = read_json(path, "vibration.json")
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
-            f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the vibration.json, "
-            "or the manifest.json of windows, that rsvib detect or run wrote"
+            f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
+            "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
         )
     result = DetectionResult.load(path)
     if result.batch_shape:

@@ -149,7 +149,7 @@ class _Session:
     def ended(self, limit: float | None = None) -> Process:
         """Wait for the end of the process; it is killed after the limit.
 
-        Without a limit it is ``_LONGEST_END``, or three times the duration up to now if that is longer: the machine is slow.
+        Without a limit it is ``_LONGEST_END``, or three times the duration up to now if the machine is slow.
         """
         begin = time.perf_counter()
         limit = limit or max(_LONGEST_END, 3.0 * (time.monotonic() - self.begin))

@@ -342,8 +342,8 @@ class _Camera:
         count = {"radial": 3, "radtan": 5}.get(self.lens)
         if count is None or not isinstance(self.distortion, list) or len(self.distortion) != count:
             raise ValueError(
-                f"{self.source}: optical_distortion {quoted(self.lens)} is not supported for a line scanner, only radial "
-                "with three and radtan with five coefficients; model='frame' keeps it as it is"
+                f"{self.source}: optical_distortion {quoted(self.lens)} is not supported for a line scanner, only "
+                "radial with three and radtan with five coefficients; model='frame' keeps it as it is"
             )
         if not any(self.distortion):
             return plane
