@@ -1,5 +1,6 @@
 """Frames in JPEG files, which can only be read."""
 
+import io
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +13,16 @@ from PIL import Image
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import exif_fields
 
+_LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and a preview have 64 KB each, colour profiles 3 MB
+
 
 def _open(path: Path) -> Image.Image:
-    with path.open("rb"):
-        pass  # a file that cannot be opened is an OSError
+    with path.open("rb") as file:
+        head = io.BytesIO(file.read(_LONGEST_HEADER))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the memory is checked before reading
+            Image.open(head, formats=("JPEG",))  # Pillow would search a file of any size for the header, at 20 MB/s
             image = Image.open(path, formats=("JPEG",))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: not a JPEG file") from error

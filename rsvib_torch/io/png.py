@@ -1,10 +1,11 @@
 """Frames in PNG files: decoding, encoding, and what the file states."""
 
+import io
 import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -17,30 +18,32 @@ from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import exif_fields
 
 _FULL_SCALE_KEY = b"full_scale"
+_LARGEST_CHUNK = 2**26  # bytes; those besides the pixels, such as colour profiles, have up to 3 MB
 
 
-def _chunks(data: bytes, path: Path, last: bytes) -> dict[bytes, bytes]:
+def _chunks(file: BinaryIO, path: Path, last: bytes) -> dict[bytes, bytes]:
     """The first chunk of each type before ``last``; checksums and the end of the file are verified."""
-    if data[:8] != b"\x89PNG\r\n\x1a\n":
+    if file.read(8) != b"\x89PNG\r\n\x1a\n":
         raise ValueError(f"{path}: not a PNG file")
     chunks: dict[bytes, bytes] = {}
-    start = 8
     while True:
-        length = struct.unpack(">I", data[start : start + 4])[0] if start + 12 <= len(data) else len(data)
-        kind, end = data[start + 4 : start + 8], start + 12 + length
+        head = file.read(8)
+        length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
         if kind == last and last != b"IEND":
             return chunks
-        if end > len(data):
+        if length > _LARGEST_CHUNK and kind != b"IDAT":
+            raise ValueError(f"{path}: damaged PNG file (a chunk {kind!r} of {length} bytes)")
+        body = file.read(length + 4)  # and its checksum
+        if len(body) < length + 4:
             raise ValueError(f"{path}: truncated PNG file")
-        if zlib.crc32(data[start + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
+        body, checksum = body[:-4], struct.unpack(">I", body[-4:])[0]
+        if zlib.crc32(body, zlib.crc32(kind)) != checksum:
             raise ValueError(f"{path}: damaged PNG file (checksum of chunk {kind!r})")
-        body = data[start + 8 : end - 4]
         if kind == b"tEXt" and body.startswith(_FULL_SCALE_KEY + b"\0"):
             chunks[_FULL_SCALE_KEY] = body[len(_FULL_SCALE_KEY) + 1 :]
         chunks.setdefault(kind, body)
         if kind == b"IEND":
             return chunks
-        start = end
 
 
 def _resolution(chunks: dict[bytes, bytes]) -> tuple[float, float, str] | None:
@@ -66,6 +69,8 @@ def _info(chunks: dict[bytes, bytes], size: int, path: Path, *, largest_ratio: i
         )
     if min(width, height, channels) < 1 or width * height * channels * bits // 8 > largest_ratio * size:
         raise ValueError(f"{path}: its header states {width} x {height} px, which {size} bytes cannot hold")
+    if size > 2 * width * height * channels * bits + _LARGEST_CHUNK:
+        raise ValueError(f"{path}: {size} bytes are too many for {width} x {height} px, as its header states")
     dtype = np.dtype(np.uint16 if bits == 16 else np.uint8)
     stated = None
     if _FULL_SCALE_KEY in chunks:
@@ -83,19 +88,15 @@ def _info(chunks: dict[bytes, bytes], size: int, path: Path, *, largest_ratio: i
 def png_info(path: Path) -> StackInfo:
     """The stack of one frame in a PNG file."""
     with path.open("rb") as file:
-        head = file.read(1 << 16)  # almost always contains all chunks before the pixels
-        try:
-            chunks = _chunks(head, path, b"IDAT")
-        except ValueError:
-            chunks = _chunks(head + file.read(), path, b"IDAT")
+        chunks = _chunks(file, path, b"IDAT")
     return replace(_info(chunks, path.stat().st_size, path), **exif_fields(chunks.get(b"eXIf", b"")))
 
 
 def decode_png(path: Path) -> NDArray[Any]:
     """Pixels of a PNG file, (H, W) or (C, H, W) with channels RGB or RGBA."""
+    png_info(path)
     data = path.read_bytes()
-    chunks = _chunks(data, path, b"IEND")
-    _info(chunks, len(data), path)
+    _chunks(io.BytesIO(data), path, b"IEND")
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
