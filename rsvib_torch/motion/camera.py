@@ -194,7 +194,7 @@ class Camera:
         """
         check_whole_number("axes", axes, at_least=2, at_most=4)
         u, v = self.rays(x, y)
-        x, y = torch.broadcast_tensors(x, y)
+        x, y = torch.broadcast_tensors(x.to(u), y.to(u))
         f = self.focal_length
         rotation = torch.stack(
             [torch.stack([1 + u * u, u * v, -f * v], -1), torch.stack([u * v, 1 + v * v, f * u], -1)], -2

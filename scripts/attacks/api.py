@@ -31,7 +31,7 @@ __all__ = ["calls", "trials"]
 
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
-_OF_THE_PACKAGE = {"mapped"}  # methods that only the package calls
+_OF_THE_PACKAGE = {"codes", "mapped"}  # methods that only the package calls
 
 
 @dataclass(frozen=True)

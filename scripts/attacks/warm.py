@@ -41,7 +41,8 @@ def tried(name: str, work: Callable[[], str], unclear: Callable[[str], str] = la
     try:
         wrong = work()
     except (ValueError, TypeError, OSError) as error:
-        fault = _unclear(str(error)) or unclear(str(error))
+        text = str(getattr(error, "strerror", None) or error)  # the system repeats names that are too long
+        fault = _unclear(text) or unclear(str(error))
         return Trial(name, "wrong" if fault else "refused", (fault or str(error))[:300])
     except MemoryError as error:
         return Trial(name, "memory", str(error)[:300])
