@@ -20,9 +20,9 @@ check: setup ## format, lint and type checks, without tests
 	$(PYTHON) -m mypy
 
 quick: setup ## tests that a change of the algorithms needs (about 2 minutes on two cores)
-	OMP_NUM_THREADS=1 $(PYTHON) -m pytest tests --quick -n auto --dist loadfile
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest tests --quick -n auto --dist loadfile --no-loadscope-reorder
 
-test: ## all checks and tests (about 10 minutes on two cores)
+test: ## all checks and tests (about 6 minutes on two cores)
 	bash scripts/test.sh
 
 slow: ## all checks and tests, the long ones included
@@ -39,7 +39,7 @@ bench: setup ## run the benchmarks and store their results
 
 pages: setup ## write the generated pages and drawings of docs/ anew
 	$(PYTHON) scripts/reference_pages.py
-	$(PYTHON) scripts/benchmark_page.py
+	$(PYTHON) scripts/benchmark.py --pages
 	$(PYTHON) scripts/drawings.py --out docs/drawings
 	$(PYTHON) scripts/run_pages.py
 

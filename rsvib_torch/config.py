@@ -138,13 +138,36 @@ def _in_rows(name: str, value: float | None, converted: float | None, rows_name:
 def simulation_section() -> Any:
     """Class of ``[simulation]``; it needs torch, which takes seconds to import."""
     from rsvib_torch.imaging.sensor_model import SensorNoise  # noqa: PLC0415
-    from rsvib_torch.io.schema import VibrationRecord  # noqa: PLC0415
+    from rsvib_torch.motion.camera import Camera  # noqa: PLC0415
+    from rsvib_torch.motion.vibration import Vibration  # noqa: PLC0415
 
-    class VibrationSection(VibrationRecord):
-        """``[simulation.vibration]``: phase and image motion are optional."""
+    tones = list[float] | list[list[float]]
+    axes = Field(default_factory=lambda: [0.0, 0.0])
 
-        phase: list[float] | list[list[float]] = Field(default_factory=lambda: [0.0, 0.0])
-        image_motion: list[float] = Field(default_factory=lambda: [0.0, 0.0])
+    class CameraSection(Section):
+        focal_length: float
+        principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
+        distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=5, max_length=5)
+
+    class VibrationSection(Section):
+        """Fields of ``Vibration``, which checks their values; an axis is one number (one tone) or a list of tones."""
+
+        amplitude: tones
+        frequency: tones
+        phase: tones = axes
+        image_motion: list[float] = axes
+        image_acceleration: list[float] = axes
+        image_shift: list[float] = axes
+        camera: CameraSection | None = None
+
+        @model_validator(mode="after")
+        def _check(self) -> Self:
+            checked(self.to_vibration)
+            return self
+
+        def to_vibration(self) -> Vibration:
+            camera = None if self.camera is None else Camera(**dict(self.camera))
+            return Vibration(**{**dict(self), "camera": camera})
 
     class SimulationSection(Section):
         vibration: VibrationSection

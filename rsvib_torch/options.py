@@ -574,7 +574,9 @@ class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
         description='Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` '
         "starts workers on this machine; None computes in this process.",
     )
-    compression: str | None = Field(default=None, description="As in ``write_stack``.")
+    compression: str | None = Field(
+        default=None, description="Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."
+    )
 
 
 @options

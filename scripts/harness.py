@@ -7,7 +7,7 @@ A section is a module with
 * ``rows(options)``: the figures, one dictionary per case, of numbers, texts, lists and dictionaries;
 * ``lines(rows, options)``: the tables in Markdown, without further measurement.
 
-``benchmark.py`` runs sections, ``write_result`` stores their rows, and ``benchmark_page.py`` makes the page of all.
+``benchmark.py`` runs sections, ``write_result`` stores their rows, and ``benchmark.py --pages`` makes the pages.
 """
 
 import argparse
@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,6 @@ _LIBRARIES = {
     "scikit-image": ("scikit-image",),
     "Kornia": ("kornia",),
     "NumPy": ("numpy",),
-    "vidstab": ("vidstab",),
 }
 BEGIN, END = "<!-- begin of the generated table -->", "<!-- end of the generated table -->"
 _NOT_FINITE = ("nan", "inf", "-inf")  # JSON has no such numbers, they are stored as text
@@ -174,6 +174,25 @@ def named(name: str, device: str) -> str:
 def plain_environment() -> dict[str, str]:
     """Environment of processes whose memory is measured, without the settings that keep freed memory."""
     return {name: value for name, value in os.environ.items() if name not in KEPT}
+
+
+def write_h264(target: Any, pictures: Iterable[Any], rate: int, *, bit_rate: int | None = None, **options: str) -> None:
+    """Write pictures, arrays (3/2 H, W) of yuv420p, as a video (BT.709, limited) into a path or an open file."""
+    import av  # an extra # noqa: PLC0415
+
+    with av.open(target if hasattr(target, "write") else str(target), "w", format="mp4") as output:
+        stream: Any = output.add_stream("libx264", rate=rate, options=options)
+        stream.pix_fmt = "yuv420p"
+        if bit_rate is not None:
+            stream.bit_rate = bit_rate
+        stream.codec_context.colorspace, stream.codec_context.color_range = 1, 1
+        for number, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(picture, format="yuv420p")
+            if number == 0:
+                stream.height, stream.width = frame.height, frame.width
+            frame.pts, frame.time_base = number, Fraction(1, rate)
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode())
 
 
 # Tables

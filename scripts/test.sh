@@ -14,5 +14,7 @@ export OMP_WAIT_POLICY=${OMP_WAIT_POLICY:-passive} # busy-waiting threads are sl
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}       # one process per core instead of threads
 .venv/bin/python -m ruff format --check .
 .venv/bin/python -m ruff check .
-.venv/bin/python -m mypy
-.venv/bin/python -m pytest -m "$marker" -n auto --dist loadfile
+.venv/bin/python -m mypy & # beside the tests, most of which it ends before
+types=$!
+.venv/bin/python -m pytest -m "$marker" -n auto --dist loadfile --no-loadscope-reorder || { kill $types 2>/dev/null || true; exit 1; }
+wait $types

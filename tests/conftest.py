@@ -4,11 +4,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from rsvib_torch import SensorTiming
 
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
+ARRANGED = {"report", "test_presentation.py", "test_gallery.py"}  # tests of figures, which are drawn as for users
+LONGEST = (
+    "test_tutorials.py",
+    "test_direct.py",
+    "test_answers.py",
+    "test_cli.py",
+    "test_start.py",
+    "test_slanted_edge.py",
+)
 SLOWER_TESTS = [line for line in (TESTS / "slower_tests.txt").read_text().splitlines() if not line.startswith("#")]
 
 
@@ -24,7 +34,8 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(config, items):
-    """With ``--quick``, the tests of ``slower_tests.txt`` are left out."""
+    """The longest files begin, so that all workers end together; ``--quick`` leaves out ``slower_tests.txt``."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
     if config.getoption("quick", False):
         slower = [item for item in items if item.nodeid.split("[")[0].removeprefix("tests/") in SLOWER_TESTS]
         config.hook.pytest_deselected(items=slower)
@@ -41,3 +52,16 @@ def paper_camera():
 def same_random_numbers():
     """Seed the global generators, so that tests without a generator of their own are reproducible."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def figures_are_not_arranged(request, monkeypatch):
+    """Draw figures coarsely and without arranging their parts, except in tests of figures: a fifth of the time."""
+
+    def print_figure(canvas, file, **_):
+        canvas.figure.set_layout_engine("none")
+        canvas.figure.set_dpi(40)
+        canvas.print_png(file)
+
+    if not ARRANGED & set(request.path.parts):
+        monkeypatch.setattr(FigureCanvasAgg, "print_figure", print_figure)

@@ -5,7 +5,6 @@ import argparse
 import numpy as np
 import pytest
 from benchmarks import honesty, timing
-from benchmarks.honesty import best_constant
 from benchmarks.honesty_camera import FINER, MARGIN, OPTICS, fine_shape, layer, row_displacement, standing, take_frames
 from benchmarks.honesty_cases import recording
 
@@ -65,15 +64,6 @@ def test_an_exposure_attenuates_a_moving_wave_by_a_sinc():
     )
 
 
-def test_rows_are_displaced_at_their_own_times():
-    scene, image = waves()
-    starts = STARTS + np.array([[0.0], [0.02]])
-    frames = take_frames([scene], lambda t: np.stack([0 * t, 2 * np.sin(300 * t), 0 * t, 0 * t]), starts, 1e-9, W)
-    for frame, of_rows in zip(frames, starts, strict=True):
-        expected = image(ROWS - 2 * np.sin(300 * of_rows)[:, None], COLUMNS)
-        np.testing.assert_allclose(frame, expected, rtol=0, atol=2e-5)
-
-
 def test_a_layer_hides_the_scene_and_moves_by_itself():
     scene, image = waves()
     cover = np.zeros(fine_shape(H, W))
@@ -83,11 +73,6 @@ def test_a_layer_hides_the_scene_and_moves_by_itself():
     for frame, border in zip(frames, (36, 44), strict=True):
         np.testing.assert_allclose(frame[:, border + 4 :], 0.9, atol=1e-3)
         np.testing.assert_allclose(frame[:, : border - 4], image(ROWS, COLUMNS[:, : border - 4]), atol=1e-3)
-
-
-def test_registration_finds_the_constant_displacement():
-    taken = recording("plain", 0, 128)
-    np.testing.assert_allclose(best_constant(taken.still(0, 3.3, -7.6), taken.still(0), 12), (-7.6, 3.3), atol=0.02)
 
 
 def test_a_plain_case_is_correct():

@@ -77,10 +77,7 @@ def test_kernels_of_rows_are_those_of_the_package():
 def test_row_loops_and_unwarping_restore_either_frame(scene_and_frames, index):
     scene, frames = scene_and_frames
     frame, motion = with_noise(frames)[index], Motion().vibration()
-    unwarped = remap_lanczos(frame, TIMING, motion, index).restored.numpy()
+    unwarped = remap_lanczos(frame, TIMING, motion, index).numpy()
     assert decibel(unwarped, scene, 24) > decibel(frame, scene, 24) + 8
-    figure = wiener_rows(frame, TIMING, motion, torch.from_numpy(scene), 24, index)
-    errors = [image[:, 24:-24] - scene[figure.rows, 24:-24] for image in (frame[figure.rows], figure.restored.numpy())]
-    before, after = (float(np.square(error).mean()) for error in errors)
-    assert after < before / 6
-    assert figure.seconds > 0
+    quality = wiener_rows(frame, TIMING, motion, torch.from_numpy(scene), 24, index)
+    assert quality > decibel(frame, scene, 24) + 8

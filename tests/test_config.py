@@ -157,7 +157,7 @@ VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"
             SENSOR + VIBRATION.replace("[1, 2]", "[-1, 2]"),
             "simulation.vibration: amplitude must not be negative, got -1",
         ),
-        (SENSOR + VIBRATION.replace("[1, 2]", "[1]"), "simulation.vibration: amplitude must be two numbers (x, y), or"),
+        (SENSOR + VIBRATION.replace("[1, 2]", "[1]"), "simulation.vibration: amplitude must have shape (2,), (2, K)"),
         (
             SENSOR + VIBRATION.replace("[1, 2]", "'1'"),
             "simulation.vibration.amplitude: expected a list of numbers or a",

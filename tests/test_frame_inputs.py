@@ -130,7 +130,7 @@ def test_channels_last_keeps_masks_and_comes_back(scan_axis, batch):
     [
         ((2, 3, 48, 64), None),
         ((2, 1, 48, 64), "first"),
-        ((2, 8, 48, 64), None),  # eight bands
+        ((2, 8, 48, 64), "first"),  # eight bands
         ((2, 48, 64, 8), "last"),
         ((2, 3, 48, 4), None),  # few columns
         ((2, 3, 4, 5), "last"),  # few rows
@@ -160,6 +160,7 @@ def test_valid_shapes_are_accepted(shape, channels):
         ((48, 64, 3), "last", r"one image \(H, W, C\): pass frames\[None\] with channels=\"last\""),
         ((48, 64, 1), None, r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
         ((2, 3, 48, 64), "last", r"appear to have their channels before the image axes: omit channels=\"last\""),
+        ((8, 2, 48, 64), None, r"appear to be a batch \(B, T, H, W\): pass frames\[:, :, None\]"),
         ((2, 48, 64, 3), "Last", "channels must be one of None, 'first', 'last'; got 'Last'"),
         ((64, 3), "last", r"frames must have shape \(T, H, W\)"),
     ],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from benchmarks.independent_camera import Shake, take_frames
-from reproduction.trials import GlobalShutter
+from benchmarks.reproduction import GlobalShutter
 
 TONES = ([[1.3, 0.4], [2.1, 0.0]], [[50.0, 120.0], [30.0, 0.0]], [[0.4, 1.0], [1.3, 0.0]])
 IMAGE_MOTION = (40.0, -30.0)

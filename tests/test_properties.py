@@ -8,8 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsvib_torch import FreeMotion, SensorTiming, Vibration, row_psf, simulate_frames
-from rsvib_torch.core.chunking import gathered, runs
-from rsvib_torch.core.splines import bspline_coefficients, bspline_coefficients_adjoint, spread_taps
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order, offsets_from_row_order
 from rsvib_torch.imaging import blur_rows, blur_rows_adjoint
 from rsvib_torch.restoration.exact.scene_solver import join_windows, row_windows
@@ -149,36 +147,7 @@ def test_adjoint_of_the_blur(vibration, timing, seed, interpolation, height, wid
     torch.testing.assert_close((blurred * frame).sum(), (scene * adjoint).sum(), rtol=1e-10, atol=1e-10)
 
 
-@few
-@given(seeds, sizes, sizes, st.sampled_from([1, 3, 5, 7, 9]), st.sampled_from([-2, -1]))
-def test_adjoint_of_the_spline_coefficients(seed, height, width, degree, dim):
-    x, y = random_tensor(seed, height, width), random_tensor(seed + 1, height, width)
-    forward, backward = bspline_coefficients(x, degree, dim), bspline_coefficients_adjoint(y, degree, dim)
-    torch.testing.assert_close((forward * y).sum(), (x * backward).sum(), rtol=1e-9, atol=1e-9)
-
-
-@few
-@given(seeds, st.integers(1, 6), st.integers(1, 5), st.integers(1, 4))
-def test_spread_taps_keep_weights_and_positions(seed, rows, nodes, taps):
-    cells = (5 * random_tensor(seed, rows, nodes)).round()
-    weights = random_tensor(seed + 1, rows, nodes, taps)
-    first, spread = spread_taps(cells, weights)
-    torch.testing.assert_close(spread.sum(-1), weights.sum(-1))
-    moments = (spread * (first[:, None, None] + torch.arange(spread.shape[-1]))).sum(-1)
-    torch.testing.assert_close(moments, (weights * (cells[..., None] + torch.arange(taps))).sum(-1))
-
-
 # Splits
-
-
-@few
-@given(st.integers(1, 300), st.integers(1, 80))
-def test_runs_cover_every_row_once(count, size):
-    rows = torch.arange(count)
-    pieces = [(part, rows[part]) for part in runs(count, size)]
-    assert torch.equal(torch.cat([piece for _, piece in pieces]), rows)
-    assert torch.equal(gathered(pieces, count, 0), rows)
-    assert all(1 <= len(piece) <= size for _, piece in pieces)
 
 
 @few

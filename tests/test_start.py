@@ -121,6 +121,7 @@ def test_type_checker_knows_the_names(tmp_path):
     pytest.importorskip("mypy")
     (tmp_path / "user.py").write_text(
         "import rsvib_torch as rsv\n"
+        "from rsvib_torch.imaging.trajectory import rows_showing\n"
         "from rsvib_torch.io import StackInfo\n"
         "timing = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)\n"
         "info: StackInfo = rsv.read_stack_info('frames.tif')\n"
@@ -135,11 +136,16 @@ def test_type_checker_knows_the_names(tmp_path):
         "rsv.register_bands(frames, timing, band_row=3)\n"
         "rsv.VibrationTracker(timing, window=4.5)\n"
         "rsv.detect_vibration(frames, timing, model='swept', tones=2)\n"
+        "row, start = frames[0, :, 0], frames[0, 0, 0]\n"
+        "rows_showing(row, start, timing.in_row_order(), still)\n"
+        "rows_showing(row, start, timing, still)\n"
     )
     command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "user.py"]
     found = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}  # mypy does not follow the hooks of editable installations
     shown = subprocess.run(command, cwd=tmp_path, env=found, capture_output=True, text=True, check=False).stdout
     assert 'note: Revealed type is "torch._tensor.Tensor"' in shown
-    assert 'user.py:7: error: Module has no attribute "restor"' in shown
+    assert 'user.py:8: error: Module has no attribute "restor"' in shown
     mistakes = [line.split(":")[1] for line in shown.splitlines() if "error:" in line]
-    assert mistakes == ["7", "11", "12", "13", "14", "15"]  # options are known from the fields of their groups
+    # options are known from the fields of their groups; functions of rows require a timing in row order
+    assert mistakes == ["8", "12", "13", "14", "15", "16", "19"]
+    assert 'has incompatible type "SensorTiming"; expected "RowTiming"' in shown

@@ -6,14 +6,14 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsvib_torch import report as reports
+from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.core.text import number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
     from rsvib_torch.detection import DetectionResult
-    from rsvib_torch.motion.detected_vibration import DetectedVibration
-    from rsvib_torch.restoration import RestorationVerdict
-    from rsvib_torch.stacks import RestoredFrames
+    from rsvib_torch.stacks import RestoredFrames, StackManifest, StackReport
 
 
 def command_text(*parts: str | Path) -> str:
@@ -38,11 +38,43 @@ def detection_data(result: DetectionResult) -> dict[str, Any]:
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
 
 
-def in_metres(result: DetectedVibration, pixel_size: float | None) -> dict[str, list[str]]:
-    """A result of an answer with the tones in units of length, if the size of a pixel in m is given."""
-    if pixel_size is None:
-        return {}
-    return {f"For pixels of {1e6 * pixel_size:.6g} µm": [result.physical_summary(pixel_size)]}
+def stack_answer(
+    frames: Path,
+    found: DetectionResult,
+    pixel_size: float | None = None,
+    restored: RestoredFrames | None = None,
+    count: int = 0,
+) -> Answer:
+    """The vibration in a stack, also in units of length if the size of a pixel in m is given, and its restoration."""
+    answer = Answer({f"Vibration in {frames.name}": [found.summary()]}, {"detection": detection_data(found)})
+    if pixel_size is not None:
+        answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [found.physical_summary(pixel_size)]
+    if restored is not None:
+        answer.results["Restoration"] = restoration_lines(restored, count)
+        answer.data["restoration"] = reports.restoration_data(restored)
+    return answer
+
+
+def windows_answer(
+    title: str, manifest: StackManifest, report: StackReport | None = None, pixel_size: float | None = None
+) -> Answer:
+    """The vibration in the windows of a stack, and what was restored."""
+    vibration, restoration = manifest.lines(pixel_size)
+    answer = Answer({title: vibration}, {"windows": manifest.totals()})
+    if report is not None:
+        answer.results["Restoration"] = [report.summary(), *restoration[1:]]
+    return answer
+
+
+def warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
+    """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
+    kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
+    forced = "writes" if output == "frames" else "shows"
+    if not result.moves:
+        error_line(f"no vibration to remove: {kept}", "warning")
+    elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
+        unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
+        error_line(result.verdict.sentence + unchanged, "warning")
 
 
 def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
@@ -68,58 +100,33 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     return [wrapped(line) for line in lines]
 
 
-def restoration_data(result: RestoredFrames) -> dict[str, Any]:
-    """The same as ``restoration_lines`` for JSON."""
-    from rsvib_torch.core.presentation import plain_values  # noqa: PLC0415
-
-    return {
-        "frames": "restored" if result.restored else "as taken",
-        "axes": result.restored_axes(),
-        "left_alone": plain_values(result.left_alone),
-        **verdict_data(result.verdict),
-    }
-
-
-def verdict_data(verdict: RestorationVerdict | None) -> dict[str, Any]:
-    """A verdict on restored frames for JSON."""
-    if verdict is None:
-        return {"outcome": None, "predicted_gain_db": None, "summary": None}
-    from rsvib_torch.core.presentation import plain_values  # noqa: PLC0415
-
-    gain = plain_values(verdict.predicted_gain.nanmean())
-    return {"outcome": verdict.overall, "predicted_gain_db": gain, "summary": verdict.sentence}
+def next_step(sentence: str, command: str) -> str:
+    """A step: a sentence, and the command that does it."""
+    return f"{sentence}:\n  {command}"
 
 
 def steps_after_detection(
     result: DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
     """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
-    lines = []
+    steps = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
         target = frames.with_name("restored.tif")
         restore = command_text("restore", frames, target, *settings.arguments, "--vibration", vibration)
-        lines.append(f"restore the frames:\n  {restore}")
+        steps.append(next_step("restore the frames", restore))
     reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
         motion = command_text("motion", frames, *settings.arguments, "--out", "motion.csv")
-        lines.append(f"detect a motion that is not a steady vibration (model='free'):\n  {motion}")
+        steps.append(next_step("detect a motion that is not a steady vibration (model='free')", motion))
     if reasons:
-        lines.append("follow the remedies that the reasons above name")
-    return lines
+        steps.append("follow the remedies that the reasons above name")
+    return steps
 
 
 def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
     """The step to write a page about a restored stack."""
     page = command_text("report", frames, out, *settings.arguments, *more)
-    return f"write a page with all figures and the sharpness before and after:\n  {page}"
-
-
-def step_with_force(command: str, result: RestoredFrames, frames: Path, out: Path, settings: Config) -> list[str]:
-    """The step to look at restored frames that were judged no better than the input."""
-    if result.restored or not result.moves:
-        return []
-    forced = command_text(command, frames, out, *settings.arguments, "--force")
-    return [f"inspect the restored frames nevertheless:\n  {forced}"]
+    return next_step("write a page with all figures and the sharpness before and after", page)
 
 
 def step_parts(step: str) -> tuple[str, str]:

@@ -1,110 +1,127 @@
-"""Commands whose parameters are groups of options, and their flat options on the command line."""
+"""Commands as functions of a group of options, whose fields are the arguments and options of the command line."""
 
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
+from pydantic import Field
 
 from rsvib_torch.commands.terminal import Answer, output_of, show_answer
-from rsvib_torch.core.validation import fields_of, members_of
+from rsvib_torch.core.validation import fields_of, members_of, options
 from rsvib_torch.options import COMMAND_LINE
 
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print the answer as JSON on standard output, and nothing else there.")
-]
-QuietOption = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors, and no progress.")
-]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")]
+
+def argument(text: str, **form: Any) -> Any:
+    """An argument of a command; ``form`` has ``default`` and arguments of ``typer.Argument``."""
+    return Field(form.pop("default", ...), description=text, json_schema_extra={"positional": True, **form})
+
+
+def option(default: Any, text: str, *names: str, **form: Any) -> Any:
+    """An option of a command, by default of the name of its field; ``form`` has arguments of ``typer.Option``."""
+    return Field(default, description=text, json_schema_extra={"names": list(names), **form})
 
 
 @dataclass(frozen=True)
-class MadeBy:
-    """Mark of a parameter of a command whose value a function makes of several options.
+class Given:
+    """Mark of a field of a command: a dictionary of those options of another group that are given.
 
     Attributes:
-        build: The function. Those of its arguments that are options take the place of the parameter; others are
-            arguments of the command, or None if it has none of their name.
+        group: The group.
+        names: Its options; by default those whose fields are marked by ``COMMAND_LINE``.
+        default: Where the default comes from, before that of the group.
+        context: What comes before the description of each.
+        forms: For options that are stated in another form than the field: arguments of ``option``.
     """
 
-    build: Callable[..., Any]
+    group: Any
+    names: tuple[str, ...] = ()
+    default: str = ""
+    context: str = ""
+    forms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def parameters(self) -> Iterator[inspect.Parameter]:
+        """The options as parameters, in the order of the group."""
+        for name, stated in fields_of(self.group).items():
+            marked = not self.names and stated.json_schema_extra == COMMAND_LINE
+            if name in self.names or name in self.forms or marked:
+                usual = [self.default] * bool(self.default)
+                if not stated.is_required() and stated.default not in (None, False, "auto"):
+                    usual.append(str(stated.default))
+                # the first sentence of the description
+                text = re.split(r"(?<=\.) (?=[A-Z])", stated.description.replace("``", "").replace('"', ""))[0]
+                form = {"text": self.context + text, "show_default": ", or ".join(usual) or False}
+                yield _parameter(name, stated.annotation, None, {**form, **self.forms.get(name, {})})
 
 
-def _common(*, as_json: JsonOption = False, quiet: QuietOption = False, debug: DebugOption = False) -> None:
+@options
+class _OutputOptions:
     """Options of all commands; ``--debug`` is read where errors are printed."""
 
-
-def _build_of(parameter: inspect.Parameter) -> Callable[..., Any] | None:
-    """The function that makes the value of a parameter; None for an option."""
-    marks = (mark for mark in getattr(parameter.annotation, "__metadata__", ()) if isinstance(mark, MadeBy))
-    return next((mark.build for mark in marks), None)
+    as_json: bool = option(False, "Print the answer as JSON on standard output, and nothing else there.", "--json")
+    quiet: bool = option(False, "Print nothing but warnings and errors, and no progress.", "--quiet", "-q")
+    debug: bool = option(False, "Print the traceback of an error.")
 
 
-def _options_of(function: Callable[..., Any]) -> Iterator[inspect.Parameter]:
-    """Options of a command or of a function of ``MadeBy``, and of those that make its arguments."""
-    for parameter in inspect.signature(function, eval_str=True).parameters.values():
-        if build := _build_of(parameter):
-            yield from _options_of(build)
-        elif get_origin(parameter.annotation) is Annotated:
-            yield parameter
+def _parameter(name: str, annotation: Any, default: Any, form: Mapping[str, Any]) -> inspect.Parameter:
+    """A field as typer reads it; the group checks bounds, and has alternatives such as "auto" that options lack."""
+    form = dict(form)
+    members = [form.pop("kind")] if "kind" in form else members_of(annotation)
+    choices = tuple(choice for member in members if get_origin(member) is Literal for choice in get_args(member))
+    plain = [member for member in members if get_origin(member) is not Literal]
+    kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
+    kind = Literal[choices] if not plain and kind is str else kind
+    names = form.pop("names", ()) or ([f"--{name.replace('_', '-')}"] if kind is bool else [])
+    make: Any = typer.Argument if form.pop("positional", False) else typer.Option
+    info = make(*names, help=form.pop("text"), **{"show_default": True} | form)
+    default = False if default is None and kind is bool else default
+    stated: Any = Annotated[kind | None if default is None else kind, info]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=stated)
 
 
-def _called(function: Callable[..., Any], given: Mapping[str, Any]) -> Any:
-    """Call a function with the options that are its arguments; those with the mark ``MadeBy`` are made of several."""
-    values = {}
-    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
-        build = _build_of(parameter)
-        values[name] = given.get(name) if build is None else _called(build, given)
-    return function(**values)
+def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:
+    """Name of each field of a command with its parameters: arguments, own options, then those that commands share."""
+    depth = {name: place for place, kind in enumerate(group.__mro__) for name in inspect.get_annotations(kind)}
+    fields = fields_of(group)
+    for name in sorted(fields, key=lambda name: -1 if _is_argument(fields[name]) else depth[name]):
+        mark = next((mark for mark in fields[name].metadata if isinstance(mark, Given)), None)
+        if mark is not None:
+            yield from ((name, parameter) for parameter in mark.parameters())
+        else:
+            stated = fields[name]
+            default = inspect.Parameter.empty if stated.is_required() else stated.default
+            yield name, _parameter(name, stated.annotation, default, {"text": stated.description, **_form(stated)})
 
 
-def flat_command(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
+def _form(stated: Any) -> dict[str, Any]:
+    return stated.json_schema_extra or {}
+
+
+def _is_argument(stated: Any) -> bool:
+    return bool(_form(stated).get("positional"))
+
+
+def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., None]:
     """A command as typer calls it: its options are flat, and its answer is printed."""
+    (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
+    fields = list(_parameters(group))
 
     def flat(**given: Any) -> None:
+        values: dict[str, Any] = {}
+        for place, parameter in fields:
+            value = given[parameter.name]
+            if place == parameter.name:
+                values[place] = value
+            else:
+                is_given = value is not None and value is not False
+                values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         with output_of(as_json=given["as_json"], quiet=given["quiet"]):
-            show_answer(name, _called(command, given))
+            show_answer(name, command(group(**values)))
 
-    parameters = sorted([*_options_of(command), *_options_of(_common)], key=lambda parameter: parameter.kind)
+    parameters = [parameter for _, parameter in (*fields, *_parameters(_OutputOptions))]
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     flat.__doc__ = command.__doc__
     return flat
-
-
-def group_arguments(group: Any, forms: Mapping[str, Any] | None = None) -> Callable[..., dict[str, Any]]:
-    """A function for ``MadeBy`` that returns those options of a group that are given on the command line.
-
-    Args:
-        group: The group; options whose field is marked by ``COMMAND_LINE`` are options of the command.
-        forms: Annotations for typer of further options, and of those that are stated in another form than the field.
-    """
-
-    def given_options(**given: Any) -> dict[str, Any]:
-        return {name: value for name, value in given.items() if value is not None}
-
-    known = forms or {}
-    given_options.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=known.get(name) or _form(field)
-            )
-            for name, field in fields_of(group).items()
-            if name in known or field.json_schema_extra == COMMAND_LINE
-        ]
-    )
-    return given_options
-
-
-def _form(field: Any) -> Any:
-    """Annotation for typer of an option of a group: a number, or choices; the group checks the value."""
-    members = members_of(field.annotation)
-    choices = tuple(choice for member in members if get_origin(member) is Literal for choice in get_args(member))
-    numbers = [member for member in members if member in (int, float)] or [type(choices[0])]
-    kind: Any = Literal[choices] if numbers == [str] else numbers[0]
-    text = re.split(r"(?<=\.) (?=[A-Z])", field.description.replace("``", "").replace('"', ""))[0]  # first sentence
-    default = "" if field.default in (None, "auto") else f", or {field.default}"
-    return Annotated[kind | None, typer.Option(help=text, show_default=f"from the configuration{default}")]

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsvib_torch import io
-from rsvib_torch.commands.answers import command_text
-from rsvib_torch.commands.flat_command import MadeBy, group_arguments
-from rsvib_torch.commands.shared_options import rate, seconds, sensor_forms, stated_rate
+from rsvib_torch.commands.answers import command_text, next_step
+from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_rate
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.config import SensorSection, presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.text import measured_text, printable, text_table
-from rsvib_torch.core.validation import MistakesError, fields_of
+from rsvib_torch.core.validation import MistakesError, fields_of, options
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorTiming
 
@@ -30,44 +30,40 @@ if TYPE_CHECKING:
 _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(SensorSection).items()}
 
 
-def init(
-    frames: Annotated[
-        Path | None,
-        typer.Argument(help="Stack of frames of the camera; its size, frame rate and times are read."),
-    ] = None,
-    *,
-    out: Annotated[Path, typer.Option(help="Configuration file to write.")] = Path("camera.toml"),
+@options
+class InitOptions:
+    """Options of ``init``."""
+
+    frames: Path | None = argument(
+        "Stack of frames of the camera; its size, frame rate and times are read.", default=None
+    )
+    out: Path = option(Path("camera.toml"), "Configuration file to write.")
     sensor: Annotated[
         dict[str, Any],
-        MadeBy(
-            group_arguments(
-                SensorSection,
-                sensor_forms("")
-                | {
-                    "full_scale": Annotated[
-                        float | None,
-                        typer.Option(
-                            help="Count that corresponds to full scale, e.g. 4095 for 12 bits.",
-                            show_default="from the file",
-                        ),
-                    ]
+        Given(
+            SensorSection,
+            forms={
+                **SENSOR_FORMS,
+                "full_scale": {
+                    "text": "Count that corresponds to full scale, e.g. 4095 for 12 bits.",
+                    "show_default": "from the file",
                 },
-            )
+            },
         ),
-    ],
-    camera: Annotated[
-        str | None,
-        typer.Option(help="Model of the camera, for its measured row time (rsvib cameras lists them)."),
-    ] = None,
-    preset: Annotated[str | None, typer.Option(help=f"Copy a preset instead: {', '.join(presets())}.")] = None,
-    list_presets: Annotated[bool, typer.Option("--list-presets", help="List the presets and exit.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing configuration file.")] = False,
-) -> Answer:
+    ]
+    camera: str | None = option(None, "Model of the camera, for its measured row time (rsvib cameras lists them).")
+    preset: str | None = option(None, f"Copy a preset instead: {', '.join(presets())}.")
+    list_presets: bool = option(False, "List the presets and exit.")
+    overwrite: bool = option(False, "Replace an existing configuration file.")
+
+
+def init(given: InitOptions) -> Answer:
     """Write a configuration file for the camera of a stack of frames.
 
     What the file does not state is taken from the options, or asked in a terminal with an explanation where to find it.
     """
-    if list_presets:
+    frames, out, sensor, camera, preset = given.frames, given.out, given.sensor, given.camera, given.preset
+    if given.list_presets:
         listed = {name: _first_comment(text) for name, text in presets().items()}
         return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
     if preset is not None and (frames is not None or sensor or camera is not None):
@@ -76,7 +72,7 @@ def init(
         raise ValueError("--camera and --row-time both state the row time; give one of them")
     if preset is None and frames is None:
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
-    if out.exists() and not overwrite:
+    if out.exists() and not given.overwrite:
         raise ValueError(f"{out} exists; --overwrite replaces it, --out FILE writes another file")
     check_outputs([out], [] if frames is None else io.stack_files(frames))
     check_writable(out)
@@ -90,7 +86,7 @@ def init(
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
     step = command_text("run", frames or "FRAMES", "results", "--config", out)
-    return Answer({}, {}, [out], [f"detect the vibration and restore the frames:\n  {step}"])
+    return Answer({}, {}, [out], [next_step("detect the vibration and restore the frames", step)])
 
 
 def _first_comment(text: str) -> str:
@@ -100,14 +96,20 @@ def _first_comment(text: str) -> str:
     return " ".join(line.removeprefix("#").strip() for line in lines[:end])
 
 
-def cameras(
-    search: Annotated[list[str] | None, typer.Argument(help="Words of its name, e.g. iphone 12.")] = None,
-) -> Answer:
-    """List the modes of camera models whose readout time is known, with their row time.
+@options
+class CamerasOptions:
+    """Options of ``cameras``."""
 
-    Median and spread of calibrations by users of Gyroflow (CC0 1.0). rsvib init --camera NAME takes the row time.
+    search: list[str] | None = argument("Words of its name, e.g. iphone 12.", default=None)
+
+
+def cameras(given: CamerasOptions) -> Answer:
+    """List camera models with known row times.
+
+    A line for each mode whose readout time is known: median and spread of calibrations by users of Gyroflow (CC0
+    1.0). rsvib init --camera NAME takes the row time.
     """
-    modes = find_cameras(" ".join(search or ()))
+    modes = find_cameras(" ".join(given.search or ()))
     head = ("brand", "model", "view", "width x height", "fps", "readout (ms)", "row time (us)", "entries")
     rows = [
         (
@@ -202,12 +204,12 @@ def _complete(values: dict[str, Any], rows: int, likely: Mapping[str, float], pr
     missing = {name: question for name, question in questions.items() if name not in values}
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         lines = [
-            f"{option} is missing. {_hint(name, values, rows, likely, proposal)}"
-            for name, (option, _) in missing.items()
+            f"{stated} is missing. {_hint(name, values, rows, likely, proposal)}"
+            for name, (stated, _) in missing.items()
         ]
         if lines:
             raise MistakesError(lines)
-    for name, (option, convert) in missing.items():
+    for name, (stated, convert) in missing.items():
         typer.echo(f"\n{_hint(name, values, rows, likely, proposal)}", err=True)
         limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
         longest = limits[name] / values["frame_rate"] if name in limits else math.inf
@@ -221,7 +223,7 @@ def _complete(values: dict[str, Any], rows: int, likely: Mapping[str, float], pr
 
         default = f"{likely[name]:.6g}" if name in likely else None
         values[name] = typer.prompt(
-            option.strip("-").replace("-", " "), default=default, value_proc=checked_answer, err=True
+            stated.strip("-").replace("-", " "), default=default, value_proc=checked_answer, err=True
         )
 
 

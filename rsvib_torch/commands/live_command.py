@@ -9,196 +9,192 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
 
-import typer
+from pydantic import Field
 
 from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
-from rsvib_torch.commands.shared_options import (
-    CameraSettings,
-    OverwriteOption,
-    ScaleOption,
-    SourceArgument,
-    check_new,
-    file_of_source,
-)
+from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new
 from rsvib_torch.commands.terminal import Answer, error_line
-from rsvib_torch.config import Config
 from rsvib_torch.core.atomic import check_writable
-from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.text import number_of
-from rsvib_torch.options import METHOD_OPTIONS, BorderName, TrackerOptions, method_options
+from rsvib_torch.core.validation import Count, NotNegative, options
+from rsvib_torch.options import BorderName, TrackerOptions, method_options
 
 if TYPE_CHECKING:
+    from rsvib_torch.config import Config
     from rsvib_torch.live import FrameOutput, FrameSource, LiveReport
-    from rsvib_torch.tracking import TrackedFrame, VibrationTracker
+    from rsvib_torch.tracking import TrackedFrame
 
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
+_AT_LEAST_2 = Annotated[int, Field(ge=2)]
 
 
-def live_session(
-    source: SourceArgument,
-    *,
-    settings: CameraSettings,
-    out: Annotated[
-        Path | None, typer.Option(help="Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout.")
-    ] = None,
-    page: Annotated[
-        int | None,
-        typer.Option(metavar="PORT", help="Show the restored frames at http://127.0.0.1:PORT.", min=0, max=65535),
-    ] = None,
-    preview: Annotated[bool, typer.Option("--preview", help="Show the restored frames in a window.")] = False,
-    spectrogram: Annotated[
-        Path | None, typer.Option(metavar="NAME", help="Write the spectrogram of both axes: NAME.png and NAME.zarr.")
-    ] = None,
-    max_frequency: Annotated[float, typer.Option(metavar="HZ", help="Highest frequency of the spectrogram.")] = 250.0,
-    size: Annotated[
-        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the frames on standard input, e.g. 1024x768.")
-    ] = None,
-    pixel_format: Annotated[PixelFormatName, typer.Option(help="Pixels of the frames on standard input.")] = "gray8",
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="Read a file at its own rate, and drop frames like a camera.")
-    ] = False,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            help=f"Restoration method: {', '.join(METHOD_OPTIONS)}.", show_default="from the configuration, or dewarp"
+@options
+class LiveOptions(CameraOptions, RangeOptions):
+    """Options of ``live``."""
+
+    source: str = argument("Number or URL of a camera, - for raw frames on standard input, or a file with frames.")
+    out: Path | None = option(None, "Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout.")
+    page: Annotated[int, Field(ge=0, le=65535)] | None = option(
+        None, "Show the restored frames at http://127.0.0.1:PORT.", metavar="PORT"
+    )
+    preview: bool = option(False, "Show the restored frames in a window.")
+    spectrogram: Path | None = option(
+        None, "Write the spectrogram of both axes: NAME.png and NAME.zarr.", metavar="NAME"
+    )
+    max_frequency: float = option(250.0, "Highest frequency of the spectrogram.", metavar="HZ")
+    size: str | None = option(None, "Size of the frames on standard input, e.g. 1024x768.", metavar="WIDTHxHEIGHT")
+    pixel_format: PixelFormatName = option("gray8", "Pixels of the frames on standard input.")
+    realtime: bool = option(False, "Read a file at its own rate, and drop frames like a camera.")
+    tracker: Annotated[
+        dict[str, Any],
+        Given(
+            TrackerOptions,
+            ("window", "columns"),
+            forms={"method": {"show_default": "from the configuration, or dewarp"}},
         ),
-    ] = None,
-    columns: Annotated[
-        int | None, typer.Option(help="Columns that are measured: those with the most detail.", min=64)
-    ] = TrackerOptions.columns,
-    window: Annotated[
-        int, typer.Option(help="Frames from which the vibration is detected at first.", min=2)
-    ] = TrackerOptions.window,
-    steady: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS",
-            help="Stabilise the image to a straight line through the last part of its path (a camera; a file with "
-            "--realtime).",
-        ),
-    ] = 0.0,
-    border: Annotated[
-        BorderName,
-        typer.Option(
-            help="Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is "
-            "available for videos (rsvib run --video)."
-        ),
-    ] = "mirror",
-    waiting: Annotated[int, typer.Option(help="Frames that wait before the oldest ones are dropped.", min=1)] = 64,
-    num_frames: Annotated[int | None, typer.Option(help="Stop after this number of frames.", min=2)] = None,
-    full_scale: ScaleOption = None,
-    overwrite: OverwriteOption = False,
-) -> Answer:
+    ]
+    steady: NotNegative = option(
+        0.0,
+        "Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime).",
+        metavar="SECONDS",
+    )
+    border: BorderName = option(
+        "mirror",
+        "Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available "
+        "for videos (rsvib run --video).",
+    )
+    waiting: Count = option(64, "Frames that wait before the oldest ones are dropped.")
+    num_frames: _AT_LEAST_2 | None = option(None, "Stop after this number of frames.")
+
+    @cached_property
+    def file(self) -> Path | None:
+        """The frames of a file that are used; None for the number or URL of a camera, and for standard input."""
+        if self.source == "-" or self.is_camera:
+            if self.frame_range is not None:
+                raise ValueError(f"--frames goes with a file, not with {self.source}; --num-frames ends a session")
+            return None
+        if not io.stack_files(self.source)[0].exists():
+            raise FileNotFoundError(f"{self.source}: no such file; a camera is a number or a URL")
+        return self.part_of(Path(self.source))
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether the source is the number or URL of a camera."""
+        return self.source.isdecimal() or "://" in self.source
+
+    @property
+    def written(self) -> Path | None:
+        """The video; None for a pipe."""
+        return None if self.out is None or str(self.out) == "-" else self.out
+
+
+def live_session(given: LiveOptions) -> Answer:
     """Follow the vibration of a running camera, and restore its frames.
 
     The source is never blocked: if frames come faster than they are processed, the oldest waiting ones are dropped and
     counted. Ctrl-C ends the session. The video can be played at any moment, also after a crash or on a full disk.
     """
-    is_camera, is_file = source.isdecimal() or "://" in source, file_of_source(source) is not None
-    check_number("steady", steady, at_least=0.0)
-    _check_options(source, out, size, realtime, border, steady, is_file=is_file)
-    pipe_out = out is not None and str(out) == "-"
-    files = [] if out is None or pipe_out else [out]
-    saved = []
-    if spectrogram is not None:
-        saved = [spectrogram.with_name(spectrogram.name + ending) for ending in (".png", ".zarr")]
-    check_new([*files, *saved], overwrite, [*(io.stack_files(Path(source)) if is_file else []), settings.path])
+    settings = given.settings_for(None if given.file is None else Path(given.source), given.frame_range)
+    _check_options(given)
+    files, saved = [] if given.written is None else [given.written], []
+    if given.spectrogram is not None:
+        saved = [given.spectrogram.with_name(given.spectrogram.name + ending) for ending in (".png", ".zarr")]
+    inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
+    check_new([*files, *saved], given.overwrite, inputs)
     for path in [*files, *saved]:
         check_writable(path)
-    options = dict(settings.restoration)
-    name: Any = method or options.get("method", "dewarp")
-    options = {key: value for key, value in options.items() if key in method_options(name) and key != "joint"}
-
-    def opened() -> FrameSource:
-        if is_camera:
-            return live.CameraSource(int(source) if source.isdecimal() else source, settings.timing)
-        if source == "-":
-            # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
-            stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-            return live.PipeSource(stream, _size(size or ""), pixel_format, settings.timing)
-        scale = full_scale if full_scale is not None else settings.full_scale
-        return live.FileSource(Path(source), settings.timing, scale, realtime=realtime)
-
-    drops = not is_file or realtime
-
-    def tracker(scale: float | None) -> VibrationTracker:
-        return tracking.VibrationTracker(
-            settings.timing,
-            window=window,
-            columns=columns,
-            method=name,
-            steady=steady,
-            wobble=steady > 0,
-            full_scale=full_scale if full_scale is not None and not is_file else scale,
-            channels="first",
-            **options,
-        )
-
-    frames_of = opened()
-    with _frames_on_standard_output(enabled=pipe_out) as stream:
-        outputs = _outputs(settings, preview, page, stream, None if pipe_out else out, overwrite)
+    method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
+    restoration = {
+        name: value
+        for name, value in settings.restoration.items()
+        if name in method_options(method) and name != "joint"
+    }
+    drops = given.file is None or given.realtime
+    source = _source(given, settings)
+    with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
+        outputs = _outputs(given, settings, stream)
         shown = [output for output in outputs if isinstance(output, live.PageOutput)]
-        collected = None if spectrogram is None else live.Spectrogram(settings.timing, max_frequency=max_frequency)
+        spectrogram = None
+        if given.spectrogram is not None:
+            spectrogram = live.Spectrogram(settings.timing, max_frequency=given.max_frequency)
 
         def save() -> None:
-            if collected is not None and spectrogram is not None:
-                check_new(saved, overwrite, [])  # another program may have written them meanwhile
-                live.save_spectrogram(spectrogram, collected)
+            if spectrogram is not None and given.spectrogram is not None:
+                check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
+                live.save_spectrogram(given.spectrogram, spectrogram)
 
+        tracker = tracking.VibrationTracker(
+            settings.timing,
+            **restoration | given.tracker | {"method": method},
+            steady=given.steady,
+            wobble=given.steady > 0,
+            full_scale=source.full_scale if given.full_scale is None or given.file else given.full_scale,
+            channels="first",
+        )
         report = live.run_live(
-            frames_of,
-            tracker(frames_of.full_scale),
+            source,
+            tracker,
             outputs,
-            border=tracking.VideoBorder(border),
+            border=tracking.VideoBorder(given.border),
             drops=drops,
-            waiting=waiting,
-            max_frames=num_frames,
-            spectrogram=collected,
+            waiting=given.waiting,
+            max_frames=given.num_frames,
+            spectrogram=spectrogram,
             progress=_StateText(shown[0]) if shown else None,
             save=save,
         )
     if report.frames == 0:
-        raise ValueError(f"{source}: no frame was read")
+        raise ValueError(f"{given.source}: no frame was read")
     if report.dropped or report.lost:
         error_line(_missing(report), "warning")
-    return _answer(source, report, [*files, *saved], drops=drops)
+    return _answer(given.source, report, [*files, *saved], drops=drops)
 
 
-def _check_options(
-    source: str, out: Path | None, size: str | None, realtime: bool, border: str, steady: float, *, is_file: bool
-) -> None:
+def _source(given: LiveOptions, settings: Config) -> FrameSource:
+    """The source of the frames."""
+    if given.is_camera:
+        return live.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
+    if given.file is None:
+        # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
+        stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
+        return live.PipeSource(stream, _size(given.size or ""), given.pixel_format, settings.timing)
+    scale = given.full_scale if given.full_scale is not None else settings.full_scale
+    return live.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
+
+
+def _check_options(given: LiveOptions) -> None:
     """Refuse options that do not go with the source."""
-    if source == "-" and size is None:
+    if given.source == "-" and given.size is None:
         raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
-    if source == "-" and size is not None:
-        _size(size)
-    if source != "-" and size is not None:
-        raise ValueError(f"--size goes with frames on standard input (-), not with {source}")
-    if realtime and not is_file:
-        raise ValueError(f"--realtime goes with a file, not with {source}: a camera has its own rate")
-    if border == "crop" or (steady > 0 and is_file and not realtime):
-        option = "--border crop" if border == "crop" else "--steady of a file"
-        remedy = f"rsvib run FRAMES OUT --video --steady {steady:g} --border {border}"
+    if given.source != "-" and given.size is not None:
+        raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
+    if given.size is not None:
+        _size(given.size)
+    if given.realtime and given.file is None:
+        raise ValueError(f"--realtime goes with a file, not with {given.source}: a camera has its own rate")
+    if given.border == "crop" or (given.steady > 0 and given.file is not None and not given.realtime):
+        option = "--border crop" if given.border == "crop" else "--steady of a file"
+        remedy = f"rsvib run FRAMES OUT --video --steady {given.steady:g} --border {given.border}"
         raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
 
 
-def _outputs(
-    settings: Config, preview: bool, page: int | None, stream: BinaryIO | None, out: Path | None, overwrite: bool
-) -> list[FrameOutput]:
+def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[FrameOutput]:
     """The outputs that the options name."""
     outputs: list[FrameOutput] = []
-    if out is not None:
-        outputs.append(live.VideoOutput(out, settings.timing.frame_rate, overwrite=overwrite))
+    if given.written is not None:
+        outputs.append(live.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
     if stream is not None:
         outputs.append(live.PipeOutput(stream))
-    if preview:
+    if given.preview:
         outputs.append(live.PreviewOutput())
-    if page is not None:  # the last one, because it is the only one that is opened before the first frame
-        served = live.PageOutput(page)
+    if given.page is not None:  # the last one, because it is the only one that is opened before the first frame
+        served = live.PageOutput(given.page)
         outputs.append(served)
         error_line(f"the page is {served.url}", "note")
     return outputs
@@ -265,15 +261,9 @@ def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) 
             f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames"
         )
     found = report.detection
+    names = ("frames", "tracked", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
     data = {
-        "frames": report.frames,
-        "tracked": report.tracked,
-        "predicted": report.predicted,
-        "unusable": report.unusable,
-        "dropped": report.dropped,
-        "lost": report.lost,
-        "detections": report.detections,
-        "seconds": report.seconds,
+        **{name: getattr(report, name) for name in names},
         "delay_median": report.latency(0.5) if drops else None,
         "delay_99": report.latency(0.99) if drops else None,
         "detection": None if found is None else detection_data(found),

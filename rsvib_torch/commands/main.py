@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
+from rsvib_torch.commands.run_stack import run
 from rsvib_torch.commands.terminal import (
     Answer,
     error_line,
@@ -22,140 +24,79 @@ from rsvib_torch.commands.terminal import (
     running,
     warnings_in_one_line,
 )
-from rsvib_torch.commands.unexpected_errors import in_one_line, system_error
 from rsvib_torch.core.validation import MistakesError
 
-# Commands in the order of the help: name, function, line in the list of commands, and two examples.
-_COMMANDS: tuple[tuple[str, Callable[..., Answer], str, str], ...] = (
-    (
-        "init",
-        init,
-        "Write a configuration file for the camera of a stack.",
-        """
-        rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
-        rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
-        """,
-    ),
-    (
-        "cameras",
-        cameras,
-        "List camera models with known row times.",
-        """
-        rsvib cameras iphone 12
-        rsvib cameras gopro --json
-        """,
-    ),
-    (
-        "run",
-        stack_commands.run,
-        "Detect the vibration, restore the frames, judge the result.",
-        """
-        rsvib run frames.tif results --config camera.toml
-        rsvib run long.tif results --config camera.toml --memory 2GB --resume
-        """,
-    ),
-    (
-        "detect",
-        stack_commands.detect,
-        "Detect the vibration in a stack of frames.",
-        """
-        rsvib detect frames.tif --config camera.toml --out found
-        rsvib detect frames.tif --config camera.toml --out found --overwrite --json
-        """,
-    ),
-    (
-        "restore",
-        stack_commands.restore_frames,
-        "Restore a stack of frames with a detected vibration.",
-        """
-        rsvib restore frames.tif restored.tif --config camera.toml \\
-              --vibration found/vibration.json
-        rsvib restore frames.tif still.tif --config camera.toml \\
-              --vibration found/vibration.json --joint all
-        """,
-    ),
-    (
-        "report",
-        stack_commands.report,
-        "Detect, restore, and write an HTML page with all figures.",
-        """
-        rsvib report frames.tif report --config camera.toml
-        rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
-        """,
-    ),
-    (
-        "motion",
-        motion_commands.motion,
-        "Detect motion that is not a steady vibration.",
-        """
-        rsvib motion frames.tif --config camera.toml --out motion.csv
-        rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
-        """,
-    ),
-    (
-        "known",
-        motion_commands.known,
-        "Restore frames with the recording of a gyroscope.",
-        """
-        rsvib known frames.tif restored.tif --config camera.toml \\
-              --motion gyroscope.csv --unit rad/s --focal-length 1800
-        rsvib known frames.tif restored.tif --config camera.toml \\
-              --motion motion.csv --unit px --offset 0
-        """,
-    ),
-    (
-        "calibrate",
-        motion_commands.calibrate,
-        "Measure row time and exposure with a flickering light.",
-        """
-        rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
-              --out camera.toml
-        rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
-        """,
-    ),
-    (
-        "live",
-        live_session,
-        "Follow the vibration of a running camera, and restore its frames.",
-        """
-        rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
-        rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
-              --steady 1
-        """,
-    ),
-    (
-        "export",
-        export,
-        "Write a detected vibration for other programs.",
-        """
-        rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
-              --focal-length 1800
-        rsvib export found/vibration.json frame.json --isd camera.json
-        """,
-    ),
-    (
-        "simulate",
-        stack_commands.simulate,
-        "Simulate frames of a vibrating camera.",
-        """
-        rsvib simulate scene.png frames.tif --config camera.toml
-        rsvib simulate scene.png frames.npy --config camera.toml --seed 2
-        """,
-    ),
-)
+_COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
+    "init": init,
+    "cameras": cameras,
+    "run": run,
+    "detect": stack_commands.detect,
+    "restore": stack_commands.restore_frames,
+    "report": stack_commands.report,
+    "motion": motion_commands.motion,
+    "known": motion_commands.known,
+    "calibrate": motion_commands.calibrate,
+    "live": live_session,
+    "export": export,
+    "simulate": stack_commands.simulate,
+}
+_EXAMPLES = """
+  rsvib init frames.tif --row-time 14.6us --exposure 1/500 --frame-rate 29.97
+  rsvib init clip.mp4 --camera "iPhone 12" --exposure 1/500
+  rsvib cameras iphone 12
+  rsvib cameras gopro --json
+  rsvib run frames.tif results --config camera.toml
+  rsvib run long.tif results --config camera.toml --memory 2GB --resume
+  rsvib detect frames.tif --config camera.toml --out found
+  rsvib detect frames.tif --config camera.toml --out found --overwrite --json
+  rsvib restore frames.tif restored.tif --config camera.toml \\
+        --vibration found/vibration.json
+  rsvib restore frames.tif still.tif --config camera.toml \\
+        --vibration found/vibration.json --joint all
+  rsvib report frames.tif report --config camera.toml
+  rsvib report chart.tif report --config camera.toml --edge 200,340,60,40
+  rsvib motion frames.tif --config camera.toml --out motion.csv
+  rsvib motion frames.tif --config camera.toml --out swept.csv --model swept
+  rsvib known frames.tif restored.tif --config camera.toml \\
+        --motion gyroscope.csv --unit rad/s --focal-length 1800
+  rsvib known frames.tif restored.tif --config camera.toml \\
+        --motion motion.csv --unit px --offset 0
+  rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
+        --out camera.toml
+  rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
+  rsvib live 0 --config camera.toml --page 8080 --spectrogram vibration
+  rsvib live rtsp://camera/stream --config camera.toml --out still.mkv \\
+        --steady 1
+  rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
+        --focal-length 1800
+  rsvib export found/vibration.json frame.json --isd camera.json
+  rsvib simulate scene.png frames.tif --config camera.toml
+  rsvib simulate scene.png frames.npy --config camera.toml --seed 2
+"""
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 120}  # characters
 
 
 # plain help texts: rich would read [sensor] as markup and join the lines of the examples
 app = typer.Typer(name="rsvib", rich_markup_mode=None, context_settings=_SETTINGS, pretty_exceptions_enable=False)
-for _name, _function, _help, _examples in _COMMANDS:
+for _name, _function in _COMMANDS.items():
+    _examples = re.findall(rf"^  rsvib {_name} .*(?:\n    .*)*", _EXAMPLES, flags=re.MULTILINE)
     app.command(
         _name,
-        short_help=_help,
-        epilog="\b\nExamples:" + _examples.replace("\n        ", "\n  ").rstrip(),  # \b keeps the lines
+        short_help=(_function.__doc__ or "").partition("\n")[0],
+        epilog="\n".join(["\b\nExamples:", *_examples]),  # \b keeps the lines
         context_settings=_SETTINGS,
     )(flat_command(_name, _function))
 
+_NO_MEMORY = "not enough memory for a stack of this size: process fewer frames at a time"
+# Lines that replace errors without a message for users, by a part of their type and text.
+_REPLACED = {
+    "RecursionError": "the input is nested too deeply",
+    "can't start new thread": "the system cannot start another thread: use fewer workers, or raise the limit of "
+    "processes (ulimit -u)",
+    "MemoryError": _NO_MEMORY,
+    "allocate": _NO_MEMORY,
+    "out of memory": _NO_MEMORY,
+}
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 
 
@@ -213,8 +154,9 @@ def _lines_of(error: Exception) -> Sequence[str]:
         message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
         several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
         return [f"{message}{several}"]
-    is_known = isinstance(error, RecursionError) or system_error(error) is not None
-    return [in_one_line(error) if is_known else f"{in_one_line(error)} (--debug prints the traceback)"]
+    text = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"
+    replaced = [line for part, line in _REPLACED.items() if part in text]
+    return replaced[:1] or [f"unexpected {text} (--debug prints the traceback)"]
 
 
 def main() -> None:

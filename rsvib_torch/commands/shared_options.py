@@ -7,16 +7,18 @@ import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from rsvib_torch import io
-from rsvib_torch.commands.flat_command import MadeBy, group_arguments
+from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, SensorSection, read_config
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.validation import options
 from rsvib_torch.options import RestorationOptions, method_options
 
 if TYPE_CHECKING:
@@ -67,10 +69,7 @@ def rate(text: str) -> float:
         >>> round(rate("30000/1001"), 6)
         29.97003
     """
-    try:
-        return float(Fraction(text))
-    except (ValueError, ArithmeticError) as error:
-        raise typer.BadParameter(f"expected a number such as 29.97 or 30000/1001, got {text!r}") from error
+    return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
 def _range_of_frames(text: str) -> str:
@@ -80,227 +79,199 @@ def _range_of_frames(text: str) -> str:
     return text
 
 
-RangeOption = Annotated[
-    str | None,
-    typer.Option(
+TIME: dict[str, Any] = {"parser": seconds, "metavar": "TIME"}  # form of an option
+# Forms of the keys of [sensor] that are options.
+SENSOR_FORMS: dict[str, dict[str, Any]] = {
+    "row_time": {"text": "Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.", **TIME},
+    "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
+    "frame_rate": {
+        "text": "Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
+        "parser": rate,
+        "metavar": "NUMBER",
+        "show_default": "from the file, or the configuration",
+    },
+    "scan_axis": {"text": "y: image rows are exposed one after another; x: image columns."},
+    "readout_direction": {"text": "forward: the top row (or left column) is read first; reverse: the last one is."},
+}
+
+
+@options
+class RangeOptions:
+    """A part of the frames of a stack."""
+
+    frame_range: str | None = option(
+        None,
+        "Use only the frames START to END - 1, counted from 0; times count from the first of them.",
         "--frames",
         parser=_range_of_frames,
         metavar="START:END",
-        help="Use only the frames START to END - 1, counted from 0; times count from the first of them.",
         show_default="all frames",
-    ),
-]
+    )
+
+    def part_of(self, path: Path) -> Path:
+        """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
+        return path if self.frame_range is None else path.with_name(f"{path.name}[{self.frame_range}]")
 
 
-def some_frames(
-    frames: Annotated[
-        Path,
-        typer.Argument(
-            help="Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."
+@options
+class DeviceOptions:
+    """Where it is computed."""
+
+    device: DeviceName = option("auto", "Device for the computation; auto uses a GPU if there is one.")
+
+    @cached_property
+    def torch_device(self) -> "torch.device":
+        """The device.
+
+        Raises:
+            ValueError: If there is no CUDA device.
+        """
+        import torch  # noqa: PLC0415
+
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
+        return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+@options
+class CameraOptions:
+    """The camera, and what all commands have that use one."""
+
+    config: Path | None = option(
+        None,
+        "TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate.",
+    )
+    sensor: Annotated[dict[str, Any], Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
+    readout_time: float | None = option(
+        None, "Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time.", **TIME
+    )
+    full_scale: float | None = option(
+        None,
+        "Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits.",
+        show_default="from the file, or the configuration",
+    )
+    overwrite: bool = option(False, "Replace results that exist already.")
+
+    def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
+        """Configuration file and the options that replace its keys, or the options alone.
+
+        Without either the frame rate is the one that the file of the frames states.
+        """
+        sensor = self.sensor
+        if self.readout_time is not None:
+            if self.config is not None or "row_time" in sensor or frames is None:
+                raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
+            shape = io.read_stack_info(frames).shape
+            sensor = sensor | {"row_time": self.readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
+        missing = [option for name, option in _TIMES.items() if name not in sensor]
+        if self.config is None and missing == ["--frame-rate"] and frames is not None:
+            frame_rate = stated_rate(io.read_stack_info(frames))
+            if frame_rate is not None:
+                note(f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it")
+                sensor, missing = sensor | {"frame_rate": frame_rate}, []
+        if self.config is None and missing:
+            raise ValueError(
+                f"the camera is not described: give {', '.join(missing)}, or --config FILE (rsvib init FRAMES writes "
+                "such a file and explains its values)"
+            )
+        settings = read_config(self.config, sensor=sensor)
+        starts = settings.timing.frame_start_times
+        if frame_range is not None and starts is not None:  # those of the file are read with its frames
+            first, _, end = frame_range.partition(":")
+            used = list(starts)[int(first or 0) : int(end) if end else None]
+            relative = tuple(float(start - used[0]) for start in used)
+            settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative or starts))
+        arguments = [] if self.config is None else ["--config", str(self.config)]
+        for name, value in sensor.items():
+            arguments += [_TIMES.get(name, f"--{name.replace('_', '-')}")]
+            arguments += [f"{value:.10g}" if isinstance(value, float) else value]
+        if self.full_scale is not None:
+            arguments += ["--full-scale", f"{self.full_scale:.10g}"]
+        return replace(settings, arguments=tuple(arguments))
+
+
+@options
+class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
+    """A command that reads a stack of frames."""
+
+    frames: Path = argument(
+        "Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."
+    )
+
+    @cached_property
+    def stack(self) -> Path:
+        """The path of the frames that are used."""
+        return self.part_of(self.frames)
+
+    @cached_property
+    def settings(self) -> Config:
+        """The camera and the options of the configuration."""
+        return self.settings_for(self.frames, self.frame_range)
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that are read."""
+        return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
+
+    def planned_restoration(
+        self, given: Mapping[str, Any] | None = None
+    ) -> "tuple[StackInfo, float | None, dict[str, Any]]":
+        """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``.
+
+        Raises:
+            ValueError: If a value is out of range.
+        """
+        info = io.read_stack_info(self.stack)
+        scale = full_scale_of(self.stack, info, self.settings, self.full_scale)
+        return info, scale, _restoration_options(info, scale, self.settings, given or {})
+
+
+@options
+class RestorationCommand(StackCommand):
+    """A command that restores the frames with options of ``restore``."""
+
+    restoration: Annotated[
+        dict[str, Any],
+        Given(
+            RestorationOptions,
+            default="from the configuration",
+            forms={
+                "joint": {
+                    "text": "Number of neighbouring frames that are restored jointly, or 'all' for one image of all "
+                    "frames (of each window).",
+                    "kind": str,
+                },
+                "optics": {
+                    "names": ["--optics-sigma"],
+                    "text": "Standard deviation of the Gaussian blur of the lens in px, before pixels without gaps: "
+                    "restored frames are sharpened to half a point of their grid. Section [restoration.optics] "
+                    "describes other optics.",
+                    "kind": float,
+                },
+            },
         ),
-    ],
-    *,
-    frame_range: RangeOption = None,
-) -> Path:
-    """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
-    return frames if frame_range is None else frames.with_name(f"{frames.name}[{frame_range}]")
+    ]
+    force: bool = option(False, "Write the restored frames even if they are judged no better than the input.")
 
 
-def _some_of_each(
-    frames: Annotated[list[Path], typer.Argument(help="One or more stacks of frames: TIFF, PNG, video ...")],
-    *,
-    frame_range: RangeOption = None,
-) -> list[Path]:
-    """The paths of several stacks, as ``some_frames``."""
-    return [some_frames(path, frame_range=frame_range) for path in frames]
+def restored_argument() -> Any:
+    """The stack that commands write."""
+    return argument(
+        "Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and "
+        ".mkv are videos with the time stamps and the sound of the input."
+    )
 
 
-def _some_of_source(
-    source: Annotated[
-        str,
-        typer.Argument(help="Number or URL of a camera, - for raw frames on standard input, or a file with frames."),
-    ],
-    *,
-    frame_range: RangeOption = None,
-) -> str:
-    """A source of frames, or the frames that are used of a file."""
-    if frame_range is None:
-        return source
-    file = file_of_source(source)
-    if file is None:
-        raise ValueError(f"--frames goes with a file, not with {source}; --num-frames ends a session")
-    return str(some_frames(file, frame_range=frame_range))
+@options
+class PixelSizeOptions:
+    """Units of length."""
 
-
-FramesArgument = Annotated[Path, MadeBy(some_frames)]
-StacksArgument = Annotated[list[Path], MadeBy(_some_of_each)]
-SourceArgument = Annotated[str, MadeBy(_some_of_source)]
-RestoredArgument = Annotated[
-    Path,
-    typer.Argument(
-        help="Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 "
-        "and .mkv are videos with the time stamps and the sound of the input.",
-    ),
-]
-_ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        help="TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and "
-        "--frame-rate.",
-    ),
-]
-FrameRateOption = Annotated[
-    float | None,
-    typer.Option(
-        parser=rate,
-        metavar="NUMBER",
-        help="Frames per second of the sensor, e.g. 29.97 or 30000/1001.",
-        show_default="from the file, or the configuration",
-    ),
-]
-READOUT_HELP = "forward: the top row (or left column) is read first; reverse: the last one is."
-
-
-def sensor_forms(default: str) -> dict[str, Any]:
-    """Annotations for typer of the keys of ``[sensor]`` that are options; ``default`` precedes that of choices."""
-    return {
-        "row_time": Annotated[
-            float | None,
-            typer.Option(
-                parser=seconds,
-                metavar="TIME",
-                help="Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.",
-            ),
-        ],
-        "exposure_time": Annotated[
-            float | None,
-            typer.Option("--exposure", parser=seconds, metavar="TIME", help="Exposure time, e.g. 1/500 or 2ms."),
-        ],
-        "frame_rate": FrameRateOption,
-        "scan_axis": Annotated[
-            Literal["y", "x"] | None,
-            typer.Option(
-                help="y: image rows are exposed one after another; x: image columns.", show_default=f"{default}y"
-            ),
-        ],
-        "readout_direction": Annotated[
-            Literal["forward", "reverse"] | None, typer.Option(help=READOUT_HELP, show_default=f"{default}forward")
-        ],
-    }
-
-
-DeviceOption = Annotated[DeviceName, typer.Option(help="Device for the computation; auto uses a GPU if there is one.")]
-ScaleOption = Annotated[
-    float | None,
-    typer.Option(
-        help="Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits.",
-        show_default="from the file, or the configuration",
-    ),
-]
-_JointOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Number of neighbouring frames that are restored jointly, or 'all' for one image of all frames (of each "
-        "window).",
-    ),
-]
-_OpticsOption = Annotated[
-    float | None,
-    typer.Option(
-        "--optics-sigma",
-        help="Standard deviation of the Gaussian blur of the lens in px, before pixels without gaps: restored frames "
-        "are sharpened to half a point of their grid. Section [restoration.optics] describes other optics.",
-    ),
-]
-PixelSizeOption = Annotated[
-    float | None,
-    typer.Option(
+    pixel_size: float | None = option(
+        None,
+        "Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s².",
         parser=metres,
         metavar="LENGTH",
-        help="Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and "
-        "m/s².",
-    ),
-]
-ForceOption = Annotated[
-    bool, typer.Option("--force", help="Write the restored frames even if they are judged no better than the input.")
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace results that exist already.")]
-MemoryOption = Annotated[
-    str | None,
-    typer.Option(help="Memory limit of the process, e.g. 2GB.", show_default="three quarters of the free memory"),
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option(
-        help="Number of windows that are processed at the same time, within the memory limit.",
-        show_default="number of processors",
-    ),
-]
-
-
-def _read_camera(
-    *,
-    config: _ConfigOption = None,
-    sensor: Annotated[
-        dict[str, Any], MadeBy(group_arguments(SensorSection, sensor_forms("from the configuration, or ")))
-    ],
-    readout_time: Annotated[
-        float | None,
-        typer.Option(
-            parser=seconds,
-            metavar="TIME",
-            help="Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time.",
-        ),
-    ] = None,
-    frames: Path | None = None,
-    frame_range: str | None = None,
-    source: str | None = None,
-    full_scale: float | None = None,
-) -> Config:
-    """Configuration file and the options that replace its keys, or the options alone.
-
-    Without either the frame rate is the one that the file of the frames states. The full scale is an argument of the
-    commands that follow.
-    """
-    frames = frames if source is None else file_of_source(source)
-    if readout_time is not None:
-        if config is not None or "row_time" in sensor or frames is None:
-            raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
-        shape = io.read_stack_info(frames).shape
-        sensor = sensor | {"row_time": readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
-    missing = [option for name, option in _TIMES.items() if name not in sensor]
-    if config is None and missing == ["--frame-rate"] and frames is not None:
-        frame_rate = stated_rate(io.read_stack_info(frames))
-        if frame_rate is not None:
-            note(f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it")
-            sensor, missing = sensor | {"frame_rate": frame_rate}, []
-    if config is None and missing:
-        raise ValueError(
-            f"the camera is not described: give {', '.join(missing)}, or --config FILE (rsvib init FRAMES writes such "
-            "a file and explains its values)"
-        )
-    settings = read_config(config, sensor=sensor)
-    starts = settings.timing.frame_start_times
-    if frame_range is not None and starts is not None:  # those of the file are read with its frames
-        first, _, end = frame_range.partition(":")
-        used = list(starts)[int(first or 0) : int(end) if end else None]
-        relative = tuple(float(start - used[0]) for start in used)
-        settings = replace(settings, timing=replace(settings.timing, frame_start_times=relative or starts))
-    arguments = [] if config is None else ["--config", str(config)]
-    for name, value in sensor.items():
-        option = _TIMES.get(name, f"--{name.replace('_', '-')}")
-        arguments += [option, f"{value:.10g}" if isinstance(value, float) else value]
-    if full_scale is not None:
-        arguments += ["--full-scale", f"{full_scale:.10g}"]
-    return replace(settings, arguments=tuple(arguments))
-
-
-CameraSettings = Annotated[Config, MadeBy(_read_camera)]
-RestorationArguments = Annotated[
-    dict[str, Any],
-    MadeBy(group_arguments(RestorationOptions, {"joint": _JointOption, "optics": _OpticsOption})),
-]
+    )
 
 
 def stated_rate(info: "StackInfo") -> float | None:
@@ -310,19 +281,6 @@ def stated_rate(info: "StackInfo") -> float | None:
     intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
     period = statistics.median(intervals)
     return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
-
-
-def file_of_source(source: str) -> Path | None:
-    """The file that a source of live frames names; None for the number or URL of a camera, and for standard input.
-
-    Raises:
-        FileNotFoundError: If it does not exist.
-    """
-    if source == "-" or source.isdecimal() or "://" in source:
-        return None
-    if not io.stack_files(source)[0].exists():
-        raise FileNotFoundError(f"{source}: no such file; a camera is a number or a URL")
-    return Path(source)
 
 
 def check_new(
@@ -347,19 +305,6 @@ def check_new(
         )
 
 
-def torch_device(name: DeviceName) -> "torch.device":
-    """Device of that name.
-
-    Raises:
-        ValueError: If there is no CUDA device.
-    """
-    import torch  # noqa: PLC0415
-
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: no CUDA device is available; use auto or cpu")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
     """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration.
 
@@ -379,14 +324,10 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
 
 
 def _restoration_options(
-    info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any] | None = None
+    info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line.
-
-    Raises:
-        ValueError: If a value is out of range.
-    """
-    options, given = dict(config.restoration), dict(given or {})
+    """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
+    options, given = dict(config.restoration), dict(given)
     method = given.get("method", options.get("method", "exact"))
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
@@ -397,7 +338,7 @@ def _restoration_options(
             raise ValueError(f"--joint must be 'all' or a number of frames, got {given['joint']!r}")
         given["joint"] = given["joint"] == "all" or int(given["joint"])
     options |= given
-    RestorationOptions(**options)
+    checked = RestorationOptions(**options)
     if options.get("saturation", "auto") == "auto":
         options.pop("saturation", None)
     if options.get("saturation") is not None:
@@ -405,24 +346,15 @@ def _restoration_options(
             options["saturation"] /= full_scale
     elif info.is_integer and full_scale is not None:
         options["saturation"] = 1.0
-    if options.get("mosaic") is not None:
+    if checked.mosaic is not None:
         from rsvib_torch.frames.mosaic import check_mosaic  # noqa: PLC0415
 
-        check_mosaic(options["mosaic"], info.shape)
-    if options.get("optics") is not None:
+        check_mosaic(checked.mosaic, info.shape)
+    if checked.optics is not None:
         from rsvib_torch.restoration.restore import check_optics  # noqa: PLC0415
 
-        check_optics(RestorationOptions(**options).optics)
+        check_optics(checked.optics)
     return options
-
-
-def planned_restoration(
-    frames: Path, config: Config, full_scale: float | None, given: Mapping[str, Any] | None = None
-) -> "tuple[StackInfo, float | None, dict[str, Any]]":
-    """What the file of a stack states, its full scale, and the options of its restoration."""
-    info = io.read_stack_info(frames)
-    scale = full_scale_of(frames, info, config, full_scale)
-    return info, scale, _restoration_options(info, scale, config, given)
 
 
 def restored_shape(info: "StackInfo", options: Mapping[str, Any]) -> tuple[int, ...]:

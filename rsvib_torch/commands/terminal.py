@@ -6,7 +6,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
@@ -176,35 +176,25 @@ def _progress() -> Progress:
 
 
 @contextmanager
-def working(description: str) -> Iterator[None]:
-    """Show the elapsed time, and progress, rate and remaining time of the loops in the block that report them."""
-    with _progress() as progress:
-        task = progress.add_task(printable(description), total=None)
+def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int, int], None]]:
+    """Show the elapsed time, and progress, rate and remaining time of a loop.
 
-        def show(done: int, total: int, unit: str) -> None:
-            if done == 0:  # another loop begins
-                progress.reset(task, total=total, unit=unit, first=0)
-            progress.update(task, completed=done)
-
-        with listening(show):
-            yield
-
-
-@contextmanager
-def counting(description: str) -> Iterator[Callable[[int, int], None]]:
-    """Show the number of processed frames, their rate and the remaining time.
+    Args:
+        description: What is done.
+        counts: Whether the block reports its frames itself; otherwise, the loops in it report their steps.
 
     Yields:
         A function to call with the number of processed frames and the number of all frames.
     """
     with _progress() as progress:
-        task: Any = None
+        task = progress.add_task(printable(description), total=None)
 
-        def show(done: int, total: int) -> None:
-            nonlocal task
-            if task is None:  # frames of a resumed run do not count for the rate
-                task = progress.add_task(printable(description), total=total, completed=done, unit="frames", first=done)
-            else:
-                progress.update(task, completed=done)
+        def show(done: int, total: int, unit: str = "frames") -> None:
+            if (
+                done == 0 or progress.tasks[0].total is None
+            ):  # another loop; frames of a resumed run are not in the rate
+                progress.reset(task, total=total, unit=unit, first=done)
+            progress.update(task, completed=done)
 
-        yield show
+        with nullcontext() if counts else listening(show):
+            yield show

@@ -11,6 +11,7 @@ from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import error_line, note, working
 from rsvib_torch.core.atomic import check_writable, write_json
+from rsvib_torch.core.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,7 +24,7 @@ OF_WINDOWS = ("manifest.json", "tones.csv", "windows.json", "windows.png")
 
 
 def check_folder(
-    folder: Path, names: Iterable[str], overwrite: bool, inputs: Iterable[Path | None], output: Path | None = None
+    folder: Path, names: Iterable[str], overwrite: bool, inputs: Iterable[Path], output: Path | None = None
 ) -> None:
     """Raise an error if results, among them a stack ``output``, exist in a folder or would replace an input."""
     stack = [] if output is None else io.stack_files(output)
@@ -78,3 +79,10 @@ def note_lost(path: Path, names: Sequence[str]) -> None:
     """Print which metadata of the input a file does not contain."""
     if names:
         note(f"{path}: not kept from the input: {', '.join(names)}")
+
+
+def warn_of_failures(manifest: stacks.StackManifest) -> None:
+    """Print a warning if detection or restoration failed in windows."""
+    failed = sum(record.error is not None for record in manifest.windows)
+    if failed:
+        error_line(f"detection failed in {number_of(failed, 'window')}: see manifest.json", "warning")

@@ -20,11 +20,9 @@ from typing import (
     Self,
     TypeVar,
     Union,
-    Unpack,
     get_args,
     get_origin,
     get_type_hints,
-    is_typeddict,
 )
 
 import numpy as np
@@ -281,12 +279,10 @@ def _hints(owner: Any) -> dict[str, Any]:
     """Annotations of the arguments of a function, or of the fields of a class."""
     given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
     if isinstance(owner, type):
-        return get_type_hints(owner, localns={"Tensor": Tensor})
+        return get_type_hints(owner, localns={"Tensor": Tensor}, include_extras=True)
     names = inspect.unwrap(owner).__globals__
-    hints = get_type_hints(types.SimpleNamespace(__annotations__=given), names, {"Tensor": Tensor, "torch": torch})
-    for name in [name for name, kind in hints.items() if get_origin(kind) is Unpack]:
-        hints |= get_type_hints(get_args(hints.pop(name))[0])
-    return hints
+    known = {"Tensor": Tensor, "torch": torch}
+    return get_type_hints(types.SimpleNamespace(__annotations__=given), names, known, include_extras=True)
 
 
 def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
@@ -321,7 +317,7 @@ def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
         return Number
     if kind is int:
         return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
-    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False) or is_typeddict(kind):
+    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False):
         return Any
     if get_origin(kind) in (os.PathLike, np.ndarray) or (
         isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None

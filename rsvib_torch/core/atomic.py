@@ -16,7 +16,8 @@ from typing import Any, Literal
 from rsvib_torch.core.text import json_text
 
 PART = ".part"  # ending of temporary folders: .NAME.########.part
-_ADDED = len("..12345678.part")  # bytes that names of temporary files have in addition
+_LONGEST_NAME = 255 - len("..12345678.part")  # bytes; of names of which temporary files have longer ones
+Kind = Literal["file", "folder", "tree"]
 
 
 def nearest_folder(path: Path) -> Path:
@@ -126,14 +127,6 @@ def temporary_folder(path: Path) -> Iterator[Path]:
             raise OSError(number, os.strerror(number), str(path)) from error
 
 
-def check_name(path: Path) -> None:
-    """Raise an ``OSError`` if the name of a file to be written is too long, with those that belong to it."""
-    longest = os.pathconf(nearest_folder(path), "PC_NAME_MAX") - _ADDED if hasattr(os, "pathconf") else 255 - _ADDED
-    size = len(os.fsencode(path.name))
-    if size > longest:
-        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {longest} are possible")
-
-
 def check_not_special(path: str | os.PathLike[str]) -> None:
     """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one.
 
@@ -147,45 +140,88 @@ def check_not_special(path: str | os.PathLike[str]) -> None:
         raise FileExistsError(f"cannot write {os.fspath(path)}: it is a device, pipe or socket; choose another name")
 
 
-def check_kind(path: Path, *, folder: bool = False) -> None:
-    """Raise an ``OSError`` if something exists at ``path`` that a file, or a folder, must not replace."""
+def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True) -> None:
+    """Raise an ``OSError`` with the reason if ``path`` must not be replaced by a file, or written into as a folder.
+
+    Args:
+        path: The file or folder to write.
+        kind: As in ``StackFormat``.
+        parent_exists: Whether the folder of a file must exist.
+    """
+    size = len(os.fsencode(path.name))
+    if size > _LONGEST_NAME:
+        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} fit")
     check_not_special(path)
-    if folder and path.exists() and not path.is_dir():
-        raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
-    if not folder and path.is_dir():
+    if kind == "file" and path.is_dir():
         raise IsADirectoryError(f"cannot write {path}: it is a folder")
-
-
-def _check_file_target(path: Path, *, parent_exists: bool = True) -> None:
-    check_kind(path)
-    if parent_exists and not path.absolute().parent.is_dir():
+    if kind == "file" and parent_exists and not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
-
-
-def _check_folder_target(path: Path) -> None:
-    check_kind(path, folder=True)
-    if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+    if kind != "file" and path.exists() and not path.is_dir():
+        raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
+    if kind != "file" and path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
 def check_writable(path: Path, *, folder: bool = False) -> None:
     """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing."""
-    (_check_folder_target if folder else _check_file_target)(path)
+    check_target(path, "folder" if folder else "file")
     with temporary_folder(path):
         pass
 
 
 @contextmanager
-def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a file under a temporary name with its ending; it gets its name when the block ends without exception."""
+def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[str, ...] = ()) -> Iterator[Path]:
+    """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
+
+    It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
+    keeps its other files.
+
+    Args:
+        path: The file or folder.
+        kind: As in ``StackFormat``.
+        companions: Endings of files beside it, as in ``StackFormat``.
+
+    Yields:
+        The temporary name, which the block creates.
+    """
     target = Path(path)
-    _check_file_target(target)
+    endings = (*companions, "")  # what describes a file is there before it
+    check_target(target, kind, parent_exists=False)
     with temporary_folder(target) as folder:
-        part = folder / target.name
-        yield part
-        sync(part)
-        _replace(part, target)
+        yield folder / target.name
+        sync_tree(folder)
+        make_folder(target.parent)
+        if kind == "folder" and target.is_dir():
+            moves = [(file, target / file.name) for file in sorted((folder / target.name).iterdir())]
+        else:
+            moves = [(folder / f"{target.name}{end}", target.with_name(f"{target.name}{end}")) for end in endings]
+        for part, final in moves:
+            check_target(final, "file" if part.is_file() else "folder", parent_exists=False)
+        for part, final in moves:
+            if final.is_file():
+                part.chmod(stat.S_IMODE(final.stat().st_mode))
+            elif final.is_dir():
+                os.replace(final, folder / "old")  # is removed with the temporary folder
+            os.replace(part, final)
+        if kind == "folder":
+            sync(target)
         sync(target.absolute().parent)
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """``whole`` for a file in a folder that must exist."""
+    check_target(Path(path))
+    with whole(path) as part:
+        yield part
+
+
+@contextmanager
+def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """``whole`` for a folder, which is created."""
+    with whole(path, "folder") as part:
+        part.mkdir()
+        yield part
 
 
 def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
@@ -196,65 +232,3 @@ def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None
     """
     with whole_file(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write files into a temporary folder; they are moved when the block ends without an exception.
-
-    The folder and those above it are created. An existing folder keeps its other files; files of the same names are
-    replaced.
-    """
-    target = Path(path)
-    _check_folder_target(target)
-    with temporary_folder(target) as folder:
-        part = folder / "new"
-        part.mkdir()
-        yield part
-        _move_files(part, target)
-
-
-def _move_files(part: Path, target: Path) -> None:
-    files = sorted(part.iterdir())
-    for file in files:
-        _check_file_target(target / file.name, parent_exists=False)
-        sync(file)
-    make_folder(target)
-    for file in files:
-        os.replace(file, target / file.name)
-    sync(target)
-
-
-def move_into_place(
-    part: Path, target: Path, kind: Literal["file", "folder", "tree"] = "file", companions: tuple[str, ...] = ()
-) -> None:
-    """Rename a complete stack, which is on the disk, from its temporary name ``part``.
-
-    It may be repeated after an interruption, and the new name is on the disk when the function returns. An existing
-    file or tree is replaced, an existing folder keeps its other files; ``kind`` and ``companions`` are those of
-    ``StackFormat``.
-    """
-    for name in (target, *(target.with_name(target.name + ending) for ending in companions)):
-        check_not_special(name)
-    for ending in companions:
-        companion = part.with_name(part.name + ending)
-        if companion.exists():
-            os.replace(companion, target.with_name(target.name + ending))
-    if kind == "folder" and target.is_dir():
-        _move_files(part, target)
-        part.rmdir()
-    elif kind == "tree" and target.is_dir():
-        old = part.with_name(f"{part.name}.old")
-        os.replace(target, old)
-        os.replace(part, target)
-        old.unlink() if old.is_symlink() else shutil.rmtree(old)
-    else:
-        _replace(part, target)
-    sync(target.absolute().parent)
-
-
-def _replace(part: Path, target: Path) -> None:
-    """Rename a file; an existing one is replaced, and its permissions are kept."""
-    if target.is_file() and part.is_file():
-        part.chmod(stat.S_IMODE(target.stat().st_mode))
-    os.replace(part, target)

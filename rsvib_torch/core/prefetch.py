@@ -1,64 +1,34 @@
 """Items of an iterator, made ahead in a thread."""
 
-import queue
-import threading
-from collections.abc import Generator, Iterator
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import torch
 
 Item = TypeVar("Item")
-_END = object()
+_END: Any = object()
 
 
-def prefetched(items: Iterator[Item], count: int) -> Generator[Item, None, None]:
-    """Yield the items of an iterator, which a thread makes while earlier ones are used; ``count`` of them wait.
+def prefetched(items: Generator[Item, None, None], count: int) -> Generator[Item, None, None]:
+    """Yield the items of a generator, which a thread makes while earlier ones are used; ``count`` of them wait.
 
-    The thread uses one thread of PyTorch. It ends with the iterator, or when the generator is closed. Errors of the
-    iterator are raised behind the items before them.
+    The thread uses one thread of PyTorch. It ends with the generator, or when this one is closed. Errors are raised
+    behind the items before them.
 
     Example:
-        >>> list(prefetched(iter("abc"), 2))
+        >>> list(prefetched((letter for letter in "abc"), 2))
         ['a', 'b', 'c']
     """
-    waiting: queue.Queue[Any] = queue.Queue(count)
-    stopped = threading.Event()
-
-    def put(item: Any) -> None:
-        while not stopped.is_set():
-            try:
-                waiting.put(item, timeout=0.2)  # s
-            except queue.Full:
-                continue
-            return
-
-    def work() -> None:
-        torch.set_num_threads(1)
-        error: BaseException | None = None
-        try:
-            for item in items:
-                put(item)
-                if stopped.is_set():
-                    break
-        except BaseException as raised:
-            error = raised
-        finally:
-            if isinstance(items, Generator):
-                items.close()
-            put((_END, error))
-
     threads = torch.get_num_threads()
-    thread = threading.Thread(target=work, name="rsvib-ahead", daemon=True)
-    thread.start()
+    pool = ThreadPoolExecutor(1, "rsvib-ahead", initializer=torch.set_num_threads, initargs=(1,))
     try:
-        while True:
-            item = waiting.get()
-            if isinstance(item, tuple) and len(item) == 2 and item[0] is _END:
-                if item[1] is not None:
-                    raise item[1]
-                return
+        waiting = deque(pool.submit(next, items, _END) for _ in range(count))
+        while (item := waiting.popleft().result()) is not _END:
+            waiting.append(pool.submit(next, items, _END))
             yield item
     finally:
-        stopped.set()
-        thread.join()
+        pool.shutdown(cancel_futures=True)
+        items.close()
         torch.set_num_threads(threads)  # the default of threads that start later

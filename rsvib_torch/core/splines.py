@@ -6,20 +6,22 @@ from functools import cache
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.tables import Array, table, tensor
 
 
 def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
     """Weights of the ``degree + 1`` B-splines that are not zero at a position.
 
-    The value at ``x = n + fraction`` is ``sum_k weights[k] c[n + first_tap(degree) + k]`` with coefficients ``c``
-    and ``first_tap(degree) = -(degree // 2)``. ``degree`` must be odd, 1 is linear interpolation.
+    The value at ``x = n + fraction`` is ``sum_k weights[k] c[n - degree // 2 + k]`` with coefficients ``c``
+    of a spline of odd degree; 1 is linear interpolation.
 
     Args:
         fraction: Fractional positions in [0, 1], any shape S.
-        degree: Odd degree of the spline.
+        degree: Degree of the spline.
 
     Returns:
         Tensor of shape (S, degree + 1); its last axis sums to 1.
@@ -33,6 +35,33 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
     for lower in others:
         weights = torch.addcmul(lower, weights, fraction[..., None])
     return weights
+
+
+def spline_taps(
+    times: Array, start: float, spacing: float, count: int, *, degree: int = 3, derivative: int = 0
+) -> tuple[NDArray[np.int64], Array]:
+    """The coefficients (..., degree + 1) that a spline depends on at times (...), and their factors.
+
+    Args:
+        times: s; the spline is constant beyond its ends.
+        start: s, of the first knot.
+        spacing: s, between knots.
+        count: Number of coefficients.
+        degree: Degree of the spline.
+        derivative: Order of the derivative with respect to the time.
+
+    Example:
+        >>> index, factors = spline_taps(np.array([0.5]), 0.0, 1.0, 4, degree=1)
+        >>> index.tolist(), factors.tolist()
+        ([[0, 1]], [[0.5, 0.5]])
+    """
+    place = np.clip((times - start) / spacing, 0.0, count - degree)
+    cell = np.minimum(np.floor(place), count - degree - 1.0)
+    factors = table(bspline_weights(tensor(place - cell), degree - derivative))
+    ends = [(0, 0)] * place.ndim
+    for _ in range(derivative):
+        factors = (np.pad(factors, [*ends, (1, 0)]) - np.pad(factors, [*ends, (0, 1)])) / spacing
+    return cell.astype(np.int64)[..., None] + np.arange(degree + 1), factors
 
 
 def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -152,8 +152,13 @@ def prepare_frames(
     if loaded.info is not None:
         timing = timing_from_first_frame(timing, loaded.info)
     given = as_tensor(name, loaded.frames)
-    # missing pixels become 0 and are marked, so that all further steps compute with finite numbers
     axis = channel_axis(name, given.shape, channels)
+    if given.ndim == 4 and channels is None and loaded.frames is frames and given.shape[1] not in (1, 3, 4):
+        raise ValueError(
+            f"{name} of shape {tuple(given.shape)} appear to be a batch (B, T, H, W): pass {name}[:, :, None], with an "
+            f'axis of channels, or channels="first" if these are {given.shape[0]} frames of {given.shape[1]} channels'
+        )
+    # missing pixels become 0 and are marked, so that all further steps compute with finite numbers
     missing = _missing_pixels(given, ignore, allow_missing, axis)
     if missing is not None:
         if bool(missing.all()):

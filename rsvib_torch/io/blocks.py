@@ -1,6 +1,6 @@
-"""Stacks whose frames are stored together: several frames are decoded at once, and each only once."""
+"""The reader of stacks whose frames can be read in any order, alone or, where they are stored together, in blocks."""
 
-from abc import abstractmethod
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.io.stack_format import FrameReader
-from rsvib_torch.io.stack_info import StackInfo, readable_frame
+from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame
+
+Read = Callable[[int, int], NDArray[Any]]
 
 
 class BlockReader(FrameReader):
@@ -19,20 +21,27 @@ class BlockReader(FrameReader):
     Args:
         path: The stack.
         info: What its file states.
+        read: ``read(first, last)`` returns frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W).
         together: Frames of a block.
         more_bytes: Memory that reading a block needs besides its pixels.
+        close: Closes the file.
     """
 
-    def __init__(self, path: Path, info: StackInfo, together: int, more_bytes: int = 0) -> None:
-        self._path, self._together = path, min(together, info.shape[0])
+    def __init__(
+        self,
+        path: Path,
+        info: StackInfo,
+        read: Read,
+        together: int = 1,
+        more_bytes: int = 0,
+        close: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._path, self._read, self._close = path, read, close
+        self._together = min(together, info.shape[0])
         block_bytes = self._together * info.frame_bytes if self._together > 1 else 0
         self.info = replace(info, decoding_bytes=block_bytes + more_bytes)
         self._first = 0
         self._block: NDArray[Any] | None = None
-
-    @abstractmethod
-    def read_block(self, first: int, last: int) -> NDArray[Any]:
-        """Frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W)."""
 
     def frame(self, index: int) -> NDArray[Any]:
         """Pixels of a frame as stored."""
@@ -41,44 +50,92 @@ class BlockReader(FrameReader):
             self._first = index - index % self._together
             last = min(self._first + self._together, self.info.shape[0])
             with readable_frame(self._path, index):
-                self._block = self.read_block(self._first, last)
+                self._block = self._read(self._first, last)
         alone = self._together == 1  # otherwise a view would keep the block in memory
         frame = np.array(self._block[index - self._first], self.info.dtype, order="C", copy=None if alone else True)
         if index == self._first + len(self._block) - 1:
             self._block = None
         return frame
 
-
-class ArrayReader(BlockReader):
-    """Frames of an array of HDF5 or Zarr, which is decoded in chunks.
-
-    Args:
-        path: The stack.
-        info: What its file states.
-        array: The array, (T, ...) or a single frame.
-        chunk_frames: Frames of a chunk.
-        more_bytes: As in ``BlockReader``.
-        close: Closes its file.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        info: StackInfo,
-        array: Any,
-        chunk_frames: int,
-        more_bytes: int,
-        close: Callable[[], None] = lambda: None,
-    ) -> None:
-        super().__init__(path, info, chunk_frames, more_bytes)
-        self._array, self._close = array, close
-
-    def read_block(self, first: int, last: int) -> NDArray[Any]:
-        """Frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W)."""
-        frames = np.asarray(self._array[first:last] if self._array.ndim > 2 else self._array[...][None])
-        return np.moveaxis(frames, -1, 1) if self.info.stored_axes == "THWC" else frames
-
     def close(self) -> None:
         """Close the file."""
         self._block = None
         self._close()
+
+
+def array_reader(
+    path: Path,
+    info: StackInfo,
+    array: Any,
+    chunk_frames: int,
+    more_bytes: int,
+    close: Callable[[], None] = lambda: None,
+) -> BlockReader:
+    """Reader of an array of HDF5 or Zarr, (T, ...) or a single frame, with chunks of ``chunk_frames`` frames."""
+
+    def read(first: int, last: int) -> NDArray[Any]:
+        frames = np.asarray(array[first:last] if array.ndim > 2 else array[...][None])
+        return np.moveaxis(frames, -1, 1) if info.stored_axes == "THWC" else frames
+
+    return BlockReader(path, info, read, chunk_frames, more_bytes, close)
+
+
+def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype[Any]) -> BlockReader:
+    """Reader of frames that lie one after another in a file.
+
+    Files are read instead of mapped into memory: if a mapped file shrinks, the access ends the process.
+
+    Args:
+        path: The file.
+        info: The stack.
+        offset: Position of the first frame in bytes.
+        dtype: Data type in the file, with its byte order.
+
+    Raises:
+        ValueError: If the file holds less than half of the frames; others are reported when they are read.
+    """
+    size, held = info.frame_bytes, max(0, path.stat().st_size - offset)
+    if held // size < 0.5 * info.shape[0]:
+        needed = size * info.shape[0]
+        raise ValueError(f"truncated: the header states {needed} bytes of pixels, the file holds {held}")
+    file = path.open("rb")
+
+    def read(first: int, _: int) -> NDArray[Any]:
+        start, pixels = offset + first * size, np.empty(0, dtype)
+        if start + size <= os.fstat(file.fileno()).st_size:  # before memory is allocated
+            file.seek(start)
+            pixels = np.fromfile(file, dtype, size // dtype.itemsize)
+        if pixels.nbytes < size:
+            raise FrameError(f"{path}: truncated: frame {first} lies beyond the end of the file")
+        return info.from_stored(pixels.reshape(info.stored_shape[1:]))[None]
+
+    return BlockReader(path, info, read, close=file.close)
+
+
+def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader:
+    """Reader of frames ``start`` to ``end`` (exclusive; None for the last) of an open stack.
+
+    Raises:
+        ValueError: If the stack does not have these frames.
+    """
+    info, count = reader.info, reader.info.shape[0]
+    last = count if end is None else end
+    if not start < last <= count:
+        reader.close()
+        raise ValueError(
+            f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
+            f"START:END with START < END <= {count}"
+        )
+    numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
+    part = replace(
+        info,
+        shape=(last - start, *info.shape[1:]),
+        frame_times=None if info.frame_times is None else info.frame_times[start:last],
+        frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
+        path=None,  # the sound of a video, and metadata of all frames, are not those of a part
+        metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
+    )
+    path = info.path or Path()
+    return BlockReader(
+        path, part, lambda first, _: reader.frame(start + first)[None], 1, info.decoding_bytes, reader.close
+    )

@@ -4,7 +4,7 @@ The table is data. The module that reads and writes a format is imported when a 
 or written (``packaged_format``).
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,6 @@ from typing import Any
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import quoted
 from rsvib_torch.io.stack_format import StackFormat
-
-
-@dataclass(frozen=True)
-class _InModule:
-    """Function of a module of this package that is imported at the first call."""
-
-    module: str
-    name: str
-
-    def __call__(self, *arguments: Any) -> Any:
-        return getattr(import_module(self.module), self.name)(*arguments)
 
 
 def packaged_format(
@@ -37,28 +26,25 @@ def packaged_format(
 ) -> StackFormat:
     """A format whose functions are imported when they are called: reading a TIFF file imports no other format.
 
-    ``tests/test_imports.py`` reads the names of the modules in the calls of this function as imports.
-
-    Args:
-        name: As in ``StackFormat``.
-        endings: As in ``StackFormat``.
-        module: Full name of the module that has the functions.
-        open: Name of the function ``StackFormat.open``.
-        write: Name of the function ``StackFormat.write``, if there is one.
-        check: Name of the function ``StackFormat.check``, if there is one.
-        **stated: Further attributes of ``StackFormat``.
+    ``tests/test_imports.py`` reads the names of the modules in the calls of this function as imports. ``open``,
+    ``write`` and ``check`` name the functions of ``StackFormat`` in the ``module``.
     """
-    functions = {"open": open, "write": write, "check": check}
-    loaded: dict[str, Any] = {
-        use: _InModule(module, function) for use, function in functions.items() if function is not None
-    }
-    return StackFormat(name, endings, **loaded, **stated)
+
+    def imported(function: str) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            return getattr(import_module(module), function)(*arguments)
+
+        return call
+
+    named = {"write": write, "check": check}
+    functions: dict[str, Any] = {use: imported(function) for use, function in named.items() if function is not None}
+    return StackFormat(name, endings, imported(open), **functions, **stated)
 
 
 _KEPT = ("full_scale", "frame_times", "orientation", "resolution")
 _KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
 _KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
-_READ_ONLY_VIDEO = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
+_READ_ONLY_VIDEO = (".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
@@ -66,13 +52,13 @@ _FORMATS_OF_THE_PACKAGE = (
     packaged_format(
         "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", write="write_hdf5", keeps=_KEPT
     ),
-    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.image_folder", "ImagesReader"),
+    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.image_folder", "open_images"),
     packaged_format(
-        "png", (".png",), "rsvib_torch.io.image_folder", "ImagesReader", write="write_image", check="check_image",
+        "png", (".png",), "rsvib_torch.io.image_folder", "open_images", write="write_image", check="check_image",
         dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
-        "image folder", ("",), "rsvib_torch.io.image_folder", "ImagesReader", write="write_folder",
+        "image folder", ("",), "rsvib_torch.io.image_folder", "open_images", write="write_folder",
         check="check_folder", kind="folder", keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
@@ -83,14 +69,14 @@ _FORMATS_OF_THE_PACKAGE = (
         compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata"),
     ),
     packaged_format(
-        "FFV1 video", (".mkv", ".avi"), "rsvib_torch.io.video", "VideoReader", write="write_video",
+        "FFV1 video", (".mkv",), "rsvib_torch.io.video", "VideoReader", write="write_video",
         check="check_video", dtypes=("uint8", "uint16"), keeps=_KEPT_BY_VIDEO,
     ),
     packaged_format(
         "H.264 video", (".mp4", ".mov", ".m4v"), "rsvib_torch.io.video", "VideoReader", write="write_video",
         check="check_video", keeps=_KEPT_BY_VIDEO,
     ),
-    packaged_format("webm, mpeg, 3gp and wmv", _READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
+    packaged_format("avi, webm, mpeg, 3gp and wmv", _READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
     packaged_format(
         "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", write="write_zarr", kind="tree",
         marker="zarr.json", keeps=_KEPT,

@@ -1,7 +1,9 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
+import itertools
 import math
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
-from rsvib_torch.io.blocks import ArrayReader
-from rsvib_torch.io.contiguous import ContiguousReader
+from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
@@ -28,24 +29,18 @@ def _h5py() -> Any:
 def _find_dataset(file: Any) -> Any:
     """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
     h5py = _h5py()
-    found, groups = [], [file]
-    visited = {file.id}  # a group may be a member of several groups, also of itself
-    count = 0
-    for group in groups:  # grows
-        for name in group:
-            count += 1
-            if count > _MAX_MEMBERS:
-                raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
-            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                if name == _DATASET:
-                    raise ValueError(f"its dataset {name!r} is a link; frames must be in the file itself")
-                continue
-            member = group[name]
-            if isinstance(member, h5py.Group) and member.id not in visited:
-                visited.add(member.id)
-                groups.append(member)
-            elif isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
-                found.append(member)
+    found: list[Any] = []
+    members = itertools.count(1)
+
+    def visit(_: str, member: Any) -> None:
+        if next(members) > _MAX_MEMBERS:
+            raise ValueError(f"it has more than {_MAX_MEMBERS} members; expected a file with one stack of frames")
+        if isinstance(member, h5py.Dataset) and member.ndim in (2, 3, 4) and member.dtype.kind in "iuf":
+            found.append(member)
+
+    file.visititems(visit)  # every member once, without links
+    if not isinstance(file.get(_DATASET, getlink=True, default=h5py.HardLink()), h5py.HardLink):
+        raise ValueError(f"its dataset {_DATASET!r} is a link; frames must be in the file itself")
     named = [member for member in found if member.name == f"/{_DATASET}"]
     stacks = named or [member for member in found if member.ndim > 2] or found
     if len(stacks) != 1:
@@ -93,30 +88,20 @@ def _times_beside(file: Any, dataset: Any, count: int) -> dict[str, Any]:
     return times_of_attributes(found, count)
 
 
-def open_hdf5(path: Path) -> ArrayReader | ContiguousReader:
+def open_hdf5(path: Path) -> BlockReader:
     """Open the dataset of a file that has the shape of a stack."""
     h5py = _h5py()
-    with readable_stack(path, "HDF5"):
-        file = h5py.File(path, "r", locking=False)
-        keep_open = False
-        try:
-            dataset = _find_dataset(file)
-            check_dtype(dataset.dtype)
-            info = info_from_attributes(dict(dataset.attrs), tuple(dataset.shape), dataset.dtype)
-            chunk = _check_sizes(dataset, path.stat().st_size)
-            if info.frame_times is None and info.frame_rate is None:
-                info = replace(info, **_times_beside(file, dataset, info.shape[0]))
-            offset = dataset.id.get_offset()
-            is_plain = dataset.id.get_type() == h5py.h5t.py_create(dataset.dtype)  # all bits, none shifted
-            if dataset.chunks is None and offset is not None and is_plain:
-                return ContiguousReader(path, info, int(offset), dataset.dtype)
-            keep_open = True
-            # one decoded chunk besides the block; measured with gzip, lzf, shuffle and without compression
-            chunk_frames = dataset.chunks[0] if dataset.chunks and dataset.ndim > 2 else 1
-            return ArrayReader(path, info, dataset, chunk_frames, chunk, file.close)
-        finally:
-            if not keep_open:
-                file.close()
+    with readable_stack(path, "HDF5"), ExitStack() as opened:
+        file = opened.enter_context(h5py.File(path, "r", locking=False))
+        dataset = _find_dataset(file)
+        check_dtype(dataset.dtype)
+        info = info_from_attributes(dict(dataset.attrs), tuple(dataset.shape), dataset.dtype)
+        chunk = _check_sizes(dataset, path.stat().st_size)
+        if info.frame_times is None and info.frame_rate is None:
+            info = replace(info, **_times_beside(file, dataset, info.shape[0]))
+        # one decoded chunk besides the block; measured with gzip, lzf, shuffle and without compression
+        chunk_frames = dataset.chunks[0] if dataset.chunks and dataset.ndim > 2 else 1
+        return array_reader(path, info, dataset, chunk_frames, chunk, opened.pop_all().close)
 
 
 def write_hdf5(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:

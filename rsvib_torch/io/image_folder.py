@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.jpeg import decode_jpeg, jpeg_info
-from rsvib_torch.io.png import decode_png, encode_png, png_info
-from rsvib_torch.io.stack_format import FrameReader
+from rsvib_torch.io.blocks import BlockReader
+from rsvib_torch.io.images import decode_image, encode_png, image_info
 from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
 from rsvib_torch.io.tiff import open_tiff, write_tiff
 from rsvib_torch.io.time_metadata import merged_times
@@ -62,10 +62,8 @@ def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
 
 
 def _read_info(file: Path) -> StackInfo:
-    if file.suffix.lower() in _PNG:
-        return png_info(file)
-    if file.suffix.lower() in _JPEG:
-        return jpeg_info(file)
+    if file.suffix.lower() not in _TIFF:
+        return image_info(file)
     reader = open_tiff(file)
     reader.close()
     if reader.info.shape[0] != 1:
@@ -74,15 +72,10 @@ def _read_info(file: Path) -> StackInfo:
 
 
 def _read_frame(file: Path) -> NDArray[Any]:
-    if file.suffix.lower() in _PNG:
-        return decode_png(file)
-    if file.suffix.lower() in _JPEG:
-        return decode_jpeg(file)
-    reader = open_tiff(file)
-    try:
+    if file.suffix.lower() not in _TIFF:
+        return decode_image(file)
+    with closing(open_tiff(file)) as reader:
         return reader.frame(0)
-    finally:
-        reader.close()
 
 
 def _without_position(info: StackInfo) -> StackInfo:
@@ -90,46 +83,42 @@ def _without_position(info: StackInfo) -> StackInfo:
     return replace(info, resolution=None, frame_times=None)
 
 
-class ImagesReader(FrameReader):
-    """Frames of files that are decoded on access."""
-
-    def __init__(self, path: Path) -> None:
-        self._files = _frame_files(path)
-        self._damaged: dict[int, ValueError] = {}
-        first: tuple[StackInfo, Path] | None = None
-        metadata: dict[str, Tag | None] = {}
-        infos: list[StackInfo | None] = [None] * len(self._files)
-        for index, file in enumerate(self._files):
-            try:
-                info = _read_info(file)
-            except ValueError as error:
-                self._damaged[index] = error
-                continue
-            infos[index] = info
-            if first is None:
-                first, metadata = (info, file), dict(info.metadata)
-            for name in metadata.keys() | info.metadata.keys():
-                if info.metadata.get(name) != metadata.get(name):
-                    metadata[name] = None  # differs between the files
-            if _without_position(info) != _without_position(first[0]):
-                raise ValueError(
-                    f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
-                )
-        if first is None or len(self._damaged) > len(self._files) // 2:
-            raise next(iter(self._damaged.values()))
-        stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(self._files))
-        self.info = replace(stack, frame_numbers=_frame_numbers(self._files), **merged_times(infos))
-
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        if index in self._damaged:
-            raise FrameError(str(self._damaged[index]))
-        file = self._files[index]
+def open_images(path: Path) -> BlockReader:
+    """Open the files of a folder, or one file; frames are decoded on access."""
+    files = _frame_files(path)
+    damaged: dict[int, ValueError] = {}
+    first: tuple[StackInfo, Path] | None = None
+    metadata: dict[str, Tag | None] = {}
+    infos: list[StackInfo | None] = [None] * len(files)
+    for index, file in enumerate(files):
         try:
-            return _read_frame(file).reshape(self.info.shape[1:])
+            infos[index] = info = _read_info(file)
         except ValueError as error:
-            message = str(error) if str(error).startswith(str(file)) else f"{file}: {error}"
+            damaged[index] = error
+            continue
+        if first is None:
+            first, metadata = (info, file), dict(info.metadata)
+        for name in metadata.keys() | info.metadata.keys():
+            if info.metadata.get(name) != metadata.get(name):
+                metadata[name] = None  # differs between the files
+        if _without_position(info) != _without_position(first[0]):
+            raise ValueError(
+                f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
+            )
+    if first is None or len(damaged) > len(files) // 2:
+        raise next(iter(damaged.values()))
+    stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(files))
+
+    def read(index: int, _: int) -> NDArray[Any]:
+        try:
+            if index in damaged:
+                raise damaged[index]
+            return _read_frame(files[index]).reshape(1, *stack.shape[1:])
+        except ValueError as error:
+            message = str(error) if str(error).startswith(str(files[index])) else f"{files[index]}: {error}"
             raise FrameError(message) from error
+
+    return BlockReader(path, replace(stack, frame_numbers=_frame_numbers(files), **merged_times(infos)), read)
 
 
 def _ending(info: StackInfo) -> str:

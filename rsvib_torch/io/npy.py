@@ -1,42 +1,28 @@
 """Stacks in NumPy ``.npy`` files; the file has no room for the full scale."""
 
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.arrays import channels_appear_last
-from rsvib_torch.io.contiguous import ContiguousReader, InterleavedReader
+from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
-_MAX_HEADER_BYTES = 10_000  # as in numpy, which reads the header before it compares
 
-
-def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Shape, whether the first axis varies fastest, data type, and position of the first pixel."""
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        start = file.tell()
-        length = int.from_bytes(file.read(4), "little")
-        file.seek(start)
-        if length > _MAX_HEADER_BYTES:
-            raise ValueError(f"its header has {length} bytes; expected at most {_MAX_HEADER_BYTES}")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran_order, dtype = read(file)
-    check_dtype(dtype)
-    if any(not isinstance(size, int) or size < 0 for size in shape):
-        raise ValueError(f"its shape is {shape}")
-    return shape, fortran_order, dtype, file.tell()
-
-
-def open_npy(path: Path) -> ContiguousReader | InterleavedReader:
+def open_npy(path: Path) -> BlockReader:
     """Open (H, W), (T, H, W) or (T, C, H, W). Pickled objects are refused."""
     with readable_stack(path, ".npy"):
         with path.open("rb") as file:
-            shape, fortran_order, dtype, offset = _read_header(file)
+            head = BytesIO(file.read(1 << 14))  # bytes; NumPy accepts headers of up to 10,000
+        first = np.lib.format.read_magic(head) == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read(head)
+        check_dtype(dtype)
         if len(shape) == 2:
             shape = (1, *shape)
         if len(shape) not in (3, 4) or min(shape) < 1:
@@ -44,10 +30,14 @@ def open_npy(path: Path) -> ContiguousReader | InterleavedReader:
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
         info = StackInfo(shape, dtype.name, known_full_scale(dtype))
-        if fortran_order:
-            axes = tuple(range(len(shape)))
-            return InterleavedReader(path, info, offset, dtype, shape[::-1], axes[::-1])
-        return ContiguousReader(path, info, offset, dtype)
+        reader = contiguous_reader(path, info, head.tell(), dtype)
+        if not fortran_order:
+            return reader
+        reader.close()
+        # all frames together: the pixels of a frame lie everywhere in the file
+        return BlockReader(
+            path, info, lambda *_: np.load(path, allow_pickle=False).reshape(shape), shape[0], info.frame_bytes
+        )
 
 
 def write_npy(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from rsvib_torch.core.validation import Section, read_json, validate
-from rsvib_torch.io.array_attributes import info_from_attributes
-from rsvib_torch.io.contiguous import ContiguousReader
+from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
+from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
 
@@ -36,7 +36,7 @@ def _sidecar_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def open_raw(path: Path) -> ContiguousReader:
+def open_raw(path: Path) -> BlockReader:
     """Open a file of pixels whose layout its sidecar states."""
     beside = _sidecar_path(path)
     if not beside.exists():
@@ -48,25 +48,16 @@ def open_raw(path: Path) -> ContiguousReader:
     dtype = np.dtype(sidecar.dtype)
     with readable_stack(path, "raw"):
         info = info_from_attributes(attributes, tuple(sidecar.shape), dtype)
-        return ContiguousReader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
+        return contiguous_reader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
 
 
 def write_raw(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
     """Write a file frame by frame, and its sidecar; arguments as in ``StackFormat.write``."""
-    content = {
-        "format": "rsvib raw",
-        "version": 1,
-        "shape": info.stored_shape,
-        "axes": info.stored_axes,
-        "dtype": info.dtype,
-        "byte_order": "little",
-        "offset": 0,
-        "full_scale": info.full_scale,
-        "frame_times": info.frame_times,
-        "frame_rate": info.frame_rate,
-        "orientation": info.orientation,
-        "resolution": info.resolution,
-    }
+    attributes = attributes_of(info)
+    if "resolution_unit" in attributes:
+        attributes["resolution"].append(attributes.pop("resolution_unit"))
+    kind = {"format": "rsvib raw", "version": 1, "shape": info.stored_shape, "dtype": info.dtype}
+    content = {**kind, "byte_order": "little", "offset": 0, **attributes}
     _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     with path.open("wb") as file:
         for frame in frames:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -43,47 +43,6 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
         return path, None
     name, start, end = found.groups()
     return path.with_name(name), (int(start or 0), int(end) if end else None)
-
-
-class PartReader:
-    """Some frames of an open stack, one after another.
-
-    Args:
-        reader: The stack.
-        start: Its first frame that is read.
-        end: The frame behind the last one; None for all.
-
-    Raises:
-        ValueError: If the stack does not have these frames.
-    """
-
-    def __init__(self, reader: FrameReader, start: int, end: int | None) -> None:
-        info, count = reader.info, reader.info.shape[0]
-        last = count if end is None else end
-        if not start < last <= count:
-            reader.close()
-            raise ValueError(
-                f"{info.path}: frames {start}:{'' if end is None else end} of a stack of {count} frames; expected "
-                f"START:END with START < END <= {count}"
-            )
-        self._reader, self._start = reader, start
-        numbers = None if info.frame_numbers is None else info.frame_numbers[start:last]
-        self.info = replace(
-            info,
-            shape=(last - start, *info.shape[1:]),
-            frame_times=None if info.frame_times is None else info.frame_times[start:last],
-            frame_numbers=None if numbers is None else tuple(number - numbers[0] for number in numbers),
-            path=None,  # the sound of a video, and metadata of all frames, are not those of a part
-            metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
-        )
-
-    def frame(self, index: int) -> Frame:
-        """As ``FrameReader.frame``; the first frame of the part is 0."""
-        return self._reader.frame(self._start + index)
-
-    def close(self) -> None:
-        """Close the stack."""
-        self._reader.close()
 
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or

@@ -224,7 +224,7 @@ def readable_frame(path: Path, index: int) -> Iterator[None]:
     """Convert any exception of a decoder into a one-line ``FrameError`` of frame ``index``."""
     try:
         yield
-    except (MemoryError, FrameError):
+    except (MemoryError, FrameError, FileNotFoundError):
         raise
     except Exception as error:
         raise FrameError(f"{path}: frame {index} cannot be read: {one_line(error)}") from error

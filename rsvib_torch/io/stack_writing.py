@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.core.atomic import (
-    check_kind,
-    check_name,
-    check_not_special,
-    check_writable,
-    make_folder,
-    move_into_place,
-    sync_tree,
-    temporary_folder,
-)
+from rsvib_torch.core.atomic import check_target, check_writable, whole
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
@@ -48,15 +39,10 @@ def check_info_target(
 ) -> StackFormat:
     """The format in which ``path`` is written; raises the error that writing would raise.
 
-    Args:
-        path: The stack to write.
-        info: Its content.
-        compression: As in ``write_stack``.
-        check_folder: Whether to check that the folder exists and is writable.
+    Without ``check_folder``, its folder need not exist.
     """
-    check_name(path)
-    check_not_special(path)
     form = target_format(path)
+    check_target(path, form.kind, parent_exists=False)
     if form.write is None:
         raise ValueError(
             f"{path}: {form.name} files can only be read; write .tif, .png, .npy, .mkv or a folder of PNG files"
@@ -73,8 +59,6 @@ def check_info_target(
         raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
     if check_folder:
         check_writable(path, folder=form.kind != "file")
-    else:
-        check_kind(path, folder=form.kind != "file")
     return form
 
 
@@ -103,13 +87,6 @@ def check_stack_target(
     like: StackInfo | None = None,
 ) -> float | None:
     """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed.
-
-    Args:
-        path: The file or folder to write.
-        shape: (T, H, W) or (T, C, H, W).
-        dtype: As in ``write_stack``.
-        full_scale: As in ``write_stack``.
-        like: As in ``write_stack``.
 
     Returns:
         The full scale that would be used; None for floats.
@@ -160,22 +137,10 @@ def metadata_not_kept(
 def write_frames(
     form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
 ) -> None:
-    """Write a stack; it gets its name when it is complete and on the disk.
-
-    Args:
-        form: Its format.
-        path: The file or folder.
-        info: Its content.
-        frames: Pixels as stored, one frame at a time.
-        compression: As in ``write_stack``.
-    """
+    """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
-    with temporary_folder(path) as folder:
-        part = folder / path.name
+    with whole(path, form.kind, form.companions) as part:
         form.write(part, info, frames, compression)
-        sync_tree(folder)
-        make_folder(path.parent)
-        move_into_place(part, path, form.kind, form.companions)
 
 
 def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
@@ -199,7 +164,7 @@ def write_stack(
 ) -> None:
     """Write a stack of frames: floats whose full scale is 1, or integer counts.
 
-    The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``, ``.avi``; without loss) or
+    The ending selects the format as in ``read_stack``; videos are written as FFV1 (``.mkv``; without loss) or
     H.264 (``.mp4``, ``.mov``; 8 bits, with loss; also of floats). A path without an ending is a folder of PNG files
     (frame_0000.png ...), or of TIFF files if PNG does not support the data type. Integers are multiplied by the full
     scale, rounded and clipped to 0 ... full scale; all formats except ``.npy`` store the full scale. The file replaces

@@ -1,8 +1,8 @@
 """Stacks in TIFF and BigTIFF files, also compressed."""
 
 import math
-import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,140 +11,75 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from rsvib_torch.io.blocks import BlockReader
-from rsvib_torch.io.contiguous import ContiguousReader, InterleavedReader
+from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
-from rsvib_torch.io.stack_format import FrameReader
-from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame, readable_stack
+from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
-# Tags on which the decoded pixels of a page depend, besides their position: subfile type, width, length, bits,
-# compression, photometric interpretation, fill order, samples, rows per strip, planar configuration, predictor, tile
-# size, extra samples, sample format, image depth, tile depth
-_LAYOUT = {254, 255, 256, 257, 258, 259, 262, 266, 277, 278, 284, 317, 322, 323, 338, 339, 32997, 32998}
-_POSITIONS = {273: "offsets", 324: "offsets", 279: "counts", 325: "counts"}
-_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-_MAX_LAYOUTS = 1000  # of pages in a file; tifffile interprets each once, in about 1 ms
+_PHOTOMETRIC = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
+_LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 
 
-@dataclass(frozen=True)
-class _Header:
-    """What is compared of the header of a page: tifffile needs about 1 ms to interpret one, which is too long for all.
-
-    Attributes:
-        layout: Stored values of all tags on which the decoded pixels depend; equal for pages of the same kind.
-        end: Position behind the stored pixels in bytes; None if it does not follow from the header.
-    """
-
-    layout: bytes
-    end: int | None
-
-
-class _Headers:
-    """Reads the headers of all pages, in time and memory linear in the size of the file."""
-
-    def __init__(self, path: Path) -> None:
-        self._size = path.stat().st_size
-        with path.open("rb") as self._file:
-            head = self._bytes(0, 16)
-            self._order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
-            version = struct.unpack(f"{self._order}H", head[2:4])[0] if self._order and len(head) >= 8 else 0
-            if version not in (42, 43) or (version == 43 and len(head) < 16):
-                raise ValueError("not a TIFF file" if self._size else "the file is empty")
-            self._word = "Q" if version == 43 else "I"
-            self.pages = list(self._chain(self._number(self._word, head[8:16] if version == 43 else head[4:8])))
-        if not self.pages:
-            raise ValueError("it contains no page")
-
-    def _bytes(self, start: int, count: int) -> bytes:
-        self._file.seek(min(start, self._size))
-        return self._file.read(min(count, self._size))
-
-    def _number(self, kind: str, data: bytes) -> int:
-        return int(struct.unpack(f"{self._order}{kind}", data)[0])
-
-    def _chain(self, offset: int) -> Iterator[_Header]:
-        """Headers of the pages from ``offset`` on.
-
-        Raises:
-            ValueError: If the chain leaves the file, as in a truncated file, or is circular.
-        """
-        visited: set[int] = set()
-        layouts: dict[bytes, bytes] = {}
-        count_kind, entry = ("Q", 20) if self._word == "Q" else ("H", 12)
-        word, count_size = struct.calcsize(self._word), struct.calcsize(count_kind)
-        while offset:
-            if offset in visited:
-                raise ValueError("its chain of pages runs in a circle")
-            visited.add(offset)
-            field = self._bytes(offset, count_size)
-            count = self._number(count_kind, field) if len(field) == count_size else self._size
-            table = self._bytes(offset + count_size, entry * count + word)
-            if len(table) < entry * count + word:
-                raise ValueError(f"truncated: the header of page {len(visited) - 1} lies beyond the end of the file")
-            header = self._header([table[start : start + entry] for start in range(0, entry * count, entry)])
-            yield _Header(layouts.setdefault(header.layout, header.layout), header.end)  # equal layouts are one object
-            if len(layouts) > _MAX_LAYOUTS:
-                raise ValueError(f"its pages have more than {_MAX_LAYOUTS} different layouts")
-            offset = self._number(self._word, table[-word:])
-
-    def _header(self, entries: list[bytes]) -> _Header:
-        layout = []
-        positions: dict[str, NDArray[Any]] = {}
-        for entry in entries:
-            code, kind = struct.unpack_from(f"{self._order}HH", entry)
-            if code in _LAYOUT:
-                values = self._values(entry, kind, 1 << 10)  # bytes; more than 100 channels are not an image
-                layout.append(struct.pack("HH", code, kind) + values + b";")
-            elif code in _POSITIONS and kind in (3, 4, 13, 16, 18):
-                data = self._values(entry, kind, self._size)
-                positions[_POSITIONS[code]] = np.frombuffer(data, f"{self._order}u{_SIZES[kind]}").astype(object)
-        offsets, counts = positions.get("offsets"), positions.get("counts")
-        known = offsets is not None and counts is not None and 0 < len(offsets) == len(counts)
-        return _Header(b"".join(layout), int(max(offsets + counts)) if known else None)  # type: ignore[operator]
-
-    def _values(self, entry: bytes, kind: int, most: int) -> bytes:
-        """Stored values of a tag, at most ``most`` bytes."""
-        word = struct.calcsize(self._word)
-        size = self._number(self._word, entry[4 : 4 + word]) * _SIZES.get(kind, 1)
-        field = entry[4 + word :]
-        return field[:size] if size <= word else self._bytes(self._number(self._word, field), min(size, most))
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _Page:
     """What the header of a page states.
 
     Attributes:
-        number: Its number in the file; of pages of the same layout, that of the first.
-        shape: (H, W) or (C, H, W).
-        dtype: Data type.
-        photometric: Meaning of the values.
+        number: Its number in the file.
+        kind: Size and type of the pixels, for messages and comparisons.
         nbytes: Size of its decoded pixels in bytes.
+        complete: Whether its stored pixels lie within the file.
         secondary: Whether it is a thumbnail or a mask of another page.
     """
 
     number: int
-    shape: tuple[int, ...]
-    dtype: Any
-    photometric: Any
+    kind: str
     nbytes: int
+    complete: bool
     secondary: bool
-
-    @property
-    def kind(self) -> str:
-        """Size and type of the pixels, for messages and comparisons."""
-        channels = f", {self.shape[0]} channels," if len(self.shape) == 3 else ""
-        meaning = "" if self.photometric in _PHOTOMETRIC else f" {_name(self.photometric)}"
-        return f"{self.shape[-2]} x {self.shape[-1]} px{channels} {self.dtype}{meaning}"
-
-
-_PHOTOMETRIC = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
 
 
 def _name(photometric: Any) -> str:
     return getattr(photometric, "name", str(photometric))
+
+
+def _pages(tif: Any) -> list[_Page]:
+    """What the headers of all pages state; tifffile interprets one in 0.05 ms.
+
+    Raises:
+        ValueError: If the chain of headers leaves the file or is circular, where tifffile stops without an error.
+    """
+    pages: list[_Page] = []
+    visited: set[int] = set()
+    file, kinds = tif.filehandle, {}
+    while True:
+        try:
+            page = tif.pages[len(pages)]
+        except IndexError:
+            break
+        if page.offset in visited:
+            raise ValueError("its chain of pages runs in a circle")
+        visited.add(page.offset)
+        key = page.shape, page.axes, page.dtype, page.photometric
+        if key not in kinds:
+            shape = _with_channels_first(page.shape, page.axes)
+            channels = f", {shape[0]} channels," if len(shape) == 3 else ""
+            meaning = "" if page.photometric in _PHOTOMETRIC else f" {_name(page.photometric)}"
+            kinds[key] = f"{' x '.join(map(str, shape[-2:]))} px{channels} {page.dtype}{meaning}"
+        complete = _is_complete(page, file.size)
+        secondary = bool(page.subfiletype & 0b101)
+        pages.append(_Page(len(pages), kinds[key], int(page.nbytes), complete, secondary))
+    file.seek(tif.pages.next_page_offset)
+    if not pages or file.read(tif.tiff.offsetsize) != bytes(tif.tiff.offsetsize):
+        raise ValueError(f"truncated: the header of page {len(pages)} lies beyond the end of the file")
+    return pages
+
+
+def _is_complete(page: Any, size: int) -> bool:
+    """Whether the stored pixels of a page lie within a file of ``size`` bytes."""
+    ends = map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
+    return max(ends, default=size + 1) <= size
 
 
 def _with_channels_first(values: Any, axes: str) -> Any:
@@ -154,47 +89,12 @@ def _with_channels_first(values: Any, axes: str) -> Any:
     return (values[2], *values[:2]) if isinstance(values, tuple) else np.moveaxis(values, -1, 0)
 
 
-def _read_page(tif: Any, number: int) -> _Page:
-    """Interpret the header of a page."""
-    page = tif.pages[number]
-    if page.axes not in ("YX", "YXS", "SYX"):
-        raise ValueError(f"page {number} has shape {page.shape} (axes {page.axes}); expected an image")
-    shape = _with_channels_first(page.shape, page.axes)
-    secondary = bool(page.subfiletype & 0b101)
-    return _Page(number, shape, page.dtype, page.photometric, int(page.nbytes), secondary)
-
-
-def _complete_pages(tif: Any, headers: Sequence[_Header], numbers: Sequence[int], size: int) -> list[bool]:
-    """Whether the stored pixels of pages lie within the file of ``size`` bytes.
-
-    Args:
-        tif: The open file.
-        headers: Headers of all pages.
-        numbers: The pages.
-        size: Bytes of the file.
-
-    Raises:
-        ValueError: If the file cannot hold that many pixels, or more than half of the pages are incomplete.
-    """
-    decoded: dict[bytes, int] = {}  # bytes of the pixels of a page, by layout
-    declared, complete = 0, []
-    for number in numbers:
-        header = headers[number]
-        if header.layout not in decoded:
-            decoded[header.layout] = int(tif.pages[number].nbytes)
-        declared += decoded[header.layout]
-        end = header.end
-        if end is None:
-            page = tif.pages[number]
-            ends = (offset + count for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True))
-            end = max(ends, default=size + 1)
-        complete.append(end <= size)
-    largest_ratio = 5000  # of pixels to the size of the file; deflate reaches 1032
-    if declared > largest_ratio * size:
-        raise ValueError(f"its header states {declared} bytes of pixels, which {size} bytes cannot hold")
+def _check_complete(complete: Sequence[bool], nbytes: int, size: int) -> None:
+    """Raise a ``ValueError`` if a file cannot hold the pixels, or more than half of the pages are incomplete."""
+    if nbytes > _LARGEST_RATIO * size:
+        raise ValueError(f"its header states {nbytes} bytes of pixels, which {size} bytes cannot hold")
     if sum(complete) < 0.5 * len(complete):
-        raise ValueError(f"truncated: pixels of page {numbers[complete.index(False)]} lie beyond the end of the file")
-    return complete
+        raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
 
 
 def _resolution(tif: Any) -> tuple[float, float, str] | None:
@@ -266,97 +166,81 @@ def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
     return _info(tif, stack, series.dtype, series.keyframe.photometric, channels_last=last), (*ones, *kept)
 
 
-class _WholeReader(BlockReader):
-    """All frames of a compressed file whose pages are not in the order of the frames, decoded together."""
+def _page_reader(
+    path: Path,
+    info: StackInfo,
+    page: Callable[[int], Any],
+    complete: Sequence[bool],
+    shape: tuple[int, ...],
+    order: tuple[int, ...],
+    close: Callable[[], None],
+) -> BlockReader:
+    """Reader of frames of equal numbers of pages, one frame after another.
 
-    def __init__(self, path: Path, tif: Any, info: StackInfo, order: tuple[int, ...]) -> None:
-        super().__init__(path, info, info.shape[0], info.shape[0] * info.frame_bytes)  # a copy if axes are reordered
-        self._tif, self._order = tif, order
-
-    def read_block(self, first: int, last: int) -> NDArray[Any]:
-        """All frames, (T, H, W) or (T, C, H, W)."""
-        series = _all_series(self._tif)[0]
-        pixels: NDArray[Any] = series.asarray(maxworkers=1).reshape(_axes_of(series)[1])
-        return pixels.transpose(self._order).reshape(self.info.shape)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._block = None
-        self._tif.close()
-
-
-class _SeriesReader:
-    """Frames decoded page by page; arguments as from ``_series_info`` and ``_complete_pages``.
-
-    Raises:
-        ValueError: If a frame is not a sequence of pages.
+    ``page`` returns a page by its number, ``complete`` states whether its stored pixels lie within the file. The pages
+    of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with leading
+    axes of length 1.
     """
+    count = len(complete) // info.shape[0]
 
-    def __init__(self, path: Path, tif: Any, info: StackInfo, order: tuple[int, ...], complete: list[bool]) -> None:
-        self.info = info
-        self._path, self._tif, self._order, self._complete = path, tif, order, complete
-        series, T = _all_series(tif)[0], info.shape[0]
-        _, shape = _axes_of(series)
-        self._pages, rest = divmod(len(series.pages), T)
-        time = order[len(order) - len(info.shape)] if T > 1 else None
-        if rest or self._pages < 1 or (time is not None and any(size > 1 for size in shape[:time])):
-            raise ValueError("its pages are not in the order of the frames")
-        self._frame_shape = tuple(1 if i == time else size for i, size in enumerate(shape))
+    def read(first: int, _: int) -> NDArray[Any]:
+        numbers = range(first * count, (first + 1) * count)
+        if not all(complete[number] for number in numbers):
+            raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
+        stored = np.stack([page(number).asarray(maxworkers=1) for number in numbers]).reshape(shape)
+        return stored.transpose(order).reshape(1, *info.shape[1:])
 
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        numbers = range(index * self._pages, (index + 1) * self._pages)
-        if not all(self._complete[number] for number in numbers):
-            raise FrameError(f"{self._path}: truncated: pixels of frame {index} lie beyond the end of the file")
-        with readable_frame(self._path, index):
-            pages = [_all_series(self._tif)[0].pages[number].asarray(maxworkers=1) for number in numbers]
-            stored = np.stack(pages).reshape(self._frame_shape).transpose(self._order)
-            return np.ascontiguousarray(stored.reshape(self.info.shape[1:]))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._tif.close()
+    return BlockReader(path, info, read, close=close)
 
 
-class _PageReader:
-    """Frames of a file in which every page is a frame, thumbnails and masks excepted.
+def _open_pages(path: Path, tif: Any, pages: Sequence[_Page], close: Callable[[], None]) -> BlockReader:
+    """Reader of a file in which every page is a frame, thumbnails and masks excepted."""
+    frames = [page for page in pages if not page.secondary] or pages
+    first = tif.pages[frames[0].number]
+    if first.axes not in ("YX", "YXS", "SYX"):
+        raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
+    for page in frames:
+        if page.kind != frames[0].kind:
+            raise ValueError(
+                f"frames of different size or kind: page {page.number} is {page.kind}, page {first.index} is "
+                f"{frames[0].kind}"
+            )
+    _check_complete([page.complete for page in frames], sum(page.nbytes for page in frames), path.stat().st_size)
+    last, shape = first.axes == "YXS", _with_channels_first(first.shape, first.axes)
+    info = _info(tif, (len(frames), *shape), first.dtype, first.photometric, channels_last=last)
+    lost = {"thumbnails and masks": None} if len(frames) < len(pages) else {}
+    info = replace(info, metadata={**info.metadata, **lost})
+    complete, order = [page.complete for page in frames], (2, 0, 1) if last else tuple(range(len(shape)))
+    return _page_reader(
+        path, info, lambda number: tif.pages[frames[number].number], complete, first.shape, order, close
+    )
 
-    Raises:
-        ValueError: If the pages differ in size or kind.
-    """
 
-    def __init__(self, path: Path, tif: Any, headers: Sequence[_Header]) -> None:
-        kinds: dict[bytes, _Page] = {}
-        for number, header in enumerate(headers):
-            if header.layout not in kinds:
-                kinds[header.layout] = _read_page(tif, number)
-        primary = {layout for layout, page in kinds.items() if not page.secondary} or set(kinds)
-        numbers = [number for number, header in enumerate(headers) if header.layout in primary]
-        first = kinds[headers[numbers[0]].layout]
-        for page in (kinds[layout] for layout in kinds if layout in primary):
-            if page.kind != first.kind:
-                raise ValueError(
-                    f"frames of different size or kind: page {page.number} is {page.kind}, page {first.number} is "
-                    f"{first.kind}"
-                )
-        self._path, self._tif, self._numbers = path, tif, numbers
-        self._complete = _complete_pages(tif, headers, numbers, path.stat().st_size)
-        last = tif.pages[first.number].axes == "YXS"
-        info = _info(tif, (len(numbers), *first.shape), first.dtype, first.photometric, channels_last=last)
-        lost = {"thumbnails and masks": None} if len(numbers) < len(headers) else {}
-        self.info = replace(info, metadata={**info.metadata, **lost})
+def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader:
+    """Reader of a file whose pages are arranged as one array."""
+    series = _all_series(tif)[0]
+    info, order = _series_info(tif, series)
+    shape, pages, T = _axes_of(series)[1], series.pages, info.shape[0]
+    in_order = tuple(sorted(order))
+    frame_by_frame = order == in_order or (info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order)
+    if series.dataoffset is not None and frame_by_frame:
+        close()
+        return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
+    size = path.stat().st_size
+    complete = [page is not None and _is_complete(page, size) for page in pages]
+    _check_complete(complete, math.prod(shape) * series.dtype.itemsize, size)
+    time = order[len(order) - len(info.shape)] if T > 1 else None
+    if len(pages) % T == 0 and (time is None or all(size == 1 for size in shape[:time])):
+        frame_shape = tuple(1 if i == time else size for i, size in enumerate(shape))
+        return _page_reader(path, info, lambda number: pages[number], complete, frame_shape, order, close)
+    if not all(complete):
+        raise ValueError("truncated: its pages are not in the order of the frames")
 
-    def frame(self, index: int) -> NDArray[Any]:
-        """Pixels of a frame as stored."""
-        if not self._complete[index]:
-            raise FrameError(f"{self._path}: truncated: pixels of frame {index} lie beyond the end of the file")
-        with readable_frame(self._path, index):
-            page = self._tif.pages[self._numbers[index]]
-            return np.ascontiguousarray(_with_channels_first(page.asarray(maxworkers=1), page.axes))
+    def read(*_: int) -> NDArray[Any]:
+        pixels: NDArray[Any] = series.asarray(maxworkers=1)
+        return pixels.reshape(shape).transpose(order).reshape(info.shape)
 
-    def close(self) -> None:
-        """Close the file."""
-        self._tif.close()
+    return BlockReader(path, info, read, T, T * info.frame_bytes, close)  # a copy if axes are reordered
 
 
 def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> None:
@@ -369,73 +253,68 @@ def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> 
 
 
 # programs that state how the pages of a file are arranged, as tifffile names them
-_ARRANGED = (
-    *("shaped", "lsm", "mmstack", "ome", "imagej", "ndtiff", "fluoview", "stk", "sis", "svs", "scn", "qpi", "ndpi"),
-    *("bif", "avs", "eer", "philips", "scanimage", "nih", "mdgel"),
+_ARRANGED = frozenset(
+    [
+        "shaped",
+        "lsm",
+        "mmstack",
+        "ome",
+        "imagej",
+        "ndtiff",
+        "fluoview",
+        "stk",
+        "sis",
+        "svs",
+        "scn",
+        "qpi",
+        "ndpi",
+        "bif",
+        "avs",
+        "eer",
+        "philips",
+        "scanimage",
+        "nih",
+        "mdgel",
+    ]
 )
 
 
-def _series_of_all_frames(tif: Any) -> Any | None:
-    """The series of pages in which the file arranges all its frames; None if every page is a frame.
+def _are_arranged(tif: Any, count: int) -> bool:
+    """Whether the ``count`` pages of a file are arranged as one array; otherwise every page is a frame.
 
     Raises:
-        ValueError: If there are several series of another arrangement.
+        ValueError: If there are several arrays that are not frames.
     """
     metadata = json_description(tif)
     if "shape" in metadata:  # series of pages that were written one by one would take quadratic time
         shape = tuple(metadata["shape"])
         pages = math.prod(shape) // math.prod(tif.pages.first.shape)
-        if pages < len(tif.pages):
+        if pages < count:
             _check_one_page_per_frame(shape, metadata.get("axes", ""), pages)
-            return None
-    if not any(getattr(tif, f"is_{kind}", False) for kind in _ARRANGED):
-        return None  # the series of all pages takes 0.3 ms per page
-    tif.pages.useframes = len(tif.pages) > 1
+            return False
+    if not tif.flags & _ARRANGED:
+        return False  # the series of all pages takes 0.3 ms per page
+    tif.pages.useframes = count > 1
     try:
         series = tif.series
     except RuntimeError:  # pages differ
-        return None
+        return False
     if len(series) == 1 and series[0].kind not in ("uniform", "generic"):
-        return _all_series(tif)[0]
+        return True
     for one in series:
         _check_one_page_per_frame(one.shape, one.axes, len(one.pages))
-    return None
+    return False
 
 
-def open_tiff(path: Path) -> FrameReader:
+def open_tiff(path: Path) -> BlockReader:
     """Open a TIFF file of one or many pages."""
-    with readable_stack(path, "TIFF"):
-        headers = _Headers(path).pages
-        tif = tifffile.TiffFile(path)
-        reader: FrameReader | None = None
-        try:
-            series = _series_of_all_frames(tif)
-            if series is None:
-                tif.pages.useframes = False
-                reader = _PageReader(path, tif, headers)
-                return reader
-            info, order = _series_info(tif, series)
-            in_order = tuple(sorted(order))
-            frame_by_frame = order == in_order or (
-                info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order
-            )
-            if series.dataoffset is not None:
-                dtype = series.dtype.newbyteorder(tif.byteorder)
-                if frame_by_frame:
-                    return ContiguousReader(path, info, series.dataoffset, dtype)
-                shape, axes = (1, *_axes_of(series)[1]), (0, *(axis + 1 for axis in order))
-                return InterleavedReader(path, info, series.dataoffset, dtype, shape, axes)
-            complete = _complete_pages(tif, headers, range(len(headers)), path.stat().st_size)
-            try:
-                reader = _SeriesReader(path, tif, info, order, complete)
-            except ValueError:
-                if not all(complete):
-                    raise
-                reader = _WholeReader(path, tif, info, order)
-            return reader
-        finally:
-            if reader is None:
-                tif.close()
+    with readable_stack(path, "TIFF"), ExitStack() as opened:
+        tif = opened.enter_context(tifffile.TiffFile(path))
+        pages = _pages(tif)
+        arranged = _are_arranged(tif, len(pages))
+        reader = _open_series(path, tif, tif.close) if arranged else _open_pages(path, tif, pages, tif.close)
+        opened.pop_all()
+        return reader
 
 
 def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:

@@ -20,30 +20,17 @@ _RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in t
 _LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate")
 _IMAGEJ_KEY = "rsvib="  # line of an ImageJ description: ImageJ uses the last description, so that there is no other one
 
+_OF_THE_FILE = (
+    "DocumentName Make Model DateTime Artist HostComputer XMP Copyright ExposureTime FNumber IPTCNAA InterColorProfile "
+    "GDAL_METADATA GDAL_NODATA GEO_METADATA"
+)
+_OF_THE_IMAGE = (
+    "ModelPixelScaleTag IntergraphMatrixTag ModelTiepointTag ModelTransformationTag GeoKeyDirectoryTag "
+    "GeoDoubleParamsTag GeoAsciiParamsTag RPCCoefficientTag"
+)
 _COPIED: dict[int, Scope] = {
-    269: "file",  # DocumentName
-    271: "file",  # Make
-    272: "file",  # Model
-    306: "file",  # DateTime
-    315: "file",  # Artist
-    316: "file",  # HostComputer
-    700: "file",  # XMP
-    33432: "file",  # Copyright
-    33434: "file",  # ExposureTime
-    33437: "file",  # FNumber
-    33723: "file",  # IPTC
-    34675: "file",  # ICC profile
-    42112: "file",  # GDAL_METADATA
-    42113: "file",  # GDAL_NODATA
-    33550: "image",  # ModelPixelScale
-    33920: "image",  # IntergraphMatrix
-    33922: "image",  # ModelTiepoint
-    34264: "image",  # ModelTransformation
-    34735: "image",  # GeoKeyDirectory
-    34736: "image",  # GeoDoubleParams
-    34737: "image",  # GeoAsciiParams
-    50844: "image",  # RPCCoefficient
-    50909: "file",  # GEO_METADATA
+    **{tifffile.TIFF.TAGS[name]: "file" for name in _OF_THE_FILE.split()},
+    **{tifffile.TIFF.TAGS[name]: "image" for name in _OF_THE_IMAGE.split()},
     **dict.fromkeys(range(65000, 65536), "file"),  # reusable range: values of the writing program
 }
 _FIRST_PRIVATE = 32768

@@ -23,10 +23,9 @@ from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import camera_name
 
-_LOSSLESS, H264 = (".mkv", ".avi"), (".mp4", ".mov", ".m4v")
-CONTAINERS = {".mkv": "matroska", ".avi": "avi", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}
-_READ_ONLY = (".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
-ENDINGS = (*_LOSSLESS, *H264, *_READ_ONLY)
+H264 = (".mp4", ".mov", ".m4v")
+CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written
+ENDINGS = (*CONTAINERS, ".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
 _FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
 _BT709, _LIMITED_RANGE = 1, 1  # codes of ITU-T H.273 and FFmpeg
@@ -278,11 +277,10 @@ def _source(info: StackInfo) -> Path | None:
     return info.path if info.path is not None and info.path.suffix.lower() in ENDINGS else None
 
 
-def presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int], Fraction | None]:
-    """Time unit in s of the video to write, presentation time of each frame in this unit, and their time origin in s.
+def presentation_times(info: StackInfo) -> tuple[Fraction, list[int]]:
+    """Time unit in s of the video to write, and the presentation time of each frame in this unit.
 
-    Times are those of the source if it is a video, else the frame times of the stack, else equal intervals. The time
-    origin is None if it is that of the source.
+    Times are those of the source if it is a video, else the frame times of the stack, else equal intervals.
     """
     source = _source(info)
     times: Sequence[Fraction] = scanned(source)[1] if source is not None else ()
@@ -292,18 +290,8 @@ def presentation_times(path: Path, info: StackInfo) -> tuple[Fraction, list[int]
     if not times:
         rate = Fraction(info.frame_rate or _DEFAULT_RATE).limit_denominator(1001)
         times = [index / rate for index in range(info.shape[0])]
-    start = None
-    if path.suffix.lower() == ".avi" and len(times) > 1:  # it begins at 0, and its unit is the frame period
-        start, times = times[0], [time - times[0] for time in times]
-        intervals = np.diff([float(time) for time in times])
-        periods = round(float(np.sum(np.round(intervals / np.median(intervals)))))
-        unit = 1 / (periods / times[-1]).limit_denominator(1001)
-        rounding = 0.0011  # s; .mkv has units of 1 ms
-        if max(abs(float(time - unit * round(time / unit))) for time in times) > rounding:
-            raise ValueError(f"{path}: .avi cannot hold a variable frame rate; write .mkv")
-    else:
-        unit = Fraction(1, math.lcm(*(time.denominator for time in times)))
-    return unit, [round(time / unit) for time in times], start
+    unit = Fraction(1, math.lcm(*(time.denominator for time in times)))
+    return unit, [round(time / unit) for time in times]
 
 
 def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
@@ -318,20 +306,12 @@ def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
 
 
 def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: str) -> Any:
-    """Add a video stream to an open container, with the metadata of ``source``, a container or None.
+    """Add a video stream to an open container, with the metadata of ``source``, an open video or None.
 
-    Args:
-        output: The container.
-        path: Name of the video, whose ending selects the codec.
-        info: Its content.
-        source: The video from which it was computed.
-        **options: Options of the encoder in addition.
-
-    Returns:
-        The stream.
+    The ending of ``path`` selects the codec; ``options`` are those of the encoder in addition.
     """
     lossy = path.suffix.lower() in H264
-    unit, ticks, _ = presentation_times(path, info)
+    unit, ticks = presentation_times(info)
     rate = 1 / (unit * int(np.median(np.diff(ticks)))) if len(ticks) > 1 else Fraction(_DEFAULT_RATE)
     codec, usual = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
     video = output.add_stream(codec, rate=rate, options=usual | options)
@@ -357,18 +337,15 @@ def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: 
 class Sound:
     """Sound of another video, copied between the frames of a video without encoding it.
 
-    Packets before the time origin ``start`` (s) of the output are omitted.
-
     Args:
         output: The open container to write; streams are added to it.
         source: The open container with the sound; None for none.
-        start: Time origin of the output in s; None if it is that of the source.
     """
 
-    def __init__(self, output: Any, source: Any, start: Fraction | None) -> None:
+    def __init__(self, output: Any, source: Any) -> None:
         streams = source.streams.audio if source is not None else ()
         added = {stream: output.add_stream_from_template(stream) for stream in streams}
-        self._output, self._packets = output, _packets(source, added, start)
+        self._output, self._packets = output, _packets(source, added)
         self._next = next(self._packets, None)
 
     def write(self, until: Fraction | None = None) -> None:
@@ -376,6 +353,14 @@ class Sound:
         while self._next is not None and (until is None or self._next.pts * self._next.time_base <= until):
             self._output.mux(self._next)
             self._next = next(self._packets, None)
+
+
+def _packets(source: Any, streams: dict[Any, Any]) -> Iterator[Any]:
+    """Packets of the streams of ``source``, for the streams of the output that belong to them."""
+    for packet in source.demux(*streams) if streams else ():
+        if packet.dts is not None and packet.pts is not None:  # the last packet of a stream is empty
+            packet.stream = streams[packet.stream]
+            yield packet
 
 
 def open_source(info: StackInfo, opened: ExitStack) -> Any:
@@ -391,13 +376,8 @@ def check_video(path: Path, info: StackInfo) -> None:
         raise ValueError(f"{path}: videos hold 1 or 3 channels, got {info.shape[1]}; write .tif")
     if ending in H264 and (info.shape[-2] % 2 or info.shape[-1] % 2):
         raise ValueError(f"{path}: H.264 needs an even height and width, got {info.shape[-2:]}; write .mkv")
-    held = {".avi": (1,), ".mkv": (1, 3, 6, 8)}.get(ending, tuple(_MATRICES))
-    if info.orientation not in held:
-        better = ".mkv or .mp4" if ending == ".avi" and info.orientation in (3, 6, 8) else ".mp4"
-        raise ValueError(
-            f"{path}: {ending} cannot hold the orientation {info.orientation} of the input; write {better}"
-        )
-    presentation_times(path, info)
+    if ending == ".mkv" and info.orientation not in (1, 3, 6, 8):
+        raise ValueError(f"{path}: .mkv cannot hold the orientation {info.orientation} of the input; write .mp4")
     with ExitStack() as opened:
         source = open_source(info, opened)
         output = opened.enter_context(av.open(BytesIO(), "w", format=CONTAINERS[ending]))
@@ -429,11 +409,11 @@ def open_output(path: Path, opened: ExitStack) -> Any:
 
 def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
     """Write a video frame by frame; arguments as in ``StackFormat.write``."""
-    unit, ticks, start = presentation_times(path, info)
+    unit, ticks = presentation_times(info)
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)
         video = add_video(output, path, info, source)
-        sound = Sound(output, source, start)
+        sound = Sound(output, source)
         for tick, pixels in zip(ticks, frames, strict=True):
             sound.write(tick * unit)
             frame = picture_of(pixels, path, info)
@@ -441,17 +421,3 @@ def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], com
             output.mux(video.encode(frame))
         output.mux(video.encode())
         sound.write()
-
-
-def _packets(source: Any, streams: dict[Any, Any], start: Fraction | None) -> Iterator[Any]:
-    """Packets of the streams of ``source``, for the streams of the output that belong to them, see ``Sound``."""
-    if not streams:
-        return
-    for packet in source.demux(*streams):
-        if packet.dts is not None and packet.pts is not None:  # the last packet of a stream is empty
-            if start is not None:
-                ticks = round(start / packet.time_base)
-                packet.pts, packet.dts = packet.pts - ticks, packet.dts - ticks
-            packet.stream = streams[packet.stream]
-            if start is None or packet.pts >= 0:
-                yield packet

@@ -98,7 +98,7 @@ class PartWriter:
         self._stream = add_video(self._output, video, info, source, **(_PART_OPTIONS if ending in H264 else {}))
         if planes is not None:
             planes.prepare_encoder(self._stream)
-        self._unit, ticks, _ = presentation_times(video, info)
+        self._unit, ticks = presentation_times(info)
         self._step, self._count = int(np.median(np.diff(ticks))) if len(ticks) > 1 else 1, 0
 
     def write(self, frame: Frame) -> None:
@@ -125,7 +125,7 @@ class PartWriter:
 
 def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
     """Write the video whose frames are in ``parts``, with the times, the metadata and the sound of its source."""
-    unit, ticks, start = presentation_times(path, info)
+    unit, ticks = presentation_times(info)
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)
         if source is not None:
@@ -137,7 +137,7 @@ def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
                 if video is None:  # of the first part; streams of sound follow that of the frames
                     video = output.add_stream_from_template(container.streams.video[0])
                     video.time_base = unit
-                    sound = Sound(output, source, start)
+                    sound = Sound(output, source)
                 for packet in container.demux(container.streams.video[0]):
                     if packet.size == 0:  # the last packet of a stream
                         continue

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.core.validation import read_json
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
-from rsvib_torch.io.blocks import ArrayReader
+from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 
@@ -27,31 +26,17 @@ def _zarr() -> Any:
     return needed_package("zarr", "reading and writing Zarr", "formats")
 
 
-def _read_header(folder: Path) -> dict[str, Any]:
-    return read_json(folder / _HEADER, "Zarr v3 array")
-
-
-def _find_array(path: Path) -> Path:
-    """The folder of the array: ``path``, or for a group its only array or the one called ``frames``."""
-    if _read_header(path).get("node_type") != "group":
-        return path
-    folders = (f for f in sorted(path.iterdir()) if not f.is_symlink() and (f / _HEADER).is_file())
-    arrays = [folder for folder in folders if _read_header(folder).get("node_type") == "array"]
-    stacks = [folder for folder in arrays if folder.name == "frames"] or arrays
+def _find_array(path: Path) -> Any:
+    """The array of a folder, or of a group its only array or the one called ``frames``."""
+    zarr = _zarr()
+    node = zarr.open(store=str(path), mode="r", zarr_format=3)
+    if isinstance(node, zarr.Array):
+        return node
+    arrays = dict(node.arrays())
+    stacks = {name: arrays[name] for name in arrays if name == "frames"} or arrays
     if len(stacks) != 1:
-        names = ", ".join(folder.name for folder in stacks)
-        raise ValueError(f"expected one array of frames, or one called 'frames'; found {names or 'none'}")
-    return stacks[0]
-
-
-def _check_codecs(codecs: Any) -> None:
-    """Accept only codecs of the Zarr specification: others may execute code."""
-    for codec in codecs:
-        name = codec.get("name") if isinstance(codec, dict) else codec
-        if name not in ("bytes", "transpose", "blosc", "gzip", "zstd", "crc32c", "sharding_indexed"):
-            raise ValueError(f"codec {name!r} is not part of the Zarr v3 specification; write it with zstd or gzip")
-        if name == "sharding_indexed":
-            _check_codecs(codec["configuration"]["codecs"])
+        raise ValueError(f"expected one array of frames, or one called 'frames'; found {', '.join(stacks) or 'none'}")
+    return next(iter(stacks.values()))
 
 
 def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
@@ -72,27 +57,22 @@ def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
         )
 
 
-def open_zarr(path: Path) -> ArrayReader:
+def open_zarr(path: Path) -> BlockReader:
     """Open the array of a folder that has the shape of a stack."""
-    zarr = _zarr()
+    _zarr()
     with readable_stack(path, "Zarr"):
         if not (path / _HEADER).is_file():
             raise ValueError(f"it contains no {_HEADER}; expected a Zarr v3 array")
-        folder = _find_array(path)
-        header = _read_header(folder)
-        if header.get("zarr_format") != 3 or header.get("node_type") != "array":
-            raise ValueError("expected a Zarr v3 array")
-        _check_codecs(header["codecs"])
-        array = zarr.open_array(store=str(folder), mode="r", zarr_format=3)
+        array = _find_array(path)
         check_dtype(array.dtype)
         info = info_from_attributes(dict(array.attrs), tuple(int(size) for size in array.shape), array.dtype)
-        _check_sizes(array, info, folder)
+        _check_sizes(array, info, path / array.path)
         chunk_frames = min(array.chunks[0], info.shape[0]) if array.ndim > 2 else 1
         chunks = math.prod(-(-size // part) for size, part in zip(array.shape[-2:], array.chunks[-2:], strict=True))
         if chunks > _MAX_CHUNKS:
             raise ValueError(f"a frame is divided into {chunks} chunks; expected at most {_MAX_CHUNKS}")
         chunk_bytes = math.prod(array.chunks) * array.dtype.itemsize
-        return ArrayReader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
+        return array_reader(path, info, array, chunk_frames, _BUFFERS * min(chunks, _CONCURRENT) * chunk_bytes)
 
 
 _DIMENSIONS = {"T": "frame", "C": "channel", "H": "y", "W": "x"}

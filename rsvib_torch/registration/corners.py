@@ -1,11 +1,18 @@
 """Corners followed from frame to frame, by OpenCV: for motions that vary over the frame, such as roll and parallax."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsvib_torch.core.tables import Array, table, tensor
+from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.motion.timing import SensorTiming
+
+Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel
 
 _CELLS = 6  # of the shorter side: every cell has the same number of corners, so that one object does not hold them all
@@ -14,6 +21,107 @@ PATCH = 11  # px, side of the patch that is compared; 21 px blur the motion of t
 _COARSE = 21  # px, side of the patch in the pyramid, where the motion is found
 _LARGEST_MOTION = 0.25  # of the longer side, which the coarsest level of the pyramid reaches
 _MAX_RETURN = 0.3  # px, between a corner and the point where the way back from the other frame ends
+_MOST_PIXELS = 700_000  # of a frame in which corners are followed; the sides of larger ones are halved
+_MIN_CORNERS = 8  # of a pair of frames; four components are determined, and wrong matches are rejected
+_MIN_SHARE = 0.25  # of the corners of a pair that agree on one motion; pairs of unrelated frames reach 0.1
+_AGREE = 3.0  # px, from an affine motion between two frames: parallax, and vibration within a frame
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """N corners that were followed between two frames, or between the frames of several pairs."""
+
+    pairs: NDArray[np.int64]  # (N,) number of the pair
+    rows: Array  # (N,) place of the row in the readout of the first frame, 0 to 1
+    times: Array  # (N, 2) s, middle of the exposure of their rows in both frames
+    places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
+    offsets: Array  # (N, 2) px
+
+    @property
+    def factors(self) -> Array:
+        """(N, 2, 4), displacement by unit components of the path."""
+        x, y = tensor(self.places).unbind(-1)
+        return table(displacement_factors(x, y, 4))
+
+    @staticmethod
+    def joined(parts: Sequence["Corners"]) -> "Corners":
+        """The corners of all pairs."""
+        pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
+        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets"))
+        return Corners(pairs, *(np.concatenate(values) for values in rest))
+
+
+class CornerFollower:
+    """Follows corners from each frame of a video to the next.
+
+    Args:
+        timing: The sensor.
+        most: Number of corners of a pair of frames; with 480, clips take twice the time and become no steadier.
+        consistent: Whether to keep only the corners that move with most others, to follow the same ones as long as they
+            are seen, and to do this in frames of reduced size if these are large. Otherwise every frame has its own
+            corners, whose errors are independent of those before.
+    """
+
+    def __init__(self, timing: SensorTiming, *, most: int = 256, consistent: bool = True) -> None:
+        self._timing, self._most, self._consistent = timing, most, consistent
+        self._start = 0.0  # s, of the frame before
+        self._before: tuple[Grey, Grey | None] | None = None  # the frame before and its mask, of reduced size
+        self._known: Points | None = None  # corners in it
+
+    def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
+        """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
+
+        There are none where the mask (H, W) is 0.
+
+        Returns:
+            The corners; None for the first frame, and if too few move together.
+        """
+        # 1. Follow corners.
+        (height, width), timing = grey.shape, self._timing
+        scale = reduction(*grey.shape) if self._consistent else 1
+        before, known, second = self._before, self._known, _reduced(grey, scale)
+        starts = np.array([self._start, start])
+        self._before, self._start, self._known = (second, mask), start, None
+        if before is None:
+            return None
+        found = find_corners(before[0], known, before[1], most=self._most)
+        ends, good = follow_corners(before[0], second, found)
+        if mask is not None:
+            x, y = ends[good].round().astype(np.int64).T
+            good[good] = mask[y, x] > 0
+        found, ends = found[good], ends[good]
+        # 2. Keep those that follow one affine motion.
+        if self._consistent:
+            agree = np.zeros(len(found), bool)
+            if len(found) >= _MIN_CORNERS:
+                limit = max(1.0, _AGREE / scale)
+                _, inliers = cv2.estimateAffine2D(found, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=limit)
+                agree = agree if inliers is None else inliers[:, 0] > 0
+            if agree.sum() < max(_MIN_CORNERS, _MIN_SHARE * len(good)):
+                return None
+            found, ends = found[agree], ends[agree]
+            self._known = ends
+        found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
+        # 3. The times of their rows.
+        axis, count = (1, height) if timing.scan_axis == -2 else (0, width)
+        rows = np.stack([found[:, axis], ends[:, axis]], -1)
+        rows = rows if timing.readout_direction == "forward" else count - 1 - rows
+        times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
+        places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
+        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found)
+
+
+def reduction(height: int, width: int) -> int:
+    """By how much the sides of frames are reduced before corners are followed."""
+    return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))
+
+
+def _reduced(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
+    """Means over squares of ``scale`` px."""
+    if scale == 1:
+        return frame
+    size = (frame.shape[1] // scale, frame.shape[0] // scale)
+    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def find_corners(

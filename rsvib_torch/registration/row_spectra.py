@@ -5,6 +5,7 @@ A row is displaced by a phase factor of its spectrum. Frames have rows on axis -
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
+from collections.abc import Iterator
 from copy import copy
 
 import torch
@@ -12,7 +13,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.chunking import at_once, chunks, gathered, runs
-from rsvib_torch.core.fourier import extend_rows, fast_length, shift_phases, squared_modulus
+from rsvib_torch.core.fourier import (
+    extend_rows,
+    fast_length,
+    phase_products,
+    phase_tables,
+    shift_phases,
+    squared_modulus,
+)
 from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
 
 DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
@@ -121,18 +129,22 @@ class RowSpectra:
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
+        return next(self.warped_copies(rows[None], shift[None]))
+
+    def warped_copies(self, rows: Tensor, shift: Tensor) -> Iterator[Tensor]:
+        """``warped`` for N rows and shifts (N, B, T, S) in turn, with one computation of weights and phases."""
         cell = rows.floor()
-        weights = bspline_weights((rows - cell).to(self._all_rows.dtype), DEGREE)
-        first = cell.to(torch.int64) - DEGREE // 2
-        taps = torch.arange(DEGREE + 1, device=rows.device)
-        index = self._first_rows[..., None, None] + (first[..., None] + taps).clamp(0, self.height - 1)
-        interpolated = functional.embedding_bag(  # weighted sums of rows of the table
-            index.flatten(0, 2), self._all_rows, per_sample_weights=weights.flatten(0, 2), mode="sum"
-        )
-        result: Tensor = torch.view_as_complex(interpolated.unflatten(-1, (-1, 2))).unflatten(0, rows.shape)
-        for part in self.runs(rows.shape[-1], 1):
-            result[..., part, :] *= self.ramp(shift[..., part])
-        return result
+        weights = bspline_weights((rows - cell).to(self._all_rows.dtype), DEGREE).flatten(1, 3)
+        taps = torch.arange(-(DEGREE // 2), DEGREE - DEGREE // 2 + 1, device=rows.device)
+        index = (cell.to(torch.int64)[..., None] + taps).clamp_(0, self.height - 1)
+        index = index.add_(self._first_rows[..., None, None]).flatten(1, 3)
+        coarse, fine = phase_tables(shift, self.length, self._band, self.values.dtype)
+        for node in range(len(rows)):
+            interpolated = functional.embedding_bag(  # weighted sums of rows of the table
+                index[node], self._all_rows, per_sample_weights=weights[node], mode="sum"
+            )
+            warped = torch.view_as_complex(interpolated.unflatten(-1, (-1, 2))).view(*rows.shape[1:], -1)
+            yield warped.mul_(phase_products(coarse[node], fine[node], warped.shape[-1]))
 
     def runs(self, count: int, arrays: int) -> list[slice]:
         """Runs of ``count`` rows for computations that hold ``arrays`` arrays of the size of these spectra."""

@@ -13,7 +13,14 @@ from .plots import (
     save_figure,
     windows_figure,
 )
-from .results import read_vibration, write_offsets, write_restoration, write_table, write_vibration
+from .results import (
+    read_vibration,
+    restoration_data,
+    write_offsets,
+    write_restoration,
+    write_table,
+    write_vibration,
+)
 
 __all__ = [
     "Box",
@@ -26,6 +33,7 @@ __all__ = [
     "offset_figure",
     "psf_figure",
     "read_vibration",
+    "restoration_data",
     "rows_figure",
     "sampling_map",
     "save_figure",

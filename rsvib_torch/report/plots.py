@@ -5,7 +5,7 @@ import math
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,16 +14,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.core.figures import FIGURES
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, Result
 from rsvib_torch.core.text import measured_text
+from rsvib_torch.core.validation import Count
 from rsvib_torch.detection import (
     ClockAlignment,
     DetectionResult,
@@ -45,6 +46,7 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 
+_Resolution = Annotated[int, Field(ge=1, le=10_000)]
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
 _AXIS_COLOURS = {"x": "#14487a", "y": "#c8102e"}
 _FIT_COLOUR = _AXIS_COLOURS["y"]
@@ -80,7 +82,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 
 
 @checks_arguments
-def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150) -> None:
+def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: _Resolution = 150) -> None:
     """Write a figure as an image file, atomically.
 
     Args:
@@ -100,7 +102,6 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: int = 150)
         >>> path.exists()
         True
     """
-    check_whole_number("dpi", dpi, at_least=1, at_most=10_000)
     with whole_file(path) as part:
         FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
 
@@ -126,6 +127,19 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
     """A figure of a size in inches, and its panels (rows, columns)."""
     figure = _Drawing(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
+
+
+def _plot_axes(panel: Axes, x: Any, values: Tensor, std: Tensor | None = None, *, legend: bool = True) -> None:
+    """Draw values (N, 2) of x and y in their colours, with bands of two standard deviations."""
+    for values_of, std_of, (name, colour) in zip(
+        values.detach().cpu().T, [None] * 2 if std is None else std.cpu().T, _AXIS_COLOURS.items(), strict=True
+    ):
+        panel.plot(x, values_of, color=colour, linewidth=1.3, label=name)
+        if std_of is not None:
+            low, high = values_of - 2 * std_of, values_of + 2 * std_of
+            panel.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
+    if legend:
+        panel.legend(fontsize=9, frameon=False, ncols=2)
 
 
 def _symbol(label: str, **style: Any) -> Line2D:
@@ -186,8 +200,14 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
-    """Add the legend and the colour bar."""
+def _offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Any]:
+    """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
+    _check_one(result)
+    sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
+    figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
+    points: Any = None
+    for column, axis in enumerate(axes):
+        points = _draw_offsets(panels[0, column], panels[1, column], result, axis)
     symbols = [
         _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
         _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
@@ -197,6 +217,7 @@ def _finish_offsets(figure: Figure, panels: Any, points: Any) -> None:
     bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
+    return figure, panels
 
 
 @checks_arguments
@@ -219,14 +240,9 @@ def offset_figure(result: DetectionResult) -> Figure:
         >>> [panel.get_ylabel() for panel in rsv.offset_figure(detection).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
-    _check_one(result)
     axes = result.vibration.num_axes
-    all_shown = len(result.offsets.pairs) <= _MOST_PAIRS
-    figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=all_shown or "row", height_ratios=(3, 1))
-    points: Any = None
-    for axis, name in enumerate(AXIS_NAMES[:axes]):
-        upper, lower = panels[0, axis], panels[1, axis]
-        points = _draw_offsets(upper, lower, result, axis)
+    figure, panels = _offset_panels(result, range(axes), 6.5 * axes, 6.4)
+    for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
         heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
         upper.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
         text = ",  ".join(tones_text(result, axis))
@@ -235,7 +251,6 @@ def offset_figure(result: DetectionResult) -> Figure:
         text = "\n".join(textwrap.wrap(text, 76, max_lines=2, placeholder=" …"))
         note = upper.annotate(text, (0, 1), (0, 32), "axes fraction", "offset points", va="top", fontsize=9.5)
         note.set_in_layout(False)  # a long text would reduce the size of the panels
-    _finish_offsets(figure, panels, points)
     return figure
 
 
@@ -256,17 +271,11 @@ def windows_figure(
         time_label: Label of the horizontal axis.
 
     Example:
-        >>> import tempfile
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> folder = tempfile.mkdtemp()
-        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
-        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
-        >>> manifest = rsv.read_manifest(report.manifest)
-        >>> starts = [window.start_time for window in manifest.windows]
-        >>> figure = rsv.windows_figure(starts, manifest.detections())
+        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> figure = rsv.windows_figure([0.0, 2 * timing.frame_period], parts)
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
     """
@@ -339,33 +348,21 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     displacement = motion.displacement(times).detach().cpu()
     further = motion.num_axes - 2
     figure, panels = _panels(8, 3.6 + 2.0 * further, 1 + further, sharex=True)
-    _draw_displacement(panels[0, 0], times.cpu(), displacement)
+    _plot_axes(panels[0, 0], 1e3 * times.cpu(), displacement[:, :2])
+    plain_axes(panels[0, 0], "time (ms)", "displacement (px)")
     for axis, panel in enumerate(panels[1:, 0], start=2):
         panel.plot(1e3 * times.cpu(), displacement[:, axis], color=_INK, linewidth=1.3)
         plain_axes(panel, "time (ms)", f"{AXIS_NAMES[axis]} ({AXIS_UNITS[axis]})")
     return figure
 
 
-def _draw_displacement(panel: Axes, times: Tensor, displacement: Tensor, std: Tensor | None = None) -> None:
-    """Draw displacements (N, 2) in px at times (N,) in seconds, with a band of two standard deviations."""
-    for axis, name in enumerate("xy"):
-        values = displacement[:, axis]
-        panel.plot(1e3 * times, values, color=_AXIS_COLOURS[name], linewidth=1.3, label=name)
-        if std is not None:
-            low, high = values - 2 * std[:, axis], values + 2 * std[:, axis]
-            panel.fill_between(1e3 * times, low, high, color=_AXIS_COLOURS[name], alpha=0.2, linewidth=0)
-    panel.legend(fontsize=9, frameon=False, ncols=2)
-    plain_axes(panel, "time (ms)", "displacement (px)")
-
-
 def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
     """State above a figure which axes are not reliable, with the first reason."""
-    refused = [
-        f"{name}: not reliable: {reasons[0]}"
+    lines = [
+        textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
         for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
         if not bool(good)
     ]
-    lines = [line for text in refused for line in textwrap.wrap(text, 100, max_lines=1, placeholder=" …")]
     panel.set_title("\n".join(lines), loc="left", fontsize=9.5, color=_INK)
 
 
@@ -378,10 +375,9 @@ def _swept_figure(result: SweptTone) -> Figure:
 def free_motion_figure(result: MotionDetection) -> Figure:
     """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
     figure, ((panel,),) = _panels(8, 3.6)
-    for frame in range(len(result.times)):
-        parts = (values[frame].cpu() for values in (result.times, result.displacement, result.std))
-        _draw_displacement(panel, *parts)
-    panel.legend(panel.lines[:2], "xy", fontsize=9, frameon=False, ncols=2)
+    for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
+        _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
+    plain_axes(panel, "time (ms)", "displacement (px)")
     _title_refusal(panel, result)
     return figure
 
@@ -411,11 +407,7 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
 
 def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
     """Draw the offset curve of one axis of a detection (not a batch) with its fit and residuals."""
-    _check_one(result)
-    all_shown = len(result.offsets.pairs) <= _MOST_PAIRS
-    figure, panels = _panels(5.6, 4.4, 2, sharex=all_shown, height_ratios=(3, 1))
-    _finish_offsets(figure, panels, _draw_offsets(panels[0, 0], panels[1, 0], result, axis))
-    return figure
+    return _offset_panels(result, [axis], 5.6, 4.4)[0]
 
 
 @checks_arguments
@@ -480,7 +472,7 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
 
 
 @checks_arguments
-def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
+def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw mean displacement and motion blur of every row of frame 0.
 
     Args:
@@ -500,16 +492,14 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figur
     figure, panels = _panels(5.6, 4.6, 2, sharex=True)
     curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
     for panel, values, label in zip(panels[:, 0], curves, ("displacement (px)", "motion blur (px)"), strict=True):
-        for axis, name in enumerate("xy"):
-            panel.plot(np.arange(num_rows), values[:, axis].numpy(), color=_AXIS_COLOURS[name], lw=1.3, label=name)
+        _plot_axes(panel, np.arange(num_rows), values, legend=panel is panels[0, 0])
         plain_axes(panel, "row (in readout order)" if panel is panels[1, 0] else "", label)
-    panels[0, 0].legend(fontsize=9, frameon=False, ncols=2)
     panels[1, 0].set_ylim(bottom=0)
     return figure
 
 
 @checks_arguments
-def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure:
+def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
 
     Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
@@ -528,7 +518,6 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: int) -> Figure
         24
     """
     _check_one(vibration)
-    check_whole_number("num_rows", num_rows, at_least=1)
     vibration = vibration.detached()
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()
@@ -619,7 +608,12 @@ def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[
 
 @checks_arguments
 def comparison_figure(
-    raw: Tensor, restored: Tensor, *, count: int = 3, size: int = 160, names: tuple[str, str] = ("input", "restored")
+    raw: Tensor,
+    restored: Tensor,
+    *,
+    count: Count = 3,
+    size: Count = 160,
+    names: tuple[str, str] = ("input", "restored"),
 ) -> Figure:
     """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
@@ -637,8 +631,6 @@ def comparison_figure(
     """
     raw, restored = (frame[None] if frame.ndim == 2 else frame for frame in (raw, restored))
     check_shapes({"raw": raw, "restored": restored}, {"raw": "C H W", "restored": "C H W"})
-    check_whole_number("count", count, at_least=1)
-    check_whole_number("size", size, at_least=1)
     raw, restored = (picture(frame) for frame in (raw, restored))
     size = min(size, *raw.shape[:2])
     places = detailed_places(restored.mean(-1), size, count, rim=16)  # boundary extension changes the border

@@ -1,13 +1,13 @@
 """Result files: ``vibration.json``, ``offsets.csv``, ``restoration.json`` and tables."""
 
 import csv
-import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
@@ -45,10 +45,7 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
         [111.0, 90.0]
     """
-    if result.batch_shape:
-        raise ValueError(
-            f"result is a batch of shape {tuple(result.batch_shape)}; write one: write_vibration(path, result[0])"
-        )
+    _check_one(result)
     timing = timing or result.timing
     if timing is None:
         raise ValueError("timing unknown: pass timing=SensorTiming(...) of the frames")
@@ -106,12 +103,15 @@ def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -
 
 
 def _equal(first: Any, second: Any) -> bool:
-    """Whether two values of a timing are equal up to rounding."""
-    if isinstance(first, list) and isinstance(second, list):
-        return len(first) == len(second) and all(map(_equal, first, second))
-    if isinstance(first, float) and isinstance(second, float):
-        return math.isclose(first, second, rel_tol=1e-9)
-    return bool(first == second)
+    """Whether two values of a timing are equal, numbers up to rounding."""
+    if np.shape(first) != np.shape(second) or {str, type(None)} & {type(first), type(second)}:
+        return bool(first == second)
+    return np.allclose(first, second, rtol=1e-9, atol=0.0)
+
+
+def _check_one(result: DetectionResult) -> None:
+    if result.batch_shape:
+        raise ValueError(f"result is a batch of shape {tuple(result.batch_shape)}; write one: result[0]")
 
 
 @checks_arguments
@@ -145,10 +145,7 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         >>> columns[6:]
         ['fitted_x_px', 'fitted_y_px', 'residual_x_px', 'residual_y_px', 'quality']
     """
-    if result.batch_shape:
-        raise ValueError(
-            f"result is a batch of shape {tuple(result.batch_shape)}; write one: write_offsets(path, result[0])"
-        )
+    _check_one(result)
     curve = result.offsets
     count = curve.times.shape[-1]
     columns = {
@@ -194,18 +191,28 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
         >>> import tempfile
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
-        >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> folder = tempfile.mkdtemp()
-        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
-        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
-        >>> rsv.write_table(f"{folder}/tones.csv", rsv.read_manifest(report.manifest))
-        >>> with open(f"{folder}/tones.csv") as file:
-        ...     print(len(file.readlines()))  # two windows with a tone along x and y each, below the header
-        5
+        >>> frames, timing, _ = example_frames()
+        >>> path = tempfile.mkdtemp() + "/tones.csv"
+        >>> rsv.write_table(path, rsv.detect_vibration(frames, timing, tones=1))
+        >>> with open(path) as file:
+        ...     print(len(file.readlines()))  # a tone along x and y each, below the header
+        3
     """
     columns = result.table(pixel_size=pixel_size)
     _write_csv(path, columns, zip(*columns.values(), strict=True))
+
+
+def restoration_data(result: RestoredFrames) -> dict[str, Any]:
+    """What was restored, and whether that helped, as values that JSON can store."""
+    verdict = result.verdict
+    return {
+        "frames": "restored" if result.restored else "as taken",
+        "axes": result.restored_axes(),
+        "left_alone": plain_values(result.left_alone),
+        "outcome": None if verdict is None else verdict.overall,
+        "predicted_gain_db": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+        "summary": None if verdict is None else verdict.sentence,
+    }
 
 
 def write_restoration(
@@ -223,16 +230,8 @@ def write_restoration(
         OSError: If the file cannot be written.
     """
     verdict = result.verdict
-    content: dict[str, Any] = {
-        "format": "rsvib restoration",
-        "version": 1,
-        "frames": "restored" if result.restored else "as taken",
-        "options": options,
-        "left_alone": plain_values(result.left_alone),
-        "outcome": None if verdict is None else verdict.overall,
-        "summary": None if verdict is None else verdict.sentence,
-        "not_kept": list(not_kept),
-    }
+    content: dict[str, Any] = {"format": "rsvib restoration", "version": 1, "options": options}
+    content |= {**restoration_data(result), "not_kept": list(not_kept)}
     if verdict is not None:
         pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}
         content["pairs"] = {**pairs, "outcome": list(verdict.outcome), "findings": plain_values(verdict.findings)}

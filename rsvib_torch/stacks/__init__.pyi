@@ -1,10 +1,10 @@
 from .corrector import CorrectedFrames, VibrationCorrector
-from .job import WindowResult
+from .job import WindowResult, restore_block
 from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
 from .process_video import process_video
 from .resumable_run import StackReport
-from .window_restoration import RestoredFrames, restore_block, restore_trusted, without_data
+from .window_restoration import RestoredFrames, restore_trusted, without_data
 from .windows import Window, cut_windows
 
 __all__ = [

@@ -5,16 +5,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.stacks.heap import keep_freed_memory, share_one_heap
-from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowReader, WindowResult
+from rsvib_torch.stacks.heap import share_one_heap
+from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows
 from rsvib_torch.stacks.windows import Window
 
 _Item = TypeVar("_Item")
@@ -54,53 +54,44 @@ def compute_here(
     *,
     at_once: int,
 ) -> Generator[_Result, None, None]:
-    """Compute windows in threads of this process, ``at_once`` at a time; one more thread reads ahead.
+    """Compute windows in threads of this process, ``at_once`` at a time, while one more is read.
 
     ``finish`` is called with a result and its frames in the thread that computed it. Its results are in the order of
     the windows.
     """
     share_one_heap()
-    reader = WindowReader(job.source, job.info)
     default_threads = torch.get_num_threads()
     threads = 1 if _one_thread_each(windows) else default_threads
-    reading = ThreadPoolExecutor(1, "rsvib-read")
-    computing = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
+    pool = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
     stopped = threading.Event()
 
-    def compute(window: Window, frames: "Future[WindowFrames]") -> _Result:
-        pixels = frames.result()
+    def compute(window: Window, pixels: WindowFrames) -> _Result:
         if stopped.is_set():
             raise RuntimeError("stopped")
         return finish(job.compute(window, pixels), pixels)
 
-    def submit(window: Window) -> "Future[_Result]":
-        return computing.submit(compute, window, reading.submit(reader.read, window))
-
     try:
-        yield from results_in_order(windows, submit, lambda: at_once + 1, deque())
+        with closing(read_windows(job, windows)) as read:
+            yield from results_in_order(read, lambda item: pool.submit(compute, *item), lambda: at_once + 1, deque())
     finally:
         stopped.set()
-        reading.shutdown(wait=True, cancel_futures=True)
-        computing.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=True, cancel_futures=True)
         torch.set_num_threads(default_threads)  # the default of threads that start later
-        reader.close()
 
 
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
     """Read and compute one window on a Dask worker."""
-    share_one_heap()
-    keep_freed_memory()
+    share_one_heap(keep_freed=True)
     default_threads = torch.get_num_threads()
     if one_thread:
         torch.set_num_threads(1)
-    reader = WindowReader(job.source, job.info)
     try:
         if job.device.startswith("cuda"):
             job = replace(job, device=_device_of_worker())
-        pixels = reader.read(window)
+        with closing(read_windows(job, [window])) as read:
+            _, pixels = next(read)
         return job.stored(job.compute(window, pixels), pixels)
     finally:
-        reader.close()
         torch.set_num_threads(default_threads)
 
 

@@ -1,7 +1,8 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.presentation import Summarised, plain_values
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
-from rsvib_torch.io.frame_times import timing_of_stack
-from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts, required_full_scale
-from rsvib_torch.io.stack_format import FrameReader
+from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
+from rsvib_torch.io.full_scale import (
+    check_dtype,
+    counts_to_frames,
+    frames_to_counts,
+    known_full_scale,
+    required_full_scale,
+)
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -113,6 +121,12 @@ class StackJob:
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
         return enlarged(frames if self.mosaic is None else colour_frames(frames, self.mosaic), self.scale)
+
+    def content(self, out: StackInfo, timing: SensorTiming) -> StackInfo:
+        """The output ``out`` with full scale, times and frame rate; ``timing`` is that of the caller."""
+        times = None if out.frame_times is None else exposure_times(self.info, timing)
+        rate = out.frame_rate or timing.frame_rate
+        return replace(out, full_scale=self.full_scale, frame_times=times, time_error=0.0, frame_rate=rate)
 
     def of_window(self, window: Window) -> "StackJob":
         """The job with only those given detections that ``window`` needs."""
@@ -223,41 +237,24 @@ class StackJob:
         }
 
 
-class WindowReader:
-    """Reads the frames of windows in order; the frame that neighbours share is read once.
+def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
+    """Windows with the pixels of their frames as stored, or why they cannot be read.
 
-    Args:
-        source: The stack.
-        info: What its file stated when the job was planned.
+    The frame that neighbours share is read once.
     """
-
-    def __init__(self, source: Path, info: StackInfo) -> None:
-        self._source, self._info = source, info
-        self._reader: FrameReader | None = None
-        self._last: tuple[int, NDArray[Any] | str] | None = None
-
-    def read(self, window: Window) -> WindowFrames:
-        """Pixels of the frames of a window as stored, or why they cannot be read."""
-        if self._reader is None:
-            self._reader = open_stack(self._source)
-            if self._reader.info != self._info:
-                raise ValueError(f"{self._source} has changed since it was first opened; start again")
-        frames = [self._frame(self._reader, index) for index in window.frames]
-        self._last = (window.last, frames[-1])
-        return frames
-
-    def _frame(self, reader: FrameReader, index: int) -> NDArray[Any] | str:
-        if self._last is not None and self._last[0] == index:
-            return self._last[1]
-        try:
-            return reader.frame(index)
-        except FrameError as error:
-            return " ".join(str(error).split())
-
-    def close(self) -> None:
-        """Close the stack."""
-        if self._reader is not None:
-            self._reader.close()
+    with closing(open_stack(job.source)) as reader:
+        if reader.info != job.info:
+            raise ValueError(f"{job.source} has changed since it was first opened; start again")
+        last: dict[int, NDArray[Any] | str] = {}  # the last frame of the window before
+        for window in windows:
+            frames: WindowFrames = []
+            for index in window.frames:
+                try:
+                    frames.append(last[index] if index in last else reader.frame(index))
+                except FrameError as error:
+                    frames.append(" ".join(str(error).split()))
+            last = {window.last: frames[-1]}
+            yield window, frames
 
 
 def plan_job(
@@ -318,3 +315,66 @@ def plan_job(
         info, job.window, memory=options.memory, most=most, restoration=job.restoration, on_gpu=device != "cpu"
     )
     return job, windows, at_once
+
+
+@checks_arguments
+def restore_block(
+    frames: NDArray[Any],
+    timing: SensorTiming,
+    *,
+    detection: Mapping[str, Any] | None = None,
+    restoration: Mapping[str, Any] | None = None,
+    full_scale: float | None = None,
+    channels: Channels = None,
+    force: bool = False,
+    device: str = "cpu",
+) -> NDArray[Any]:
+    """Detect the vibration in a block of frames and restore them; the result has the shape and data type of the block.
+
+    For ``dask.array.map_overlap`` with an overlap of one frame, and similar tools. The time origin is the first frame
+    of the block. A block in which the detection fails is returned unchanged, as are frames that cannot be used.
+
+    Args:
+        frames: (T, H, W) or (T, C, H, W), as stored.
+        timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
+        detection: Options of ``detect_vibration``.
+        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
+        full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
+        channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
+        force: Whether to return restored frames even if they are judged worse than the raw ones.
+        device: Device for the computation.
+
+    Returns:
+        Restored frames.
+
+    Raises:
+        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
+            to have their channels last.
+
+    Example:
+        >>> restored = array.map_overlap(  # doctest: +SKIP
+        ...     rsv.restore_block, depth={0: 1}, boundary="none", dtype=array.dtype, meta=array._meta,
+        ...     timing=timing, full_scale=4095,
+        ... )
+    """
+    if timing.frame_start_times is not None:
+        raise ValueError(
+            "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
+        )
+    options = dict(restoration or {})
+    if options.get("joint", False) is True:
+        raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
+    for name in ("scale", "mosaic"):
+        if options.get(name) not in (None, 1):
+            raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
+    check_dtype(frames.dtype)
+    axis = channel_axis("frames", frames.shape, channels)
+    stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
+    scale = known_full_scale(frames.dtype, full_scale)
+    if frames.dtype.kind != "f":
+        scale = required_full_scale(scale, frames.dtype, "frames")
+    info = StackInfo(stored.shape, stored.dtype.name, scale)
+    job = StackJob(Path("frames"), info, timing, scale, detection or {}, options, force=force, device=device)
+    window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
+    restored = job.stored(job.compute(window, pixels), pixels).frames
+    return np.moveaxis(np.stack(restored), -3, axis)

@@ -17,7 +17,7 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joined_columns, physical_tone, plain_values
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.result_files import decode
-from rsvib_torch.core.text import measured_text, number_of, text_table, wrapped
+from rsvib_torch.core.text import json_text, measured_text, number_of, text_table, wrapped
 from rsvib_torch.io.stack_format import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -241,22 +241,19 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
     reliable = [one for one in found if one is not None and axis < one.vibration.num_axes and bool(one.reliable[axis])]
     tones: list[list[tuple[float, float]]] = []  # (amplitude, frequency) in the windows of each tone
     for one in reliable:
-        amplitudes, frequencies, stds = (
+        columns = (
             values[axis].tolist() for values in (one.vibration.amplitude, one.vibration.frequency, one.std.frequency)
         )
-        new = [
-            (a, f, max(_SAME_TONE * f, 4 * s)) for a, f, s in zip(amplitudes, frequencies, stds, strict=True) if a > 0
-        ]
+        new = [(a, f, max(_SAME_TONE * f, 4 * s)) for a, f, s in zip(*columns, strict=True) if a > 0]
         steps = ((abs(f - tone[-1][1]), i, j) for i, (_, f, _) in enumerate(new) for j, tone in enumerate(tones))
         pairs: dict[int, int] = {}  # number of the tone that each one of this window continues
         for step, i, j in sorted(steps):
             if i not in pairs and j not in pairs.values() and step <= new[i][2]:
                 pairs[i] = j
         for i, (amplitude, frequency, _) in enumerate(new):
-            if i in pairs:
-                tones[pairs[i]].append((amplitude, frequency))
-            else:
-                tones.append([(amplitude, frequency)])
+            if i not in pairs:
+                tones.append([])
+            tones[pairs.get(i, -1)].append((amplitude, frequency))
     described = []
     for tone in tones:
         entry: dict[str, Any] = {"windows": len(tone)}
@@ -266,30 +263,26 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 
 
-def fingerprint(path: Path, *, block: int = 1 << 16, blocks: int = 32, files: int = 32) -> dict[str, Any]:
+def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> dict[str, Any]:
     """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
-    The hash covers the names and sizes of all files, and evenly spaced blocks of them that include the first and the
-    last; with the defaults, files of up to 2 MiB completely.
+    The hash covers the names and sizes of all files, and up to ``most`` evenly spaced blocks of up to ``most`` of them,
+    the first and the last included; with the defaults, files of up to 2 MiB completely.
     """
 
-    def spread(count: int, most: int) -> list[int]:
-        steps = min(count, most)
-        return sorted({round(i * (count - 1) / max(1, steps - 1)) for i in range(steps)})
+    def spread(count: int) -> list[int]:
+        return sorted(set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()))
 
     name, (path, _) = path.name, split_range(path)
-    if path.is_dir():
-        members = sorted(file for file in path.rglob("*") if file.is_file())
-    else:
-        sidecar = path.with_name(path.name + ".json")
-        members = [path, sidecar] if sidecar.is_file() else [path]
-    sizes = [file.stat().st_size for file in members]
+    members = path.rglob("*") if path.is_dir() else (path, path.with_name(f"{path.name}.json"))
+    files = sorted(file for file in members if file.is_file())
+    sizes = [file.stat().st_size for file in files]
     digest = hashlib.sha256()
-    for file, size in zip(members, sizes, strict=True):
+    for file, size in zip(files, sizes, strict=True):
         digest.update(os.fsencode(file.relative_to(path.parent)) + f"\0{size}\0".encode())
-    for number in spread(len(members), files):
-        with members[number].open("rb") as opened:
-            for index in spread(-(-sizes[number] // block), blocks):
+    for number in spread(len(files)):
+        with files[number].open("rb") as opened:
+            for index in spread(-(-sizes[number] // block)):
                 opened.seek(index * block)
                 digest.update(opened.read(block))
     return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
@@ -321,34 +314,27 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     return copy
 
 
-def write_manifest(
-    path: Path, header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
-) -> None:
-    """Write a manifest with one line per key and ``WindowRecord``; records are not kept in memory."""
-    units = {
-        "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
-        "amplitude": "px",
-        "frequency": "Hz",
-        "period": "s",
-        "phase": "rad at start_time",
-        "image_motion": "px/s",
-        "image_acceleration": "px/s^2",
-        "residual": "px",
-    }
-    bad: dict[str, str] = {}
-    with path.open("w", encoding="utf-8") as file:
-        file.write("{\n")
-        for key, value in {"format": "rsvib stack", "version": 1, **header, "units": units}.items():
-            file.write(f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)},\n")
-        file.write('  "windows": [')
-        for number, record in enumerate(records):
-            bad.update(record["bad_frames"])
-            file.write(",\n    " if number else "\n    ")
-            file.write(json.dumps(record, allow_nan=False))
-        file.write("\n  ]")
-        for key, value in {"bad_frames": bad, "not_kept": list(not_kept), **results}.items():
-            file.write(f",\n  {json.dumps(key)}: {json.dumps(value)}")
-        file.write("\n}\n")
+_UNITS = {
+    "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
+    "amplitude": "px",
+    "frequency": "Hz",
+    "period": "s",
+    "phase": "rad at start_time",
+    "image_motion": "px/s",
+    "image_acceleration": "px/s^2",
+    "residual": "px",
+}
+
+
+def manifest_text(
+    header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
+) -> str:
+    """A manifest as JSON, from the content of its ``WindowRecord``s."""
+    windows = list(records)
+    bad = {index: reason for record in windows for index, reason in record["bad_frames"].items()}
+    stated = {"format": "rsvib stack", "version": 1, **header, "units": _UNITS}
+    content = {**stated, "windows": windows, "bad_frames": bad, "not_kept": list(not_kept), **results}
+    return json_text(content) + "\n"
 
 
 @checks_arguments
@@ -363,16 +349,8 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
         ValueError: If it is not a complete manifest.
 
     Example:
-        >>> import tempfile
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
-        >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> folder = tempfile.mkdtemp()
-        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
-        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-        >>> report = rsv.process_stack(f"{folder}/frames.npy", f"{folder}/restored.npy", timing, **options)
-        >>> manifest = rsv.read_manifest(report.manifest)
-        >>> manifest.detections()[0].vibration.frequency[:, 0].round().tolist()  # Hz, first window
+        >>> manifest = read_manifest("restored.tif.manifest.json")  # doctest: +SKIP
+        >>> manifest.detections()[0].vibration.frequency[:, 0].tolist()  # Hz, first window  # doctest: +SKIP
         [110.0, 90.0]
     """
     return StackManifest.load(path)

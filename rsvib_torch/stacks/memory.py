@@ -13,7 +13,7 @@ from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.restoration.exact.priors import PRIORS
 
 # bytes; of the process with its libraries, and of a window independent of its size; peaks measured by
-# scripts/benchmark.py --only memory, rounded up
+# scripts/benchmark.py --only streaming, rounded up
 _PROCESS_BYTES, _WINDOW_BYTES = 450 * 10**6, 80 * 10**6
 # bytes per pixel and channel of a window that is detected, restored and judged; same measurement
 _PIXEL_BYTES = {"dewarp": 55, "banded": 55, "exact": 68, "richardson-lucy": 105}

@@ -1,8 +1,6 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
-import time
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +12,13 @@ from numpy.typing import NDArray
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.frames.entry_points import file_options, source_options
-from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
-from rsvib_torch.stacks.manifest import manifest_header, write_manifest
+from rsvib_torch.stacks.manifest import manifest_header, manifest_text
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, check_space, disk_errors_named, work_folder
 from rsvib_torch.stacks.windows import Window
@@ -52,14 +49,7 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
         ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
 
     Example:
-        >>> import tempfile
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
-        >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> folder = tempfile.mkdtemp()
-        >>> rsv.write_stack(f"{folder}/frames.npy", frames)
-        >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
-        >>> for result in rsv.iterate_stack(f"{folder}/frames.npy", timing, **options):
+        >>> for result in iterate_stack("frames.tif", timing, window=3):  # doctest: +SKIP
         ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
         (0,) [110.0, 90.0]
         (1, 2, 3) [110.0, 90.0]
@@ -100,7 +90,7 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
             yield record
 
     with whole_file(sink) as part:
-        write_manifest(part, manifest_header(job, None, None), records())
+        part.write_text(manifest_text(manifest_header(job, None, None), records()), encoding="utf-8")
 
 
 @file_options(ProcessStackOptions)
@@ -148,7 +138,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         >>> rsv.read_stack(f"{folder}/restored.npy").shape == frames.shape
         True
     """
-    start, sink = time.perf_counter(), Path(sink)
+    sink = Path(sink)
     scheduler, compression, given = options.scheduler, options.compression, options.given
     job, windows, at_once = plan_job(source, timing, options, here=scheduler in (None, "local"))
     if given is not None and len(given) != len(windows):
@@ -157,13 +147,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "pass one for each window"
         )
     out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
-    out = replace(
-        out,
-        full_scale=job.full_scale,
-        frame_times=None if out.frame_times is None else exposure_times(job.info, timing),
-        time_error=0.0,
-        frame_rate=out.frame_rate or timing.frame_rate,
-    )
+    out = job.content(out, timing)
     form = check_info_target(sink, out, compression, check_folder=False)
     target = manifest_path(sink, options)
     check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))
@@ -201,7 +185,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         write=write,
         not_kept=lambda count: metadata_not_kept(job.info, sink, (count, *out.shape[1:])),
     )
-    return replace(report, first=first, seconds=time.perf_counter() - start)
+    return replace(report, first=first)
 
 
 def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window]) -> None:
@@ -221,37 +205,27 @@ def _store_windows(
     remaining = [window for window in windows if window.index not in folder]
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
-
-    def store(stored: StoredWindow) -> None:
-        names = [f"{stored.record['window']:06d}.npy"] if stored.frames else []
-        for name in names:
-            stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
-            with folder.create(name) as file:
-                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
-                file.write(stack.data)  # errors of np.save do not contain the reason
-        folder.add(stored.record, names)
-
     if progress is not None:
         progress(done, total)
-    with ThreadPoolExecutor(1, "rsvib-write") as writing, closing(results):
-        previous: Future[None] | None = None
+    with closing(results):
         for window, stored in zip(remaining, results, strict=True):
             errors.append(stored.record["error"])
-            if previous is not None:
-                with disk_errors_named(folder):
-                    previous.result()
             try:
                 _check_not_all_failed(errors, windows)
             except ValueError:
                 folder.remove()
                 raise
-            previous = writing.submit(store, stored)
-            if progress is not None:
-                done += window.kept
-                progress(done, total)
-        if previous is not None:
+            names = [f"{window.index:06d}.npy"] if stored.frames else []
             with disk_errors_named(folder):
-                previous.result()
+                for name in names:
+                    stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
+                    with folder.create(name) as file:
+                        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
+                        file.write(stack.data)  # errors of np.save do not contain the reason
+                folder.add(stored.record, names)
+            done += window.kept
+            if progress is not None:
+                progress(done, total)
 
 
 def _stored_frames(folder: RunFolder) -> Iterator[NDArray[Any]]:

@@ -1,6 +1,5 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,6 @@ from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.validation import fields_of
 from rsvib_torch.frames.entry_points import file_options
-from rsvib_torch.io.frame_times import exposure_times
 from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack
@@ -28,7 +26,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
-from rsvib_torch.stacks.job import StackJob, plan_job
+from rsvib_torch.stacks.job import plan_job
 from rsvib_torch.stacks.manifest import manifest_header, rms_shaking
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
@@ -61,7 +59,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Args:
         source: A video, or another stack as in ``read_stack``.
-        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv, .avi (FFV1, without loss). Times, sound and metadata
+        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv (FFV1, without loss). Times, sound and metadata
             are those of the source.
         timing: As in ``process_stack``.
         options: Options. A part of the video is a window in the manifest; its detection is that of its middle, with the
@@ -82,7 +80,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Example:
         >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
     """
-    begin, source, sink = time.perf_counter(), Path(source), Path(sink)
+    source, sink = Path(source), Path(sink)
     border = options.border
     video, at_once = _planned(source, timing, options)
     job = video.job
@@ -90,7 +88,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     target = manifest_path(sink, options)
     check_outputs([sink, work_folder(sink), target], stack_files(source))
-    content = _content(job, timing)
+    content = job.content(job.info, timing)
     if border != "crop":
         check_info_target(sink, content, check_folder=False)
     header = manifest_header(job, sink.name, None)
@@ -117,7 +115,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         with whole_file(sink) as part:
             join_parts(part, content, (folder.open(name) for name in folder.files() if not name.endswith(".npy")))
 
-    report = run_to_file(
+    return run_to_file(
         sink,
         target,
         header,
@@ -127,7 +125,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         write=write,
         not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
     )
-    return replace(report, seconds=time.perf_counter() - begin)
 
 
 class _Encoder:
@@ -230,16 +227,6 @@ def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
     return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit), at_once
-
-
-def _content(job: StackJob, timing: SensorTiming) -> StackInfo:
-    return replace(
-        job.info,
-        full_scale=job.full_scale,
-        frame_times=None if job.info.frame_times is None else exposure_times(job.info, timing),
-        time_error=0.0,
-        frame_rate=job.info.frame_rate or timing.frame_rate,
-    )
 
 
 def _restore_parts(

@@ -12,7 +12,7 @@ from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import number_of
 from rsvib_torch.options import RunOptions
 from rsvib_torch.stacks.job import WindowResult
-from rsvib_torch.stacks.manifest import read_manifest, write_manifest
+from rsvib_torch.stacks.manifest import manifest_text, read_manifest
 from rsvib_torch.stacks.run_folder import RunFolder, describe_difference, disk_errors_named, work_folder
 
 
@@ -92,19 +92,16 @@ def run_to_file(
     """
     start = time.perf_counter()
 
-    def report(records: Iterable[Mapping[str, Any]], resumed: int, lost: Sequence[str]) -> StackReport:
-        counts = dict.fromkeys(("frames", "restored", "failed", "bad_frames"), 0)
-        for record in records:
-            counts["frames"] += record["written"]
-            counts["restored"] += record["frames"] == "restored"
-            counts["failed"] += record["error"] is not None
-            counts["bad_frames"] += len(record["bad_frames"])
-        seconds = time.perf_counter() - start
+    def report(windows_done: Iterable[Mapping[str, Any]], resumed: int, lost: Sequence[str]) -> StackReport:
+        records = list(windows_done)
         return StackReport(
-            **counts,
+            frames=sum(record["written"] for record in records),
             windows=windows,
+            restored=sum(record["frames"] == "restored" for record in records),
+            failed=sum(record["error"] is not None for record in records),
+            bad_frames=sum(len(record["bad_frames"]) for record in records),
             resumed=resumed,
-            seconds=seconds,
+            seconds=time.perf_counter() - start,
             first=None,
             manifest=manifest,
             not_kept=tuple(lost),
@@ -126,7 +123,7 @@ def run_to_file(
         with disk_errors_named(folder):
             make_folder(manifest.parent)
             with whole_file(manifest) as part:
-                write_manifest(part, header, folder.records(), lost, **results)
+                part.write_text(manifest_text(header, folder.records(), lost, **results), encoding="utf-8")
                 write(folder)
             sync(manifest.absolute().parent)  # the temporary folder is gone as well
         summary = report(folder.records(), resumed, lost)

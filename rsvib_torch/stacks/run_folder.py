@@ -21,20 +21,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rsvib_torch.core.atomic import (
-    PART,
-    error_of_full_disk,
-    make_folder,
-    nearest_folder,
-    sync,
-    sync_tree,
-    temporary_folder,
-)
+from rsvib_torch.core.atomic import PART, error_of_full_disk, make_folder, nearest_folder, sync
 from rsvib_torch.core.free_memory import size_text
-from rsvib_torch.core.text import quoted
+from rsvib_torch.core.text import one_line
 
 _HEADER = "run.json"
-_NAMES = re.compile(r"run\.json|\d{6,}\.(done|done\.part|npy|mkv|avi|mp4|mov|m4v)")  # of the files that a run makes
+_NAMES = re.compile(
+    r"run\.json(\.part)?|\d{6,}\.(done|done\.part|npy|mkv|mp4|mov|m4v)"
+)  # of the files that a run makes
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
 
 
@@ -51,7 +45,8 @@ def describe_difference(old: Any, new: Any, path: str = "") -> str | None:
             if difference:
                 return difference
         return None
-    return None if old == new else f"{path} was {quoted(old)}, now it is {quoted(new)}"
+    texts = (one_line(json.dumps(value), 60) for value in (old, new))
+    return None if old == new else "{} was {}, now it is {}".format(path, *texts)
 
 
 def check_space(path: Path, needed: int) -> None:
@@ -60,13 +55,6 @@ def check_space(path: Path, needed: int) -> None:
     if needed > free:
         reason = f"{os.strerror(errno.ENOSPC)}: a run needs {size_text(needed)}, {size_text(free)} are free"
         raise OSError(errno.ENOSPC, reason, str(path))
-
-
-def _digest(file: BinaryIO) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    while block := file.read(1 << 20):
-        digest.update(block)
-    return digest.hexdigest()
 
 
 class RunFolder:
@@ -86,56 +74,37 @@ class RunFolder:
 
     def __init__(self, sink: Path, header: Mapping[str, Any], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
-        self._header = json.dumps(header).encode()
-        self._key = hashlib.blake2b(self._header, digest_size=32).digest()
+        content = json.dumps(header).encode()
+        self._key = hashlib.blake2b(content, digest_size=32).digest()
         self._written: dict[int, int] = {}  # number of frames of each finished window
-        while True:
-            if not self._open():
-                self._create()
-                continue
-            try:
-                self._check_names()
-                windows = self._windows()
-                if windows and not resume:
-                    raise FileExistsError(
-                        f"{sink}: a run was interrupted here after {len(windows)} windows; resume it (--resume), or "
-                        f"delete {self.path} to start over"
-                    )
-                difference = self._difference()
-                if windows and difference:
-                    raise ValueError(f"{difference}; delete {self.path} to start over")
-                self._find_finished(windows)
-            except BaseException:
-                os.close(self._folder)
-                raise
-            if not difference:
-                return
-            self.remove()  # nothing is lost
-            os.close(self._folder)
-
-    def _create(self) -> None:
-        """Create the folder with its header: it gets its name when it is complete."""
         make_folder(self.path.parent)
-        with temporary_folder(self.sink) as folder:
-            new = folder / "new"
-            new.mkdir(0o700)
-            (new / _HEADER).write_bytes(self._header)
-            sync_tree(new)
-            try:
-                new.rename(self.path)
-            except OSError as error:
-                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # another process has created it
-                    raise
-        sync(self.path.parent)
+        while not self._open():
+            pass
+        try:
+            names = self._checked_names()
+            windows = sorted(int(name[:-5]) for name in names if name.endswith(".done"))
+            if windows:
+                self._check_resumable(content, len(windows), resume=resume)
+                self._find_finished(windows)
+            else:
+                for name in names:
+                    self._delete(name)
+                self._write(_HEADER, content)
+        except BaseException:
+            os.close(self._folder)
+            raise
 
     def _open(self) -> bool:
-        """Open and lock the folder; False if there is none."""
+        """Open the folder, which is created if it does not exist, and lock it; False if it was removed meanwhile."""
         try:
+            with suppress(FileExistsError):
+                self.path.mkdir(0o700)
+                sync(self.path.parent)
             self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
         except FileNotFoundError:
             return False
         except OSError as error:
-            if stat.S_ISDIR(os.lstat(self.path).st_mode):
+            if not os.path.lexists(self.path) or stat.S_ISDIR(os.lstat(self.path).st_mode):
                 raise
             raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
         try:
@@ -150,8 +119,8 @@ class RunFolder:
         except BaseException:
             os.close(self._folder)
             raise
-        os.close(self._folder)  # a process that has ended meanwhile removed it
-        return self._open()
+        os.close(self._folder)  # another process has removed it
+        return False
 
     def _lock(self) -> None:
         """Lock the folder; a warning if the file system has no locks, as those of some clusters."""
@@ -176,10 +145,10 @@ class RunFolder:
             f"delete {self.path} to start over"
         )
 
-    def _check_names(self) -> None:
-        """Raise a ``FileExistsError`` if there is anything in the folder that no run has made."""
+    def _checked_names(self) -> list[str]:
+        """Names in the folder; a ``FileExistsError`` if there is anything in it that no run has made."""
         names = sorted(os.listdir(self._folder))
-        if _HEADER not in names:
+        if not {_HEADER, f"{_HEADER}.part"}.intersection(names) and names:
             raise self._refusal(f"it has no {_HEADER}")
         for name in names:
             status = os.stat(name, dir_fd=self._folder, follow_symlinks=False)
@@ -187,23 +156,25 @@ class RunFolder:
                 raise self._refusal("it is not a regular file of one name and of this user", name)
             if not _NAMES.fullmatch(name):
                 raise self._refusal("it has another name than files of a run", name)
+        return names
 
-    def _difference(self) -> str | None:
-        """How the header differs from that of this run; None if it does not."""
+    def _check_resumable(self, header: bytes, count: int, *, resume: bool) -> None:
+        """Raise an error if a run of ``count`` finished windows must not be continued with this header."""
+        start_over = f"delete {self.path} to start over"
+        if not resume:
+            raise FileExistsError(
+                f"{self.sink}: a run was interrupted here after {count} windows; resume it (--resume), or {start_over}"
+            )
         with self.open(_HEADER) as file:
             stored = file.read()
-        if stored == self._header:
-            return None
-        try:
-            difference = describe_difference(json.loads(stored), json.loads(self._header))
-        except (ValueError, RecursionError):
-            difference = None
-        damaged = f"{self.path / _HEADER} is damaged"
-        return damaged if difference is None else f"{self.sink}: cannot resume: {difference}"
-
-    def _windows(self) -> list[int]:
-        """Numbers of the windows that have a marker."""
-        return sorted(int(name[:-5]) for name in os.listdir(self._folder) if name.endswith(".done"))
+        if stored != header:
+            try:
+                difference = describe_difference(json.loads(stored), json.loads(header))
+            except (ValueError, RecursionError):
+                difference = None
+            if difference is None:
+                raise ValueError(f"{self.path / _HEADER} is damaged; {start_over}")
+            raise ValueError(f"{self.sink}: cannot resume: {difference}; {start_over}")
 
     def _find_finished(self, windows: Iterable[int]) -> None:
         """Find the windows whose files are as they were written, and remove the markers of the others."""
@@ -217,13 +188,18 @@ class RunFolder:
     def _is_whole(self, window: int) -> bool:
         """Whether the files of a window are those that were written."""
         try:
-            for name, digest in self._entry(window)["files"].items():
-                with self.open(name) as file:
-                    if _digest(file) != digest:
-                        return False
+            return all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
         except OSError:
             return False
-        return True
+
+    def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
+        with self.open(name) as file:
+            if synchronised:
+                os.fsync(file.fileno())
+            digest = hashlib.blake2b(digest_size=16)
+            for block in iter(lambda: file.read(1 << 20), b""):
+                digest.update(block)
+            return digest.hexdigest()
 
     def _entry(self, window: int) -> dict[str, Any]:
         """Content of the marker of a window.
@@ -257,21 +233,20 @@ class RunFolder:
 
     def add(self, record: Mapping[str, Any], names: Iterable[str]) -> None:
         """Enter the ``WindowRecord`` of a window with its closed files; it is on the disk when the function returns."""
-        digests = {}
-        for name in names:
-            with self.open(name) as file:
-                os.fsync(file.fileno())
-                digests[name] = _digest(file)
+        digests = {name: self._digest_of(name, synchronised=True) for name in names}
         os.fsync(self._folder)  # their names
         body = json.dumps({"record": record, "files": digests}, allow_nan=False).encode()
-        marker = _marker(record["window"])
-        with self.create(f"{marker}.part") as file:
-            file.write(body + b"\n" + self._checksum(body))
+        self._write(_marker(record["window"]), body + b"\n" + self._checksum(body))
+        self._written[record["window"]] = record["written"]
+
+    def _write(self, name: str, content: bytes) -> None:
+        """Write a file, which gets its name when its content is on the disk."""
+        with self.create(f"{name}.part") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(f"{marker}.part", marker, src_dir_fd=self._folder, dst_dir_fd=self._folder)
+        os.replace(f"{name}.part", name, src_dir_fd=self._folder, dst_dir_fd=self._folder)
         os.fsync(self._folder)
-        self._written[record["window"]] = record["written"]
 
     def __contains__(self, window: int) -> bool:
         return window in self._written

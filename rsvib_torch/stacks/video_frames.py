@@ -15,15 +15,12 @@ from torch import Tensor
 
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
-from rsvib_torch.motion.field import displacement_at
+from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration.restore import METHODS, restore_prepared
 from rsvib_torch.tracking import Margins
-
-_MAP_COLUMNS = 9  # at which the displacement is computed with roll and zoom; the error is below 0.001 px
-_MAP_ROUNDS = 4  # of the row that a pixel was recorded in; rows move by less than a tenth of a pixel in a row time
 
 Frame = NDArray[Any]
 
@@ -175,47 +172,6 @@ class VideoRestorer:
         with torch.no_grad():
             restored = restore_prepared(prepared, motion, self.options)
         return frames_to_counts(prepared.from_row_order(restored)[0], self.layout.dtype, scale)
-
-
-def recorded_offsets(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -> NDArray[np.float32]:
-    """(2, n, m) px, how far (x, y) from each pixel of the restored frame it was recorded.
-
-    A pixel at rest at p was recorded at ``q = p + D(p, t(q))`` with the mean displacement D during the exposure of the
-    row of q. Rows in the order of the sensor are n; along them, D is linear between m columns, of which the first and
-    the last are those of the frame; without roll and zoom there is one.
-    """
-    height, width = size
-    along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)  # axes (x, y) along which rows follow, and along rows
-    count, length = (height, width) if along == 1 else (width, height)
-    parts = _MAP_COLUMNS if motion.num_axes > 2 else 1
-    grid = np.empty((2, count, parts))
-    grid[along] = np.arange(count)[:, None]
-    grid[across] = np.linspace(0.0, length - 1.0, parts) if parts > 1 else 0.0
-    centre = 0.5 * (np.array([width, height]) - 1)
-    x, y = (torch.from_numpy(grid[axis] - centre[axis]) for axis in (0, 1))
-    start, places = float(timing.frame_starts(1)[0]), grid
-    for _ in range(_MAP_ROUNDS):
-        rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
-        starts = torch.from_numpy(start + rows * timing.row_time)
-        moved = motion.mean_displacement(starts, timing.exposure_time)
-        places = grid + np.moveaxis(displacement_at(moved, x, y).numpy(), -1, 0)
-    return (places - grid).astype(np.float32)
-
-
-def source_map(motion: Vibration, timing: SensorTiming, size: tuple[int, int]) -> NDArray[np.float32]:
-    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded."""
-    offsets = recorded_offsets(motion, timing, size)
-    along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)
-    count, length = size[::-1][along], size[::-1][across]
-    parts = offsets.shape[-1]
-    if parts > 1:  # to all columns
-        place = np.arange(length) * ((parts - 1) / max(length - 1, 1))
-        hats = np.maximum(1.0 - np.abs(place - np.arange(parts)[:, None]), 0.0).astype(np.float32)
-        offsets = offsets @ hats
-    result = np.empty((2, count, length), dtype=np.float32)
-    np.add(np.arange(count, dtype=np.float32)[:, None], offsets[along], out=result[along])
-    np.add(np.arange(length, dtype=np.float32), offsets[across], out=result[across])
-    return result if along == 1 else result.transpose(0, 2, 1)
 
 
 def moved_back(plane: Frame, source: NDArray[np.float32]) -> Frame:

@@ -22,14 +22,16 @@ from rsvib_torch.io.stack_info import FrameError
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.sampling import recorded_offsets
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer, recorded_offsets
+from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer
 from rsvib_torch.tracking import Margins
-from rsvib_torch.tracking.camera_path import CameraPath, CornerFollower, Corners, Tone, camera_path, shake
+from rsvib_torch.tracking.camera_path import CameraPath, Tone, camera_path, shake
 from rsvib_torch.tracking.steadying import steady_places
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
@@ -159,7 +161,7 @@ class VideoPasses:
         for index in range(len(self.starts)):
             if index not in motion.faults:
                 track, timing = self.track(motion, index), self.restorer.timing_of(0)
-                x, y = recorded_offsets(track.motion, timing, self.layout.size)
+                (x, y), _ = recorded_offsets(track.motion, timing, self.layout.size)
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
                 widest = np.maximum(widest, sides)

@@ -10,21 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import MAX_NUMBER
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.detection import detect_vibration
 from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.io.full_scale import (
     beyond_full_scale,
-    check_dtype,
-    counts_to_frames,
-    frames_to_counts,
-    known_full_scale,
 )
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
@@ -140,70 +133,3 @@ def frame_fault(
         return f"frame {index} reaches {largest:.3g}, at most {MAX_NUMBER:g} is possible"
     rounding = 1e-7  # of float32, relative
     return constant_frame(index) if high - low <= rounding * largest else None
-
-
-@checks_arguments
-def restore_block(
-    frames: NDArray[Any],
-    timing: SensorTiming,
-    *,
-    detection: Mapping[str, Any] | None = None,
-    restoration: Mapping[str, Any] | None = None,
-    full_scale: float | None = None,
-    channels: Channels = None,
-    force: bool = False,
-    device: str = "cpu",
-) -> NDArray[Any]:
-    """Detect the vibration in a block of frames and restore them; the result has the shape and data type of the block.
-
-    For ``dask.array.map_overlap`` with an overlap of one frame, and similar tools. The time origin is the first frame
-    of the block. A block in which the detection fails is returned unchanged.
-
-    Args:
-        frames: (T, H, W) or (T, C, H, W), as stored.
-        timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
-        full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
-        channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
-        force: Whether to return restored frames even if they are judged worse than the raw ones.
-        device: Device for the computation.
-
-    Returns:
-        Restored frames.
-
-    Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
-            to have their channels last.
-
-    Example:
-        >>> restored = array.map_overlap(  # doctest: +SKIP
-        ...     rsv.restore_block, depth={0: 1}, boundary="none", dtype=array.dtype, meta=array._meta,
-        ...     timing=timing, full_scale=4095,
-        ... )
-    """
-    if timing.frame_start_times is not None:
-        raise ValueError(
-            "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
-        )
-    options = dict(restoration or {})
-    if options.get("joint", False) is True:
-        raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
-    for name in ("scale", "mosaic"):
-        if options.get(name) not in (None, 1):
-            raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
-    check_dtype(frames.dtype)
-    scale = known_full_scale(frames.dtype, full_scale)
-    axis = channel_axis("frames", frames.shape, channels)
-    stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
-    if len(stored) < 2 or any(frame_fault(frame, index, scale) for index, frame in enumerate(stored)):
-        return frames.copy()
-    floats = counts_to_frames(stored, scale, "frames").to(device)
-    try:
-        detected = detect_vibration(floats, timing, **(detection or {}))
-        restored = restore_trusted(floats, timing, detected, options, force=force, most_pairs=2)
-    except (ValueError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-        return frames.copy()
-    if not restored.restored:
-        return frames.copy()
-    return np.moveaxis(frames_to_counts(restored.frames, np.dtype(frames.dtype), scale), -3, axis)

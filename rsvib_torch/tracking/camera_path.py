@@ -8,28 +8,22 @@ has been projected out. Both are fitted together, with weights that leave out mo
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from rsvib_torch.core.tables import Array, table, tensor
-from rsvib_torch.motion.field import displacement_factors
+from rsvib_torch.core.splines import spline_taps
+from rsvib_torch.core.tables import Array
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration.corners import Points, find_corners, follow_corners
+from rsvib_torch.registration.corners import Corners, reduction
 
 WINDOW_FRAMES = 96  # of one fit; amplitudes and frequencies may change from window to window
 _MOST_TONES = 3  # of an axis in a window
-_MOST_PIXELS = 700_000  # of a frame in which corners are followed; the sides of larger ones are halved
-_MOST_CORNERS = 256  # of a pair of frames; 480 take twice the time, and the clips become no steadier
-_MIN_CORNERS = 8  # of a pair of frames; four components are determined, and wrong matches are rejected
-_MIN_SHARE = 0.25  # of the corners of a pair that agree on one motion; pairs of unrelated frames reach 0.1
-_AGREE = 3.0  # px, from an affine motion between two frames: parallax, and vibration within a frame
 _KNOTS = 2  # of the spline per frame; with one, residuals of hand-held clips are 1.7 times as large
 _STIFFNESS = 1e-3  # of the third difference of the spline, in units of the information of a typical knot
 _CELLS = 24  # of the rows, in which the search for tones takes means; resolves tones of 12 periods per readout
@@ -47,92 +41,6 @@ _SOFT = 3.0  # standard deviations, at which a corner has a quarter of the weigh
 
 
 Averaged = tuple[float, float]  # s, the exposure, and the time in which the rows of the patch of a corner are read
-
-
-@dataclass(frozen=True, eq=False)
-class Corners:
-    """N corners that were followed between two frames, or between the frames of several pairs."""
-
-    pairs: NDArray[np.int64]  # (N,) number of the pair
-    rows: Array  # (N,) place of the row in the readout of the first frame, 0 to 1
-    times: Array  # (N, 2) s, middle of the exposure of their rows in both frames
-    places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
-    offsets: Array  # (N, 2) px
-
-    @property
-    def factors(self) -> Array:
-        """(N, 2, 4), displacement by unit components of the path."""
-        x, y = tensor(self.places).unbind(-1)
-        return table(displacement_factors(x, y, 4))
-
-    @staticmethod
-    def joined(parts: Sequence["Corners"]) -> "Corners":
-        """The corners of all pairs."""
-        pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets"))
-        return Corners(pairs, *(np.concatenate(values) for values in rest))
-
-
-class CornerFollower:
-    """Follows corners from each frame of a video to the next; the same corners as long as they are seen.
-
-    Args:
-        timing: The sensor.
-    """
-
-    def __init__(self, timing: SensorTiming) -> None:
-        self._timing = timing
-        self._start = 0.0  # s, of the frame before
-        self._before: NDArray[np.uint8] | None = None  # the frame before, of reduced size
-        self._known: Points | None = None  # corners in it
-
-    def next(self, grey: NDArray[np.uint8], start: float) -> Corners | None:
-        """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
-
-        Returns:
-            The corners that move with most others; None if there are too few, and for the first frame.
-        """
-        # 1. Follow corners, in frames of reduced size if they are large.
-        (height, width), timing, scale = grey.shape, self._timing, _reduction(*grey.shape)
-        second, first, known = _reduced(grey, scale), self._before, self._known
-        starts = np.array([self._start, start])
-        self._before, self._start, self._known = second, start, None
-        if first is None:
-            return None
-        found = find_corners(first, known, most=_MOST_CORNERS)
-        ends, good = follow_corners(first, second, found)
-        found, ends = found[good], ends[good]
-        if len(found) < _MIN_CORNERS:
-            return None
-        # 2. Keep those that follow one affine motion.
-        _, inliers = cv2.estimateAffine2D(
-            found, ends, method=cv2.USAC_MAGSAC, ransacReprojThreshold=max(1.0, _AGREE / scale)
-        )
-        agree = np.zeros(len(found), bool) if inliers is None else inliers[:, 0] > 0
-        if agree.sum() < max(_MIN_CORNERS, _MIN_SHARE * len(good)):
-            return None
-        self._known = ends[agree]
-        found, ends = ((points[agree] + 0.5) * scale - 0.5 for points in (found, ends))
-        # 3. The times of their rows.
-        axis, count = (1, height) if timing.scan_axis == -2 else (0, width)
-        rows = np.stack([found[:, axis], ends[:, axis]], -1)
-        rows = rows if timing.readout_direction == "forward" else count - 1 - rows
-        times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
-        places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
-        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found)
-
-
-def _reduction(height: int, width: int) -> int:
-    """By how much the sides of frames are reduced before corners are followed."""
-    return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))
-
-
-def _reduced(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
-    """Means over squares of ``scale`` px."""
-    if scale == 1:
-        return frame
-    size = (frame.shape[1] // scale, frame.shape[0] // scale)
-    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 @dataclass(eq=False)
@@ -170,33 +78,14 @@ class WindowPath:
 
     def path(self, times: Array, derivative: int = 0) -> Array:
         """(N, 4) components of the path, or their derivatives, at times (N,) in s."""
-        first, weights = _spline(times, self.start, self.step, len(self.knots), derivative)
-        return np.einsum("nk,nka->na", weights, self.knots[first[:, None] + np.arange(4)])
+        index, weights = spline_taps(times, self.start, self.step, len(self.knots), derivative=derivative)
+        return np.einsum("nk,nka->na", weights, self.knots[index])
 
 
-def _spline(
-    times: Array, start: float, step: float, count: int, derivative: int = 0
-) -> tuple[NDArray[np.int64], Array]:
-    """First of the four cubic B-splines (of ``count``) at each time, and their values or derivatives (..., 4)."""
-    place = np.clip((times - start) / step, 0.0, count - 3.0)
-    first = np.minimum(place.astype(np.int64), count - 4)
-    u = place - first
-    if derivative == 0:
-        values = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-    elif derivative == 1:
-        values = [-3 * (1 - u) ** 2, 9 * u**2 - 12 * u, -9 * u**2 + 6 * u + 3, 3 * u**2]
-    else:
-        values = [6 * (1 - u), 18 * u - 12, -18 * u + 6, 6 * u]
-    return first, np.stack(values, -1) / (6 * step**derivative)
-
-
-def _differences(first: NDArray[np.int64], values: Array, count: int) -> Array:
-    """(N, count), differences between both times (N, 2) of the B-splines from ``_spline``."""
-    basis = np.zeros((len(first), count))
-    for frame, sign in ((0, -1.0), (1, 1.0)):
-        np.add.at(
-            basis, (np.arange(len(first))[:, None], first[:, frame, None] + np.arange(4)), sign * values[:, frame]
-        )
+def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
+    """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
+    basis = np.zeros((len(index), count))
+    np.add.at(basis, (np.arange(len(index))[:, None, None], index), factors * [[-1.0], [1.0]])
     return basis
 
 
@@ -216,7 +105,7 @@ class _WindowFit:
         self.times = corners.times - self.origin
         # Roll and zoom are fitted as the displacement in px at the farthest corner.
         self.reach = max(1.0, float(np.abs(corners.places).max()))
-        first, weights = _spline(corners.times, self.start, self.step, self.count)
+        index, weights = spline_taps(corners.times, self.start, self.step, self.count)
         factors = corners.factors / np.array([1.0, 1.0, self.reach, self.reach])
         # Columns of the path, for the few knots that a pair of frames depends on: every component of a knot at the
         # places of the corners.
@@ -224,8 +113,8 @@ class _WindowFit:
         ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
         for begin, stop in pairwise((0, *ends)):
             part = slice(int(begin), int(stop))
-            low, knots = int(first[part].min()), int(first[part].max()) + 4
-            basis = _differences(first[part] - low, weights[part], knots - low)
+            low, knots = int(index[part].min()), int(index[part].max()) + 1
+            basis = _differences(index[part] - low, weights[part], knots - low)
             columns = np.einsum("nac,nk->anck", factors[part], basis).reshape(2, len(basis), -1)
             unknowns = (np.arange(4)[:, None] * self.count + np.arange(low, knots)).ravel()
             self.pairs.append((part, unknowns, columns))
@@ -315,8 +204,7 @@ class _WindowFit:
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
-        first, values = _spline(times + self.origin, self.start, self.step, self.count)
-        basis = _differences(first, values, self.count)
+        basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
         tones = [tone.columns(times, self.averaged)[:, :2] for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known
@@ -443,7 +331,7 @@ def camera_path(pairs: Iterable[Corners | None], timing: SensorTiming, size: tup
         ValueError: If no window of frames has corners in a quarter of its pairs.
     """
     readout = timing.row_time * size[0 if timing.scan_axis == -2 else 1]
-    averaged = timing.exposure_time, _PATCH_ROWS * _reduction(*size) * timing.row_time
+    averaged = timing.exposure_time, _PATCH_ROWS * reduction(*size) * timing.row_time
     windows: list[WindowPath] = []
     waiting: list[Corners | None] = []
 

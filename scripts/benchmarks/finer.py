@@ -24,7 +24,7 @@ from benchmarks.independent_camera import (
     still_image,
     take_frames,
 )
-from benchmarks.restoration import SCENES
+from benchmarks.pipeline import SCENES
 from harness import Rows, one_thread, table
 from scipy import ndimage
 

@@ -11,6 +11,7 @@ import av
 import numpy as np
 from benchmarks.honesty_camera import Array, Layer, Motion, row_displacement, standing, take_frames
 from benchmarks.honesty_scenes import cars, cloud, near_half, scene_layer
+from harness import write_h264
 
 import rsvib_torch as rsv
 
@@ -129,12 +130,7 @@ def decoded_h264(frames: Array, crf: int) -> Array:
     counts = np.clip(np.round(16 + 219 * frames), 0, 255).astype(np.uint8)
     grey = np.full((height // 2, width), 128, np.uint8)  # both planes of chroma
     video = io.BytesIO()
-    with av.open(video, "w", format="mp4") as output:
-        stream = output.add_stream("libx264", rate=round(1 / FRAME_PERIOD), options={"crf": str(crf)})
-        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
-        for luma in counts:
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.concatenate([luma, grey]), format="yuv420p")))
-        output.mux(stream.encode())
+    write_h264(video, (np.concatenate([luma, grey]) for luma in counts), round(1 / FRAME_PERIOD), crf=str(crf))
     video.seek(0)
     with av.open(video) as encoded:
         decoded = [frame.to_ndarray()[:height] for frame in encoded.decode(video=0)]

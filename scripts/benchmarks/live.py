@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from typing import Any
 
 import cv2
@@ -17,7 +16,6 @@ import numpy as np
 import psutil
 import torch
 from benchmarks.independent_camera import closed, take_frames
-from benchmarks.vidstab_peer import stabilised
 from harness import Rows, table
 from numpy.typing import NDArray
 
@@ -245,8 +243,6 @@ def rows(options: argparse.Namespace) -> Rows:
         "`VibrationTracker`, exact": tracked_frames(clip, size, "exact"),
         "`cv2.phaseCorrelate`, `cv2.warpAffine`": lambda: phase_correlated(clip),
     }
-    if find_spec("vidstab") is not None:
-        tasks["vidstab"] = lambda: stabilised(clip)
     for name, work in tasks.items():
         begin, cpu = time.perf_counter(), time.process_time()
         restored = work()

@@ -10,32 +10,35 @@ from a camera made without the package.
 import argparse
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-from benchmarks import restoration
+from benchmarks.independent_camera import Shake, closed, take_frames
 from benchmarks.library_chain import detect_by_libraries
-from benchmarks.restoration import (
-    AMPLITUDE,
-    FREQUENCY,
-    MARGIN,
-    RIM,
-    SCENES,
-    SEED,
-    camera,
-    quality,
-    recordings,
-    vibration,
-)
-from benchmarks.restoration_peers import Peer, remap_lanczos, sampled_rows, slabs_and_kernels, wiener_loop, wiener_rows
+from benchmarks.restoration_peers import remap_lanczos, sampled_rows, slabs_and_kernels, wiener_loop, wiener_rows
 from harness import Rows, Timed, in_turns, named, shown_seconds, table
 from torch import Tensor
 
 import rsvib_torch as rsv
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
 
-OPTIONS = restoration.OPTIONS | {"pipeline_rows": (2048, "pipeline: rows of the frames where chains are compared")}
-QUICK = restoration.QUICK | {"pipeline_rows": 384}
+SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
+    "city": city_and_fields,
+    "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
+}
+OPTIONS = {
+    "pipeline_rows": (2048, "pipeline: rows of the frames where chains are compared"),
+    "grid_size": (512, "pipeline: columns of these frames"),
+    "exposures": ((20, 100, 400), "pipeline: exposures in row times"),
+    "noises": ((0.0, 0.005, 0.02), "pipeline: noise levels of full scale"),
+    "scenes": (tuple(SCENES), "drawn scenes to compare on", SCENES),
+}
+QUICK = {"pipeline_rows": 384, "grid_size": 128, "exposures": (20,), "noises": (0.005,), "scenes": ("city",)}
+SEED = 7
+RIM, MARGIN, FADE = 32, 48, 24  # px
+AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
+FULL_ROWS = 2048  # of the paper's camera
 TIMED_BALANCE, TIMED_NOISE = 0.01, 0.005
 PAPER, FASTEST = "matchTemplate, curve_fit, wiener rows (the paper's)", "matchTemplate, curve_fit, remap (fastest)"
 OURS, DEWARP = "detect_vibration, restore", 'detect_vibration, "dewarp"'
@@ -58,8 +61,40 @@ CHAINS = {  # of the package: detection and method of restoration
     '"bands" on a quarter of the columns, "dewarp"': ("narrow bands", "dewarp"),
 }
 FIGURES = {"amplitude_percent": "amplitude", "period_percent": "period", "psnr_db": "PSNR"}
-# frames per second: of the paper's camera, and the goal for restoration on a large GPU
-CAMERA_RATE, GOAL_RATE = 24.0, 100.0
+
+
+# The frames
+
+
+def camera(exposure: float, num_rows: int = FULL_ROWS) -> rsv.SensorTiming:
+    """The paper's camera; fewer rows are slower, so that frame period and exposure time are unchanged."""
+    slower = FULL_ROWS / num_rows
+    return rsv.SensorTiming(row_time=20.52e-6 * slower, exposure_rows=exposure / slower, frame_rows=num_rows)
+
+
+def vibration() -> rsv.Vibration:
+    """The paper's vibration with random phases."""
+    generator = torch.Generator().manual_seed(SEED)
+    phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
+    return rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
+
+
+def recordings(options: argparse.Namespace) -> Iterator[tuple[dict[str, Any], Tensor, Tensor, rsv.SensorTiming]]:
+    """Scene, exposure and noise of every case, its two frames, the scene at rest, and the timing."""
+    size = (options.pipeline_rows, options.grid_size)
+    for name in options.scenes:
+        scene = SCENES[name](size[0] + 2 * MARGIN, size[1] + 2 * MARGIN, SEED)
+        still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
+        for exposure in options.exposures:
+            timing = camera(exposure, size[0])
+            taken = take_frames(closed(scene.double().numpy(), FADE), Shake.of(vibration()), timing, 2, size)
+            clean = torch.from_numpy(taken).float()
+            for noise in options.noises:
+                frames = rsv.SensorNoise(read_noise=noise).apply(clean, torch.Generator().manual_seed(SEED))
+                yield {"scene": name, "exposure_rows": exposure, "noise": noise}, frames, still, timing
+
+
+# Accuracy
 
 
 def detect(frames: Tensor, timing: rsv.SensorTiming, name: str) -> rsv.DetectionResult:
@@ -74,72 +109,77 @@ def errors_of(found: rsv.Vibration) -> dict[str, float]:
     """Errors of amplitude and period in % of the strongest tone, on the axis that has the larger one."""
     amplitude, frequency = found.amplitude[:, 0].cpu(), found.frequency[:, 0].cpu()
     true_amplitude, true_frequency = (torch.tensor(v, dtype=torch.float64) for v in (AMPLITUDE, FREQUENCY))
-    lost = amplitude <= 0
     wrong = (amplitude / true_amplitude - 1).abs()
-    period = torch.where(lost, math.nan, (true_frequency / frequency - 1).abs())
+    period = torch.where(amplitude <= 0, math.nan, (true_frequency / frequency - 1).abs())
     return {"amplitude_percent": 100 * float(wrong.max()), "period_percent": 100 * float(period.max())}
 
 
-def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, method: str) -> list[Peer]:
+def restored_by(frames: Tensor, timing: rsv.SensorTiming, found: rsv.Vibration, method: str) -> Tensor:
     """Both frames restored by the package."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
-        return [Peer(frame, 0.0) for frame in rsv.restore(frames, timing, found, method=method)]
+        return rsv.restore(frames, timing, found, method=method)
+
+
+def quality(restored: Tensor, still: Tensor) -> float:
+    """PSNR in dB without the border."""
+    return float(rsv.psnr(restored, still, 1.0, rim=RIM))
 
 
 def compare_chains(frames: Tensor, still: Tensor, timing: rsv.SensorTiming) -> Rows:
     """Errors of the vibration, and the PSNR of the worse of the two frames, of every chain."""
-    array, found = frames.numpy(), {name: detect(frames, timing, name) for name in DETECTIONS}
-    by_libraries = detect_by_libraries(array, timing)
-    chains: dict[str, tuple[rsv.Vibration, bool | None, Callable[[], list[Peer]]]] = {
-        PAPER: (
-            by_libraries,
-            None,
-            lambda: [wiener_rows(array[i], timing, by_libraries, still, RIM, i) for i in range(2)],
-        ),
-        FASTEST: (by_libraries, None, lambda: [remap_lanczos(array[i], timing, by_libraries, i) for i in range(2)]),
-    }
+    array, lib = frames.numpy(), detect_by_libraries(frames.numpy(), timing)
+    try:
+        by_rows = min(wiener_rows(array[i], timing, lib, still, RIM, i) for i in range(2))
+    except ValueError:  # kernels of a row loop are larger than its slabs, because the detection failed
+        by_rows = math.nan
+    remapped = min(quality(remap_lanczos(array[i], timing, lib, i), still) for i in range(2))
+    results = [
+        {"chain": PAPER, **errors_of(lib), "psnr_db": by_rows, "reliable": None},
+        {"chain": FASTEST, **errors_of(lib), "psnr_db": remapped, "reliable": None},
+    ]
+    found = {name: detect(frames, timing, name) for name in DETECTIONS}
     for name, (detection, method) in CHAINS.items():
-        vibration_of, reliable = found[detection].vibration, bool(found[detection].reliable.all())
-        chains[name] = (
-            vibration_of,
-            reliable,
-            lambda v=vibration_of, m=method: restored_by(frames, timing, v, m),
-        )
-    results = []
-    for name, (vibration_of, reliable, restore) in chains.items():
-        try:
-            psnr = min(quality(figure, still) for figure in restore())
-        except ValueError:  # kernels of a row loop are larger than its slabs, because the detection failed
-            psnr = math.nan
-        results.append({"chain": name, **errors_of(vibration_of), "psnr_db": psnr, "reliable": reliable})
+        motion, reliable = found[detection].vibration, bool(found[detection].reliable.all())
+        psnr = min(quality(frame, still) for frame in restored_by(frames, timing, motion, method))
+        results.append({"chain": name, **errors_of(motion), "psnr_db": psnr, "reliable": reliable})
     return results
 
 
-def accuracy(options: argparse.Namespace) -> Rows:
-    """Every chain on every scene, exposure and noise."""
-    size = (options.pipeline_rows, options.grid_size)
-    return [
-        {"part": "accuracy", **case, **row}
-        for case, frames, still, timing in recordings(options, size, size[0])
-        for row in compare_chains(frames, still, timing)
-    ]
+def behind_libraries(compared: Rows, chain: str) -> Rows:
+    """Cases in which the better chain of libraries is more accurate: case, figure, peer and both values."""
+    cases: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
+    for row in compared:
+        cases.setdefault((row["scene"], row["exposure_rows"], row["noise"]), {})[row["chain"]] = row
+    found = []
+    for case, rows_of in cases.items():
+        for figure in FIGURES:
+            sign = 1 if figure == "psnr_db" else -1
+            values = [(sign * rows_of[peer][figure], peer) for peer in (PAPER, FASTEST)]
+            best, peer = max((pair for pair in values if not math.isnan(pair[0])), default=(-math.inf, ""))
+            ours = rows_of[chain][figure]
+            if not sign * ours > best:
+                found.append({"case": case, "figure": figure, "peer": peer, "ours": ours, "theirs": sign * best})
+    return found
 
 
-def fft_round_trip(frame: Tensor) -> Tensor:
-    """The unit of time: forward and inverse ``torch.fft`` in float32."""
-    image: Tensor = torch.fft.irfft2(torch.fft.rfft2(frame), s=frame.shape)
-    return image
+# Time
 
 
-def speed(options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming) -> Rows:
+def speed(options: argparse.Namespace) -> Rows:
     """Seconds of every chain, of detection and of restoration, also in FFT round trips of one frame."""
+    size, timing = options.size, camera(20, options.size)
+    scene = SCENES["city"](size + 2 * MARGIN, size + 2 * MARGIN, SEED)
+    noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
+    frames = rsv.simulate_frames(
+        scene, timing, vibration(), 2, frame_size=(size, size), noise=noise, generator=generator
+    )
     results = []
     for device in options.device:
         taken, chains = frames.to(device), dict(CHAINS)
         found = detect(taken, timing, "direct").vibration
         works: dict[str, Callable[[], Any]] = {
-            "round trip": lambda f=taken: fft_round_trip(f[0]),
+            "round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]), s=f.shape[1:]),
             **{name: lambda n=name, f=taken: detect(f, timing, n) for name in DETECTIONS},
             **{
                 method: lambda m=method, f=taken, v=found: restored_by(f, timing, v, m)
@@ -147,7 +187,7 @@ def speed(options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming)
             },
         }
         if device == "cpu":
-            array, rows_ = frames.numpy(), sampled_rows(frames.shape[-2], RIM)
+            array, rows_ = frames.numpy(), sampled_rows(size, RIM)
             lib = detect_by_libraries(array, timing)
             works["libraries"] = lambda a=array: detect_by_libraries(a, timing)
             works["wiener"] = lambda a=array, r=rows_, v=lib: [
@@ -157,9 +197,9 @@ def speed(options: argparse.Namespace, frames: Tensor, timing: rsv.SensorTiming)
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
         done = in_turns(works, options.runs)
         if "wiener" in done:
-            done["wiener"] = done["wiener"].scaled(frames.shape[-2] / len(rows_))
+            done["wiener"] = done["wiener"].scaled(size / len(rows_))
         results += [
-            {"part": "speed", "chain": named(name, device), **_figures(done[first], done[second], done["round trip"])}
+            {"chain": named(name, device), **_figures(done[first], done[second], done["round trip"])}
             for name, (first, second) in chains.items()
         ]
     return results
@@ -174,88 +214,25 @@ def _figures(detection: Timed, restoration: Timed, round_trip: Timed) -> dict[st
         "detection_round_trips": detection.seconds / round_trip.seconds,
         "restoration_round_trips": restoration.seconds / 2 / round_trip.seconds,
         "frames_a_second": 2 / whole.seconds,
-        "frames_restored_a_second": 2 / restoration.seconds,
     }
 
 
+# The tables
+
+
 def rows(options: argparse.Namespace) -> Rows:
-    """Accuracy and time of all chains, and the targets."""
-    size, timing = options.size, camera(20, options.size)
-    scene = SCENES["city"](size + 2 * MARGIN, size + 2 * MARGIN, SEED)
-    noise, generator = rsv.SensorNoise(read_noise=TIMED_NOISE), torch.Generator().manual_seed(SEED)
-    frames = rsv.simulate_frames(
-        scene, timing, vibration(), 2, frame_size=(size, size), noise=noise, generator=generator
-    )
-    compared, timed = accuracy(options), speed(options, frames, timing)
-    return [*compared, *timed, *targets(compared, timed)]
-
-
-def _target(target: str, value: float, goal: float, *, at_least: bool = False) -> dict[str, Any]:
-    met = value >= goal if at_least else value <= goal
-    bound = f"at least {goal:g}" if at_least else f"at most {goal:g}"
-    return {"part": "target", "target": target, "value": value, "goal": bound, "met": met}
-
-
-def targets(compared: Rows, timed: Rows) -> Rows:
-    """Targets, and whether they are met."""
-    speed_of = {row["chain"]: row for row in timed}
-    found = []
-    if OURS in speed_of:
-        ours, paper, fastest = (speed_of[name]["seconds"] for name in (OURS, PAPER, FASTEST))
-        narrow = speed_of[NARROW]["seconds"]
-        found += [
-            _target("time of the paper's chain over ours", paper / ours, 10.0, at_least=True),
-            _target(f"time of the paper's chain over {NARROW}", paper / narrow, 10.0, at_least=True),
-            _target("time of ours over that of the fastest chain", ours / fastest, 3.0),
-        ]
-        found += [
-            _target(f"time of {name} over that of the fastest chain", row["seconds"] / fastest, 1.0)
-            for name, row in speed_of.items()
-            if '"dewarp"' in name
-        ]
-        found += [
-            _target("FFT round trips of detection of a pair", speed_of[OURS]["detection_round_trips"], 30.0),
-            _target("FFT round trips of restoration of a frame", speed_of[OURS]["restoration_round_trips"], 10.0),
-        ]
-    on_gpu = speed_of.get(named(OURS, "cuda"))
-    if on_gpu is not None:
-        both, restored = on_gpu["frames_a_second"], on_gpu["frames_restored_a_second"]
-        found += [
-            _target("frames per second on cuda, detected and restored", both, CAMERA_RATE, at_least=True),
-            _target("frames restored per second on cuda", restored, GOAL_RATE, at_least=True),
-        ]
-    for chain in (OURS, NARROW):
-        behind = behind_libraries(compared, chain)
-        for figure, name in FIGURES.items():
-            worse = sum(row["figure"] == figure for row in behind)
-            text = f"cases where a chain of libraries is ahead of {chain} in {name}"
-            found.append(_target(text, float(worse), 0.0))
-    return found
-
-
-def behind_libraries(compared: Rows, chain: str) -> Rows:
-    """Cases in which the better chain of libraries is more accurate: case, figure, peer and both values."""
-    cases: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
-    for row in compared:
-        cases.setdefault((row["scene"], row["exposure_rows"], row["noise"]), {})[row["chain"]] = row
-    found = []
-    for case, rows_of in cases.items():
-        for figure in FIGURES:
-            sign = 1 if figure == "psnr_db" else -1
-            peers = [peer for peer in (PAPER, FASTEST) if not math.isnan(rows_of[peer][figure])]
-            if not peers:
-                continue
-            best = max(peers, key=lambda peer, s=sign, r=rows_of, f=figure: s * r[peer][f])
-            ours, theirs = rows_of[chain][figure], rows_of[best][figure]
-            if not sign * ours > sign * theirs:
-                found.append({"case": case, "figure": figure, "peer": best, "ours": ours, "theirs": theirs})
-    return found
+    """Accuracy of every chain on every scene, exposure and noise; time of all chains."""
+    compared = [
+        {"part": "accuracy", **case, **row}
+        for case, frames, still, timing in recordings(options)
+        for row in compare_chains(frames, still, timing)
+    ]
+    return compared + [{"part": "speed", **row} for row in speed(options)]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as Markdown tables."""
-    of_part = {part: [r for r in results if r["part"] == part] for part in ("accuracy", "speed", "target")}
-    compared = of_part["accuracy"]
+    compared, timed = ([row for row in results if row["part"] == part] for part in ("accuracy", "speed"))
     text = [
         f"Detection and restoration of a pair of frames, {options.pipeline_rows} x {options.grid_size} px. Errors of "
         "amplitude and period in % on the worse axis, PSNR in dB of the worse frame. The row loop processes "
@@ -281,27 +258,20 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
                 *(f"{r[f'{part}_round_trips']:.1f}" for part in ("detection", "restoration")),
                 f"{r['frames_a_second']:.1f}",
             )
-            for r in of_part["speed"]
+            for r in timed
         ],
     )
-    text += [f"Medians of {options.runs} alternating runs (range).", ""]
-    goals = [
-        (r["target"], r["goal"], f"{r['value']:.2f}", "met" if r["met"] else "**missed**") for r in of_part["target"]
-    ]
-    text += table(("target", "goal", "measured", ""), goals)
-    if not any(r["chain"].endswith("on cuda") for r in of_part["speed"]):
-        text += ["Frames per second on a GPU: not measured.", ""]
     unsure = [row for row in compared if row["chain"] == OURS and not row["reliable"]]
-    text += [f"Cases in which the detection is not reliable according to its own verdict: {len(unsure)}.", ""]
-    return text + _losses(compared, chains)
-
-
-def _losses(compared: Rows, chains: list[str]) -> list[str]:
-    """Cases in which chains of libraries are better: listed for the default chain, counted for the others."""
-    text = []
-    for chain in (chain for chain in chains if chain not in (PAPER, FASTEST)):
+    text += [
+        f"Medians of {options.runs} alternating runs (range).",
+        "",
+        f"Cases in which the detection is not reliable according to its own verdict: {len(unsure)}.",
+        "",
+    ]
+    # Cases in which chains of libraries are better: listed for the default chain, counted for the others.
+    cases = len({(row["scene"], row["exposure_rows"], row["noise"]) for row in compared})
+    for chain in CHAINS:
         behind = behind_libraries(compared, chain)
-        cases = len({(row["scene"], row["exposure_rows"], row["noise"]) for row in compared})
         counts = ", ".join(f"{FIGURES[name]} {sum(row['figure'] == name for row in behind)}" for name in FIGURES)
         text.append(
             f"- {chain} is less accurate than a chain of libraries in these numbers of {cases} cases: {counts}."

@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
-from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-from harness import Rows, table
+from harness import Rows, table, write_h264
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
@@ -127,18 +126,6 @@ def taken(clip: Clip, scene: NDArray[np.float32], hand: tuple[Array, Array], cou
     return frames
 
 
-def write_clip(path: Path, frames: Frames) -> None:
-    """Write grey frames as H.264 of 2.5 Mb/s."""
-    with av.open(str(path), "w") as output:
-        stream: Any = output.add_stream("libx264", rate=RATE)
-        stream.height, stream.width, stream.pix_fmt, stream.bit_rate = HEIGHT, WIDTH, "yuv420p", 2_500_000
-        for number, frame in enumerate(frames):
-            picture = av.VideoFrame.from_ndarray(frame, format="gray").reformat(format="yuv420p")
-            picture.pts, picture.time_base = number, Fraction(1, RATE)
-            output.mux(stream.encode(picture))
-        output.mux(stream.encode())
-
-
 def figures(path: Path) -> dict[str, Any]:
     """PSNR of neighbouring frames (dB), rms change of their shift along x and y, and motion of rows in bands (px)."""
     with av.open(str(path)) as video:
@@ -194,7 +181,10 @@ def rows(options: argparse.Namespace) -> Rows:
     with tempfile.TemporaryDirectory() as folder:
         for number, clip in enumerate(CLIPS):
             source = Path(folder) / f"{number}.mp4"
-            write_clip(source, taken(clip, scene, hand, options.steady_frames))
+            frames = taken(clip, scene, hand, options.steady_frames)
+            grey = (av.VideoFrame.from_ndarray(frame, format="gray") for frame in frames)
+            planes = (frame.reformat(format="yuv420p").to_ndarray() for frame in grey)
+            write_h264(source, planes, RATE, bit_rate=2_500_000)
             target = source.with_name(f"{number}_steady.mp4")
             process_video(source, target, timing, steady=1.0, border="crop", restoration={"method": "dewarp"})
             vidstab = with_vidstab(source, source.with_name(f"{number}_vidstab.mp4"))

@@ -1,44 +1,60 @@
-"""Long stacks: memory and time per frame over the number of frames, overlap of computation with input and output.
+"""Long stacks: time and memory over the number of frames, memory limits of all methods, and workers of Dask.
 
 A few simulated frames are repeated to form long stacks. Every run is a separate process, in which peak memory is
-measured.
+measured. Workers of Dask are processes with one thread each; they start, import and warm up before anything is timed.
 """
 
 import argparse
 import json
-import math
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from harness import Rows, plain_environment, table
 
 import rsvib_torch as rsv
 from rsvib_torch.evaluation import city_and_fields
 from rsvib_torch.stacks import process_stack
-from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.stacks.windows import cut_windows
+from rsvib_torch.stacks.memory import memory_needed
 
 OPTIONS = {
-    "frames": ((100, 1000), "streaming: lengths of the stacks"),
-    "frame_size": (1024, "streaming: rows and columns"),
-    "memory": ("2GB", "streaming: memory of the process"),
+    "frames": ((100, 1000), "streaming: lengths of the long stacks"),
+    "frame_size": (1024, "streaming: rows and columns of the long stacks"),
+    "memory": ("2GB", "streaming: memory of the process for the long stacks"),
+    "smaller_size": (512, "streaming: rows and columns of other stacks"),
+    "smaller_frames": (57, "streaming: length of the stack for Dask; half of it for limits of the memory"),
+    "windows": ((1, 2), "streaming: windows at once"),
+    "methods": (8, "streaming: at most so many options of restoration"),
+    "dask_workers": ((1, 2), "streaming: workers of Dask"),
 }
-QUICK = {"frames": (22,), "frame_size": 128}
+QUICK = {"frames": (22,), "frame_size": 128, "smaller_size": 96, "smaller_frames": 44}
+QUICK |= {"windows": (1,), "methods": 1, "dask_workers": (1,)}
 _DRAWN, WINDOW = 14, 8  # frames; period of the vibration, and of the stack
 DETECTION = {"method": "bands", "tones": 1, "band_step": 32, "search": 8}
-RESTORATION = {"method": "dewarp"}
+RESTORATIONS: list[dict[str, Any]] = [
+    {"method": "dewarp"},
+    {"method": "banded"},
+    {"method": "exact"},
+    {"method": "exact", "joint": 3},
+    {"method": "exact", "joint": True},
+    {"method": "exact", "prior": "edges"},
+    {"method": "richardson-lucy"},
+    {"method": "richardson-lucy", "joint": 3},
+]
 _RUN = """
 import json, sys
 import torch
-torch.set_num_threads(1)
 from benchmarks import streaming
-print(json.dumps(streaming.one_run(**json.loads(sys.argv[1]))))
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(json.dumps(streaming.one_run(**json.loads(sys.argv[1]))))
 """
 
 
@@ -70,110 +86,101 @@ def peak_memory() -> float:
     raise OSError("the kernel does not report peak memory")
 
 
-def process(source: Path | str, sink: Path | str, size: int, **options: Any) -> Any:
-    """Process a stack; returns its report."""
-    common: dict[str, Any] = {"window": WINDOW, "detection": DETECTION, "restoration": RESTORATION, "full_scale": 4095}
-    return process_stack(source, sink, timing_of(size), **common | options)
+def one_run(source: str, sink: str, size: int, dask_workers: int = 0, **options: Any) -> dict[str, Any]:
+    """Process a stack in this process, or by workers of Dask."""
+    common = {"window": WINDOW, "detection": DETECTION, "restoration": RESTORATIONS[0], "full_scale": 4095} | options
+    with ExitStack() as opened:
+        client: Any = None
+        if dask_workers:
+            import distributed  # noqa: PLC0415 - an extra
 
+            cluster = opened.enter_context(
+                distributed.LocalCluster(dask_workers, threads_per_worker=1, dashboard_address=None, memory_limit=0)
+            )
+            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
+            common["scheduler"] = cluster.scheduler_address
+            process_stack(source, sink, timing_of(size), **common)  # imports and warm-up of every worker
 
-def one_run(source: str, sink: str, size: int, **options: Any) -> dict[str, Any]:
-    """Process a stack in this process."""
-    import resource  # noqa: PLC0415 - not available on all systems
+        def counted() -> tuple[float, float, float, int]:
+            of_workers = sum(client.run(time.process_time).values()) if client else 0.0
+            sent = psutil.net_io_counters(pernic=True)["lo"].bytes_sent
+            return time.perf_counter(), time.process_time(), of_workers, sent
 
-    begin = time.perf_counter()
-    report = process(source, sink, size, **options)
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    seconds = time.perf_counter() - begin
-    return {
+        before = counted()
+        report = process_stack(source, sink, timing_of(size), **common)
+        seconds, cpu, of_workers, moved = (b - a for a, b in zip(before, counted(), strict=True))
+    figures = {
         "frames": report.frames,
         "restored_windows": report.restored,
         "windows": report.windows,
-        "seconds": seconds,
         "seconds_a_frame": seconds / report.frames,
-        "cpu_seconds_a_frame": (used.ru_utime + used.ru_stime) / report.frames,
+        "cpu_seconds_a_frame": cpu / report.frames,
         "peak_memory_gb": peak_memory() / 1e9,
     }
+    if dask_workers:
+        figures |= {"worker_seconds_a_frame": of_workers / report.frames, "moved_mb": moved / 1e6 / report.frames}
+    return figures
 
 
 def run_apart(**arguments: Any) -> dict[str, Any]:
     """``one_run`` in a separate process."""
-    done = subprocess.run(
-        [sys.executable, "-c", _RUN, json.dumps(arguments)],
-        cwd=Path(__file__).parents[1],
-        env=plain_environment(),
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+    with tempfile.NamedTemporaryFile("w", suffix=".py") as program:
+        program.write(_RUN)
+        program.flush()
+        folder = str(Path(__file__).parents[1])
+        environment = plain_environment()
+        environment["PYTHONPATH"] = f"{folder}:{environment.get('PYTHONPATH', '')}"
+        command = [sys.executable, program.name, json.dumps(arguments)]
+        done = subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True, text=True)
     result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return result
 
 
-def _computing_alone(source: Path, size: int, windows: int) -> float:
-    """Seconds per frame of computation only: frames are in memory, and nothing is written; one thread."""
-    reader = rsv.open_stack(source)
-    job = StackJob(source, reader.info, timing_of(size), 4095.0, DETECTION, RESTORATION)
-    cut = cut_windows(reader.info.shape[0], WINDOW)[:windows]
-    pixels = [[reader.frame(index) for index in window.frames] for window in cut]
-    reader.close()
-    job.compute(cut[0], list(pixels[0]))
-    begin = time.perf_counter()
-    for window, frames in zip(cut, pixels, strict=True):
-        job.compute(window, list(frames))
-    return (time.perf_counter() - begin) / sum(window.kept for window in cut)
-
-
 def rows(options: argparse.Namespace) -> Rows:
-    """Runs of each length; then one worker with and without input and output, alternating."""
-    import torch  # noqa: PLC0415
-
+    """Runs of each length; runs whose limit is the estimated memory of some windows; a local run, and Dask."""
     results: Rows = []
-    size = options.frame_size
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        sink = folder / "out.tif"
+    with tempfile.TemporaryDirectory() as folder:
+        source, sink = Path(folder) / "frames.npy", Path(folder) / "out.tif"
+        size = options.frame_size
         for count in options.frames:
-            source = folder / "frames.npy"
             write_long(source, count, size)
-            common = {"source": str(source), "sink": str(sink), "size": size}
-            run = run_apart(**common, memory=options.memory)
-            results.append({"name": f"{count} frames, memory {options.memory}", **run})
-        few = 3 * (WINDOW - 1) + 1
-        write_long(folder / "few.npy", few, size)
-        common |= {"source": str(folder / "few.npy")}
-        torch.set_num_threads(1)
-        works: dict[str, Callable[[], Any]] = {
-            "computation only, one thread": lambda: _computing_alone(folder / "few.npy", size, 3),
-            "with input and output, one worker": lambda: one_run(**common, workers=1),
-        }
-        best = dict.fromkeys(works, math.inf)
-        for turn in range(1 + options.runs):
-            for what, work in works.items():
-                result = work()
-                seconds = result if isinstance(result, float) else result["seconds_a_frame"]
-                best[what] = min(best[what], seconds if turn else math.inf)  # the first run is a warm-up
-        results += [{"name": name, "seconds_a_frame": seconds} for name, seconds in best.items()]
-        results[-1]["rate"] = results[-2]["seconds_a_frame"] / results[-1]["seconds_a_frame"]
+            run = run_apart(source=str(source), sink=str(sink), size=size, memory=options.memory)
+            results.append({"name": f"{count} frames of {size} px, memory {options.memory}", **run})
+        size, paths = options.smaller_size, {"source": str(source), "sink": str(sink)}
+        write_long(source, options.smaller_frames // 2, size)
+        info = rsv.read_stack_info(source)
+        for restoration in RESTORATIONS[: options.methods]:
+            for count in options.windows:
+                asked = memory_needed(info, WINDOW, restoration, count)
+                run = run_apart(**paths, size=size, memory=asked, workers=count, restoration=restoration)
+                text = ", ".join(f"{key}={value!r}" for key, value in restoration.items())
+                results.append({"name": f"{text}; {count} windows at once", "asked_gb": asked / 1e9, **run})
+        write_long(source, options.smaller_frames, size)
+        results.append({"name": "one worker, without Dask", **run_apart(**paths, size=size, workers=1)})
+        expected = sink.read_bytes()
+        for workers in options.dask_workers if find_spec("distributed") else ():
+            run = run_apart(**paths, size=size, dask_workers=workers)
+            results.append({"name": f"{workers} workers of Dask", "same": sink.read_bytes() == expected, **run})
     return results
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The figures as Markdown tables."""
-    names = ("seconds_a_frame", "cpu_seconds_a_frame", "peak_memory_gb")
-    text = [
-        f"Stacks of {options.frame_size} x {options.frame_size} 16-bit frames, windows of {WINDOW}, bands and dewarp.",
-        "",
-        *table(
-            ("run", "s per frame", "CPU s per frame", "peak memory (GB)"),
-            [(row["name"], *(f"{row[name]:.3f}" if name in row else "" for name in names)) for row in results],
-        ),
+    """The figures as a Markdown table."""
+    columns = {
+        "s per frame": "seconds_a_frame",
+        "CPU s per frame of this process": "cpu_seconds_a_frame",
+        "of workers": "worker_seconds_a_frame",
+        "MB over the local network": "moved_mb",
+        "limit (GB)": "asked_gb",
+        "peak (GB)": "peak_memory_gb",
+    }
+    cells = [
+        (row["name"], *(f"{row[key]:.3f}" if key in row else "" for key in columns.values()), row.get("same", ""))
+        for row in results
     ]
-    runs = [row for row in results if "memory" in row["name"]]
-    if len(runs) > 1:
-        time_, cpu, peak = (runs[-1][name] / runs[0][name] for name in names)
-        text += [
-            f"Longest over shortest: memory {peak:.3f}, time per frame {time_:.3f}, CPU time {cpu:.3f}.",
-            "",
-        ]
-    rate = next(row["rate"] for row in results if "rate" in row)
-    return [*text, f"With reading and writing: {100 * rate:.0f} % of the rate of computation only."]
+    return [
+        f"Frames of 16 bits, windows of {WINDOW}, detection by bands, restoration by dewarp if not stated; frames of "
+        f"later runs have {options.smaller_size} x {options.smaller_size} px.",
+        "",
+        *table(("run", *columns, "same bytes as without Dask"), cells),
+    ]

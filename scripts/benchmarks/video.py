@@ -1,19 +1,12 @@
-"""A colour video from file to file: frames per second, processor time by part of the work, and PSNR after encoding.
+"""A colour video from file to file: frames per second, processor time, and PSNR after encoding.
 
 The frames come from benchmarks/independent_camera.py, as planes Y, U and V of a 4:2:0 video: chroma has the motion of
 half the amplitude in rows that last twice as long. One second of frames is repeated.
 """
 
 import argparse
-import functools
-import importlib
 import tempfile
-import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +14,7 @@ import av
 import numpy as np
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
 from benchmarks.live import AMPLITUDE, FREQUENCY, PHASE, RATE, timing_of
-from harness import Rows, table
+from harness import Rows, table, write_h264
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
@@ -41,30 +34,6 @@ GOALS = {"exact": 0.6, "dewarp": 0.16}  # s of a processor per frame: 3 and 12 f
 # s of a processor per frame of 1920 x 1080 px in colour, before videos were followed: `rsvib run --video`, 24 frames of
 # a photograph, 2026-11-25
 BEFORE = {"exact": 3.68, "dewarp": 0.98}
-# Parts of the work: functions whose processor time is measured, without that of the others within them.
-PARTS: dict[str, list[tuple[str, str]]] = {
-    "motion": [
-        ("rsvib_torch.tracking.camera_path", "CornerFollower.next"),
-        ("rsvib_torch.tracking.camera_path", "fit_window"),
-    ],
-    "restoration": [
-        ("rsvib_torch.stacks.video_frames", "restore_prepared"),
-        ("rsvib_torch.stacks.video_frames", "prepare_frames"),
-        ("rsvib_torch.stacks.video_frames", "source_map"),
-        ("rsvib_torch.stacks.video_frames", "moved_back"),
-    ],
-    "conversion of counts": [
-        ("rsvib_torch.stacks.video_frames", "counts_to_frames"),
-        ("rsvib_torch.stacks.video_frames", "frames_to_counts"),
-        ("rsvib_torch.stacks.video_frames", "FrameLayout.frame"),
-    ],
-    "verdict": [("rsvib_torch.stacks.process_video", "VideoPasses.verdict")],
-    "joining parts, checksums": [
-        ("rsvib_torch.stacks.process_video", "_Encoder.close"),
-        ("rsvib_torch.stacks.process_video", "_Encoder.finish_part"),
-    ],
-}
-CODECS = "decoding, encoding and the rest"
 
 
 def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Array]]:
@@ -87,22 +56,6 @@ def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Arra
     return counts, still
 
 
-def write_clip(path: Path, planes: list[NDArray[np.uint8]], count: int) -> None:
-    """Write a video of ``count`` frames, H.264."""
-    luma, *chroma = planes
-    height, width = luma.shape[1:]
-    with av.open(str(path), "w") as output:
-        stream: Any = output.add_stream("libx264", rate=RATE, options={"crf": CRF, "preset": "veryfast"})
-        stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
-        stream.codec_context.colorspace, stream.codec_context.color_range = 1, 1  # BT.709, limited
-        for index in range(count):
-            rows = [luma[index % len(luma)], *(plane[index % len(luma)].reshape(-1, width) for plane in chroma)]
-            frame = av.VideoFrame.from_ndarray(np.concatenate(rows), format="yuv420p")
-            frame.pts, frame.time_base = index, Fraction(1, RATE)
-            output.mux(stream.encode(frame))
-        output.mux(stream.encode())
-
-
 def psnr_of(path: Path, still: list[Array], rim: int = 24) -> list[float]:
     """PSNR of Y and of U with V in dB, over all frames of a video."""
     errors: list[list[float]] = [[], []]
@@ -116,65 +69,33 @@ def psnr_of(path: Path, still: list[Array], rim: int = 24) -> list[float]:
     return [float(-10 * np.log10(np.mean(values))) for values in errors]
 
 
-@contextmanager
-def processor_times(parts: dict[str, list[tuple[str, str]]]) -> Iterator[Counter[str]]:
-    """Seconds of a processor in the functions of each part, in all threads of this program."""
-    spent: Counter[str] = Counter()
-    local, replaced = threading.local(), []
-
-    def measured(function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def call(*arguments: Any, **options: Any) -> Any:
-            within: list[float] = local.__dict__.setdefault("within", [])
-            within.append(0.0)
-            begin = time.thread_time()
-            try:
-                return function(*arguments, **options)
-            finally:
-                seconds = time.thread_time() - begin
-                spent[part] += seconds - within.pop()
-                if within:
-                    within[-1] += seconds
-
-        return call
-
-    for part, functions in parts.items():
-        for module, name in functions:
-            *owners, last = name.split(".")
-            owner = functools.reduce(getattr, owners, importlib.import_module(module))
-            replaced.append((owner, last, getattr(owner, last)))
-            setattr(owner, last, measured(getattr(owner, last), part))
-    try:
-        yield spent
-    finally:
-        for owner, name, function in reversed(replaced):
-            setattr(owner, name, function)
-
-
 def rows(options: argparse.Namespace) -> Rows:
     """Figures of each method, and of the video as taken."""
     count = options.video_frames
     planes, still = planes_of(options.video_rows, count)
     with tempfile.TemporaryDirectory() as folder:
         clip = Path(folder) / "clip.mp4"
-        write_clip(clip, planes, count)
+        luma, *chroma = planes
+        width = luma.shape[-1]
+        pictures = [
+            np.concatenate([luma[i], *(plane[i].reshape(-1, width) for plane in chroma)]) for i in range(len(luma))
+        ]
+        repeated = (pictures[index % len(pictures)] for index in range(count))
+        write_h264(clip, repeated, RATE, crf=CRF, preset="veryfast")
         results: list[dict[str, Any]] = [
             {"name": "as taken", "psnr": psnr_of(clip, still), "size": clip.stat().st_size}
         ]
         for method in METHODS:
             target = Path(folder) / f"{method}.mp4"
             begin, cpu = time.perf_counter(), time.process_time()
-            with processor_times(PARTS) as spent:
-                process_video(
-                    clip, target, timing_of(options.video_rows, EXPOSURE_ROWS), restoration={"method": method}
-                )
+            timing = timing_of(options.video_rows, EXPOSURE_ROWS)
+            process_video(clip, target, timing, restoration={"method": method})
             used, seconds = time.process_time() - cpu, time.perf_counter() - begin
             results.append(
                 {
                     "name": method,
                     "rate": count / seconds,
                     "cpu": used / count,
-                    "parts": {**{part: spent[part] / used for part in PARTS}, CODECS: 1 - sum(spent.values()) / used},
                     "psnr": psnr_of(target, still),
                     "size": target.stat().st_size,
                 }
@@ -203,6 +124,4 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
         rate = row["size"] / 1e6 / count * RATE
         lines_of_methods.append((row["name"], *timed, *(f"{value:.1f}" for value in row["psnr"]), f"{rate:.1f}"))
     heads = ("method", "processor s per frame", "goal", "before", "frames/s", "PSNR of Y (dB)", "PSNR of U, V (dB)")
-    shares = [(name, *(f"{row['parts'][name]:.0%}" for row in methods)) for name in methods[0]["parts"]]
-    text += [*table((*heads, "MB per s"), lines_of_methods), "Shares of the processor time:", ""]
-    return text + table(("part", *(row["name"] for row in methods)), shares)
+    return text + table((*heads, "MB per s"), lines_of_methods)

@@ -42,7 +42,7 @@ def record_frames(
     height = HEIGHT if np.ndim(scene) == 0 else len(scene)
     rows = np.arange(height)[::-1] if reverse else np.arange(height)
     shots = exposure if np.ndim(exposure) else [exposure] * frames
-    steps = (np.arange(400) + 0.5) / 400
+    steps = (np.arange(100) + 0.5) / 100
     begin = start + np.arange(len(shots))[:, None] / frame_rate + rows * row_time
     lit = np.stack([light(b[:, None] + e * steps).mean(-1) * e / shots[0] for b, e in zip(begin, shots, strict=True)])
     picture = scene * np.ones((height, WIDTH)) if np.ndim(scene) == 0 else scene
@@ -70,7 +70,7 @@ def test_row_time_of_one_frame_agrees_within_its_standard_deviation(light):
 
 def test_standard_deviations_agree_with_scatter():
     ratios = []
-    for seed in range(12):
+    for seed in range(0, 12, 2):
         row_time = 1e-6 * (9 + 0.9 * seed)
         frames = record_frames(sine, row_time=row_time, noise=0.06, seed=seed)
         found = calibrate_row_time(frames, 1000.0)
@@ -114,8 +114,7 @@ def test_flicker_in_a_photograph():
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
 
 
-@pytest.mark.parametrize("reverse", [False, True])
-@pytest.mark.parametrize("light", [sine, blink])
+@pytest.mark.parametrize(("light", "reverse"), [(sine, False), (blink, True)])
 def test_readout_direction(light, reverse):
     frames = record_frames(light, frames=3, scene=shaded(), reverse=reverse)
     found = calibrate_row_time(frames, 1000.0, frame_rate=29.97)
@@ -179,8 +178,7 @@ def test_row_time_from_two_exposures_of_an_unknown_strobe():
         calibrate_row_time_by_exposure(frames, [1e-3])
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(("seed", "count"), [(0, 1), (1, 2)])
 def test_frames_without_flicker_are_refused(seed, count):
     frames = record_frames(np.ones_like, frames=count, scene=0.8 * draw_scene(HEIGHT, WIDTH, seed), noise=0.01)
     with pytest.raises(ValueError, match="no flicker found"):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from program import refused, rsvib
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.evaluation import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
@@ -30,7 +30,7 @@ def place(tmp_path_factory):
 
 
 def run(*arguments):
-    return run_command(["export", *map(str, arguments)])
+    return rsvib("export", *arguments)
 
 
 def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
@@ -44,8 +44,9 @@ def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
     tone = detected.vibration
     rate = float(tone.amplitude[1, 0] * 2 * np.pi * tone.frequency[1, 0] * torch.cos(tone.phase[1, 0])) / 900
     assert float(first.split(",")[1]) * 1e-9 == pytest.approx(rate, rel=1e-3)
-    assert run(folder / "vibration.json", tmp_path / "other.gcsv", *frames) == 2
-    assert "require the focal length in px" in capsys.readouterr().err
+    assert "require the focal length in px" in refused(
+        capsys, "export", folder / "vibration.json", tmp_path / "other.gcsv", *frames
+    )
 
 
 def test_stmap_by_size(place, tmp_path, capsys):
@@ -57,8 +58,7 @@ def test_stmap_by_size(place, tmp_path, capsys):
     found = tifffile.imread(out / "stmap_0001.tif")
     expected = rsv.sampling_map(detected.vibration, TIMING, size, 2)[1]
     np.testing.assert_allclose(found[..., :2], expected.numpy(), atol=1e-4)
-    assert run(folder / "vibration.json", out, *options) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    assert "--overwrite" in refused(capsys, "export", folder / "vibration.json", out, *options)
 
 
 def test_isd_of_the_second_frame(place, tmp_path, capsys):
@@ -68,8 +68,9 @@ def test_isd_of_the_second_frame(place, tmp_path, capsys):
     assert run(folder / "vibration.json", out, *options) == 0
     assert "line scanner with one quaternion per row" in capsys.readouterr().out
     assert len(json.loads(out.read_text())["instrument_pointing"]["quaternions"]) == size[0] + 8
-    assert run(folder / "vibration.json", out, *options, "--overwrite", "--model", "frame") == 2
-    assert "no sensor model represents this motion within 0.005 px (frame: " in capsys.readouterr().err
+    assert "no sensor model represents this motion within 0.005 px (frame: " in refused(
+        capsys, "export", folder / "vibration.json", out, *options, "--overwrite", "--model", "frame"
+    )
     assert json.loads(out.read_text())["name_model"] == "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"  # not replaced
 
 
@@ -99,8 +100,7 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     assert run(path, tmp_path / "forced", *options, "--force") == 0
     assert np.abs(tifffile.imread(tmp_path / "forced" / "stmap_0000.tif")[..., 1] - rows).max() > 1
     path.write_text(json.dumps(data | {"reliable": [False, False], "findings": [[blind], [blind]]}))
-    assert run(path, tmp_path / "none", *options) == 2
-    assert "nothing to export" in capsys.readouterr().err
+    assert "nothing to export" in refused(capsys, "export", path, tmp_path / "none", *options)
     assert not (tmp_path / "none").exists()
 
 
@@ -122,8 +122,6 @@ def test_errors_are_one_line(place, monkeypatch, capsys, arguments, message):
     folder, _, _ = place
     monkeypatch.chdir(folder)
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    assert run(*arguments) == 2
-    error = capsys.readouterr().err
+    error = refused(capsys, "export", *arguments)
     assert message in error
-    assert "Traceback" not in error
     assert {path: path.read_bytes() for path in folder.iterdir()} == before

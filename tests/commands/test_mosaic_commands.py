@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import small_config
-from program import rsvib
+from program import refused, rsvib
 from small_stack import HEIGHT, STILL, WIDTH, write_small
 
 from rsvib_torch import read_stack, read_stack_info
@@ -94,5 +94,4 @@ def test_errors(place, tmp_path, capsys, more, message):
 def test_errors_in_a_configuration(place, tmp_path, capsys, line, message):
     (tmp_path / "wrong.toml").write_text(f"{CAMERA}\n[restoration]\n{line}\n")
     vibration = ("--config", tmp_path / "wrong.toml", "--vibration", place / "found" / "vibration.json")
-    assert rsvib("restore", place / "raw.tif", tmp_path / "out.tif", *vibration) == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, "restore", place / "raw.tif", tmp_path / "out.tif", *vibration)

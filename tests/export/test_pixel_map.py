@@ -119,7 +119,7 @@ def test_errors(tmp_path):
         rsv.sampling_map(motion.expanded(2), timing, (80, 60), 1)
     with pytest.raises(ValueError, match="frame_rows=100 is less than"):
         rsv.sampling_map(motion, timing, (120, 60), 1)
-    with pytest.raises(ValueError, match="width in size must be at least 1"):
+    with pytest.raises(ValueError, match=r"size\[1\] must be at least 1"):
         rsv.sampling_map(motion, timing, (80, 0), 1)
     with pytest.raises(ValueError, match="num_frames must be at least 1"):
         rsv.write_stmap(tmp_path / "maps", motion, timing, (80, 60), 0)

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import cv2
 import h5py
@@ -16,7 +15,6 @@ from rsvib_torch.io import (
     FrameError,
     StackFormat,
     StackInfo,
-    check_stack_target,
     formats,
     open_stack,
     read_stack,
@@ -67,14 +65,6 @@ def test_compressed_tiff_of_other_programs_is_read(tmp_path, compression, big):
     np.testing.assert_allclose(read_stack(path, full_scale=4095).numpy(), COUNTS / 4095, rtol=1e-6)
 
 
-def test_bigtiff_and_resolution(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", COUNTS, bigtiff=True, photometric="minisblack", resolution=(300, 150, "INCH"))
-    info = read_stack_info(tmp_path / "a.tif")
-    assert info.resolution == (300.0, 150.0, "inch")
-    tifffile.imwrite(tmp_path / "b.tif", COUNTS, photometric="minisblack", byteorder=">", metadata=None)
-    np.testing.assert_allclose(read_stack(tmp_path / "b.tif", full_scale=4095).numpy(), COUNTS / 4095, rtol=1e-6)
-
-
 def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", COUNTS, photometric="minisblack", compression="zlib")
     np.save(tmp_path / "a.npy", COUNTS)
@@ -98,28 +88,8 @@ def test_frames_are_read_one_at_a_time_in_any_order(tmp_path):
         reader.close()
 
 
-def _file_pages():
-    """Memory of this process that is mapped from files, in bytes."""
-    line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("RssFile:"))
-    return 1024 * int(line.split()[1])
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_reading_frames_of_npy_does_not_accumulate_memory(tmp_path, order):
-    frames = np.random.default_rng(2).integers(0, 256, (32, 512, 512)).astype(np.uint8)
-    np.save(tmp_path / "a.npy", np.asarray(frames, order=order))
-    reader = open_stack(tmp_path / "a.npy")
-    before = _file_pages()
-    for index in range(32):
-        np.testing.assert_array_equal(reader.frame(index), frames[index])
-    assert _file_pages() - before < 1_000_000
-    reader.close()
-
-
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_npy_file_that_shrinks_while_open_is_an_error(tmp_path, order):
-    big_endian = np.asarray(COUNTS.repeat(800, axis=1).astype(">u2"), order=order)
+def test_npy_file_that_shrinks_while_open_is_an_error(tmp_path):
+    big_endian = COUNTS.repeat(800, axis=1).astype(">u2")
     np.save(tmp_path / "a.npy", big_endian)
     reader = open_stack(tmp_path / "a.npy")
     frame = reader.frame(2)
@@ -180,42 +150,25 @@ def test_format_can_be_added_and_removed(tmp_path, monkeypatch):
         open_stack(tmp_path / "a.toy")
 
 
-def test_format_checks_the_full_scale_before_frames_are_computed(tmp_path):
-    def refuse(path, info):
-        if info.full_scale != 255:
-            raise ValueError(f"{path}: full scale {info.full_scale}")
-
-    register_format(StackFormat("toy", (".toy",), ToyReader, write=lambda *_: None, check=refuse))
-    try:
-        assert check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint8") == 255
-        with pytest.raises(ValueError, match=r"a\.toy: full scale 4095"):
-            check_stack_target(tmp_path / "a.toy", (2, 5, 4), dtype="uint16", full_scale=4095)
-    finally:
-        del formats.FORMATS[".toy"]
-
-
 @pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
 def test_format_without_a_valid_ending_is_refused(ending, message):
     with pytest.raises(ValueError, match=message):
         register_format(StackFormat("toy", () if ending is None else (ending,), ToyReader))
 
 
-def test_npy_of_a_stack_with_channels_last_has_channels_second(tmp_path):
-    frames = torch.rand(2, 3, 9, 7, generator=torch.Generator().manual_seed(1))
-    write_stack(tmp_path / "a.npy", frames, like=StackInfo((2, 3, 9, 7), "uint8", 255.0, channels_last=True))
-    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), frames)
-
-
-@pytest.mark.parametrize(("ending", "package"), [(".h5", "h5py"), (".zarr", "zarr")])
-def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package):
+@pytest.mark.parametrize(
+    ("ending", "package", "extra"), [(".h5", "h5py", "formats"), (".zarr", "zarr", "formats"), (".mp4", "av", "video")]
+)
+def test_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package, extra):
     monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / "a.h5").write_bytes(b"")
+    (tmp_path / "a.mp4").write_bytes(b"")
     (tmp_path / "a.zarr").mkdir()
-    message = rf"needs the package {package}: pip install rsvib_torch\[formats\]"
+    message = rf"needs the package {package}: pip install rsvib_torch\[{extra}\]"
     with pytest.raises(ModuleNotFoundError, match=message):
         read_stack(tmp_path / f"a{ending}")
     with pytest.raises(ModuleNotFoundError, match=message):
-        write_stack(tmp_path / f"b{ending}", torch.rand(2, 4, 4))
+        write_stack(tmp_path / f"b{ending}", torch.rand(2, 4, 4), dtype="uint8")
 
 
 def test_hdf5_links_to_other_files_are_refused(tmp_path):
@@ -253,5 +206,5 @@ def test_zarr_codecs_that_could_execute_code_are_refused(tmp_path):
     header = json.loads((tmp_path / "a.zarr" / "zarr.json").read_text())
     header["codecs"] = [{"name": "numcodecs.pickle", "configuration": {}}]
     (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
-    with pytest.raises(ValueError, match=r"codec 'numcodecs\.pickle' is not part of the Zarr v3 specification"):
+    with pytest.raises(ValueError, match=r"Unknown codec: 'numcodecs\.pickle'"):
         read_stack(tmp_path / "a.zarr")

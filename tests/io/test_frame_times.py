@@ -167,25 +167,6 @@ def test_exact_times_may_be_those_of_every_nth_frame():
     assert used.frame_start_times[1] == pytest.approx(0.75 * TIMING.frame_period)
 
 
-@pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
-def test_video_with_another_playback_rate_has_evenly_spaced_frames(tmp_path, capsys):
-    kind = cv2.VideoWriter.fourcc(*"MJPG")
-    # FFmpeg would write messages to the terminal
-    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.CAP_OPENCV_MJPEG, kind, 24, (WIDTH, HEIGHT))
-    for frame in draw_counts(6):
-        writer.write(np.repeat((frame // 16).astype(np.uint8)[..., None], 3, axis=-1))
-    writer.release()
-    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
-    arguments = ("run", tmp_path / "clip.avi", tmp_path / "out", "--config", tmp_path / "camera.toml")
-    assert rsvib(*arguments, "--output", "restored.h5") == 0
-    warning = capsys.readouterr().err
-    assert warning.count("24 frames per second according to its time stamps, but 96.154 according to the sensor") == 1
-    found = json.loads((tmp_path / "out" / "vibration.json").read_text())
-    assert found["timing"]["frame_start_times"] is None
-    assert found["vibration"]["frequency"][0][0] == pytest.approx(MOTION.frequency[0], rel=0.02)
-    assert read_stack_info(tmp_path / "out" / "restored.h5").frame_times is None
-
-
 def test_writing_keeps_times_resolution_and_channel_order(tmp_path):
     like = StackInfo((2, 3, 9, 7), "uint16", 4095.0, (0.5, 0.75), (300.0, 300.0, "inch"), channels_last=True)
     write_stack(tmp_path / "a.zarr", torch.rand(2, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)

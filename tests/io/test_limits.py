@@ -2,13 +2,11 @@
 
 import os
 import resource
-import struct
 
 import h5py
 import numpy as np
 import psutil
 import pytest
-import tifffile
 import torch
 import zarr
 from time_limit import at_most
@@ -16,7 +14,7 @@ from time_limit import at_most
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.config import read_config
-from rsvib_torch.io import open_stack, read_stack, read_stack_info
+from rsvib_torch.io import read_stack, read_stack_info
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
 COUNTS = np.random.default_rng(2).integers(0, 4096, (4, 16, 16)).astype(np.uint16)
@@ -45,26 +43,6 @@ def test_hdf5_times_of_other_files_are_not_read(tmp_path):
     assert read_stack_info(tmp_path / "a.h5").frame_times is None
 
 
-def pages(path, count):
-    with tifffile.TiffWriter(path) as tif:
-        for index in range(count):
-            tif.write(COUNTS[index % 4], photometric="minisblack", metadata=None, contiguous=False)
-
-
-def test_headers_of_equal_tiff_pages_are_interpreted_once(tmp_path, monkeypatch):
-    pages(tmp_path / "a.tif", 500)
-    interpreted, initialise = [], tifffile.TiffPage.__init__
-    monkeypatch.setattr(
-        tifffile.TiffPage, "__init__", lambda *args, **kw: interpreted.append(1) or initialise(*args, **kw)
-    )
-    reader = open_stack(tmp_path / "a.tif")
-    assert reader.info.shape == (500, 16, 16)
-    assert len(interpreted) < 10
-    for index in (0, 1, 499):
-        np.testing.assert_array_equal(reader.frame(index), COUNTS[index % 4])
-    reader.close()
-
-
 @pytest.mark.parametrize("name", ["a.tif", "a.npy", "a.png", "a.h5", "a.raw", "a.mp4", "a.jpg"])
 def test_pipes_and_devices_are_not_read(tmp_path, name):
     os.mkfifo(tmp_path / name)
@@ -83,9 +61,6 @@ def test_zarr_frame_of_too_many_chunks(tmp_path):
 
 
 def test_npy_headers(tmp_path):
-    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**32 - 1) + b"{")
-    with pytest.raises(ValueError, match="its header has 4294967295 bytes"):
-        read_stack_info(tmp_path / "a.npy")
     header = {"descr": "|u1", "fortran_order": False, "shape": (10**8, 1, 1)}
     with (tmp_path / "b.npy").open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
@@ -170,10 +145,10 @@ _PNG = b"\x89PNG\r\n\x1a\n"
     ("name", "start"), [("a.jpg", b"\xff\xd8\xff\xe0"), ("a.png", _PNG), ("b.png", _PNG + b"\x40\0\0\0tEXt")]
 )
 def test_sparse_images(tmp_path, name, start):
-    """Pillow searched 6 GB for a header at 20 MB/s, and a PNG file was read as a whole."""
+    """Pillow searches a file of any size for its header, at 20 MB/s."""
     (tmp_path / name).write_bytes(start)
     os.truncate(tmp_path / name, 6 << 30)
-    with pytest.raises(ValueError, match=f"{name}: (not a JPEG file|damaged PNG file)"):
+    with pytest.raises(ValueError, match=f"{name}: not a readable (JPEG|PNG) stack"):
         read_stack_info(tmp_path / name)
 
 

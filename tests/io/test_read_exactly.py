@@ -53,5 +53,5 @@ def test_grey_png_with_a_transparent_value(tmp_path, dtype, full_scale):
 def test_animated_png_is_refused(tmp_path):
     frames = [Image.fromarray((counts // 16).astype(np.uint8)) for counts in COUNTS[:3]]
     frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])
-    with pytest.raises(ValueError, match=r"a.png: an animated PNG, of which only the first frame"):
+    with pytest.raises(ValueError, match=r"a.png: .*an animated PNG, of which only the first frame"):
         rsv.read_stack(tmp_path / "a.png")

@@ -1,9 +1,7 @@
 """Stacks in files: round trips with full scale, and files of other programs."""
 
-import json
 import struct
 import zlib
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -92,56 +90,11 @@ def test_full_scale_argument_has_priority(tmp_path):
     assert read_stack(tmp_path / "frames.tif", full_scale=2000).unique().tolist() == [0.25]
 
 
-def test_tiff_files_of_other_programs(tmp_path):
-    stored = draw_counts((3, 9, 7), 4095)
-    with tifffile.TiffWriter(tmp_path / "pages.tif", byteorder=">") as tif:
-        for frame in stored:
-            tif.write(frame, metadata=None)
-    tifffile.imwrite(tmp_path / "imagej.tif", stored, imagej=True, metadata={"axes": "ZYX"})
-    tifffile.imwrite(
-        tmp_path / "big.tif", stored, bigtiff=True, photometric="minisblack", compression="zlib", metadata=None
-    )
-    for name in ("pages.tif", "imagej.tif", "big.tif"):
-        assert read_stack_info(tmp_path / name) == StackInfo((3, 9, 7), "uint16", None)
-        np.testing.assert_allclose(read_stack(tmp_path / name, full_scale=4095).numpy(), stored / 4095, rtol=1e-7)
-    colour = draw_counts((9, 7, 3), 255, "uint8")
-    tifffile.imwrite(tmp_path / "colour.tif", colour, photometric="rgb", metadata=None)
-    np.testing.assert_allclose(read_stack(tmp_path / "colour.tif")[0].numpy(), np.moveaxis(colour, -1, 0) / 255)
-
-
 def test_png_files_are_read_in_natural_order(tmp_path):
     for index in (2, 10, 1, 9):
         cv2.imwrite(str(tmp_path / f"shot{index}.png"), np.full((4, 5), index, np.uint8))
     (tmp_path / "notes.txt").write_text("not a frame")
     assert (read_stack(tmp_path)[:, 0, 0] * 255).round().tolist() == [1, 2, 9, 10]
-
-
-def test_video_is_read_as_rgb(tmp_path):
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 24, (64, 48))
-    for level in (40, 90, 140, 190):
-        writer.write(np.dstack([np.full((48, 64), value, np.uint8) for value in (level, 60, 30)]))
-    writer.release()
-    info = read_stack_info(path)
-    assert replace(info, frame_times=None) == StackInfo((4, 3, 48, 64), "uint8", 255.0)
-    assert info.time_error == pytest.approx(1 / 24)
-    assert info.frame_times == pytest.approx([0, 1 / 24, 2 / 24, 3 / 24], abs=1e-6)
-    means = (read_stack(path) * 255).mean((-2, -1))
-    np.testing.assert_allclose(means, [[30, 60, level] for level in (40, 90, 140, 190)], atol=4)
-
-
-def test_axes():
-    assert StackInfo((2, 9, 7), "uint8", 255.0).axes == "THW"
-    assert StackInfo((2, 3, 9, 7), "float32", None).axes == "TCHW"
-    assert StackInfo((2, 9, 7), "uint16", None).is_integer
-    assert not StackInfo((2, 9, 7), "float32", None).is_integer
-
-
-def test_description_of_a_tiff_file_is_json(tmp_path):
-    write_stack(tmp_path / "frames.tif", torch.zeros(2, 4, 5), dtype="uint16", full_scale=4095)
-    with tifffile.TiffFile(tmp_path / "frames.tif") as tif:
-        assert json.loads(tif.pages[0].description) == {"shape": [2, 4, 5], "axes": "TYX", "full_scale": 4095}
-        assert len(tif.pages) == 2
 
 
 def png_chunk(kind, body):
@@ -152,5 +105,5 @@ def test_png_header_larger_than_the_file_is_refused(tmp_path):
     header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 16, 0, 0, 0, 0))
     data = b"\x89PNG\r\n\x1a\n" + header + png_chunk(b"IDAT", zlib.compress(b"\0" * 99)) + png_chunk(b"IEND", b"")
     (tmp_path / "huge.png").write_bytes(data)
-    with pytest.raises(ValueError, match=r"huge\.png: its header states 2000000 x 2000000 px"):
+    with pytest.raises(ValueError, match=r"huge\.png: .*its header states 2000000 x 2000000 px"):
         read_stack(tmp_path / "huge.png")

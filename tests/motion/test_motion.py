@@ -1,6 +1,5 @@
 """The contract of ``Motion``, checked for every motion type."""
 
-import dataclasses
 import math
 
 import pytest
@@ -67,15 +66,6 @@ def test_batches_of_equal_motions(motion):
     torch.testing.assert_close(batch[1].velocity(TIMES), motion.velocity(TIMES))
     with pytest.raises(IndexError, match="not a batch"):
         motion[0]
-
-
-def test_image_shift_is_a_constant_displacement():
-    without = dataclasses.replace(TONES, image_shift=[0.0, 0.0])
-    shift = torch.tensor([-3.0, 7.0], dtype=torch.float64)
-    for function in (lambda motion: motion.displacement(TIMES), lambda motion: motion.mean_displacement(TIMES, 2e-3)):
-        torch.testing.assert_close(function(TONES) - function(without), shift.expand(len(TIMES), 2))
-    assert torch.equal(TONES.velocity(TIMES), without.velocity(TIMES))
-    assert torch.equal(TONES.drift(TIMES), without.drift(TIMES))
 
 
 def test_moving_axes():

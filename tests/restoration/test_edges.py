@@ -56,8 +56,7 @@ def test_psnr_exceeds_that_of_the_gaussian_prior(buildings, joint):
     assert decibel(kept, truth) > decibel(plain, truth) + 0.15
 
 
-@pytest.mark.parametrize("exposure_rows", [100, 400])
-@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize(("exposure_rows", "joint"), [(100, False), (400, True)])
 def test_psnr_exceeds_that_of_the_gaussian_prior_under_blur(joint, exposure_rows):
     scene = draw_scene(272, 240, seed=5)
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)

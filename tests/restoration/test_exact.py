@@ -61,7 +61,7 @@ def test_long_exposures(rows, one, two):
     assert decibel(joint, crop(scene)) > two
 
 
-@pytest.mark.parametrize("noise", [0.001, 0.005, 0.02, 0.05])
+@pytest.mark.parametrize("noise", [0.001, 0.02])
 def test_estimated_regularisation_is_close_to_the_best(short, noise):
     truth, frames, motion = short
     frames = with_noise(frames, noise)[:1]

@@ -88,8 +88,7 @@ def contrast(image, cycles, axis, inner=32):
     return abs((line * np.exp(-1j * np.pi * cycles * np.arange(len(line)))).mean())
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize(("cycles", "kind"), [(0.6, "texture"), (0.75, "texture"), (0.75, "patch")])
+@pytest.mark.parametrize(("cycles", "kind", "axis"), [(0.6, "texture", 0), (0.75, "texture", 1), (0.75, "patch", 0)])
 def test_contrast_of_a_sine_beyond_the_nyquist_frequency(cycles, kind, axis):
     side = FINER * (SIZE + 2 * MARGIN)
     values, cycles = wave(cycles, axis)
@@ -205,7 +204,7 @@ def test_frames_that_sample_the_same_points_are_reported(scene, truth):
     assert abs(decibel(image, truth, 16) - decibel(mean, truth, 16)) < 2.5  # no detail is invented
 
 
-@pytest.mark.parametrize(("noise", "count"), [(NOISE, 6), (0.02, 6), (0.02, 2)])
+@pytest.mark.parametrize(("noise", "count"), [(NOISE, 6), (0.02, 2)])
 def test_inaccurate_vibration_is_reported_and_no_worse_than_on_pixels(frames, truth, noise, count):
     wrong = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.45, 1.35])
     more = (noise**2 - NOISE**2) ** 0.5

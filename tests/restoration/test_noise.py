@@ -73,8 +73,7 @@ def test_blocks_with_ignored_pixels_are_excluded(shape):
     assert estimate_noise(filled, torch.ones_like(hidden)).isnan().all()
 
 
-@pytest.mark.parametrize("rows", [20, 100])
-@pytest.mark.parametrize("dead", ["black", "constant", "not measured"])
+@pytest.mark.parametrize(("rows", "dead"), [(20, "black"), (100, "constant"), (100, "not measured")])
 def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 3, 0.01)).float()[:, None]
@@ -91,8 +90,7 @@ def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
     assert (noise_levels(torch.zeros_like(frames[None]), motion) == 0).all()
 
 
-@pytest.mark.parametrize("rows", [20, 100])
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.6])
+@pytest.mark.parametrize(("rows", "share"), [(20, 0.05), (100, 0.3), (20, 0.6)])
 def test_missing_pixels_do_not_affect_the_level(rows, share):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 2, 0.01)).float()[:, None]

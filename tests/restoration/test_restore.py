@@ -336,12 +336,12 @@ def test_batch_channels_and_chunks_do_not_change_the_result(scene_and_frames, me
         torch.testing.assert_close(
             found[:, 0], restore(images, TIMING, vibration, **common, **chunks), rtol=0, atol=2e-7
         )
-    two = torch.stack([stack, stack], 1)  # channels have one noise level
-    torch.testing.assert_close(restore(two, TIMING, other, **common)[:, 1], restore(stack, TIMING, other, **common))
+    three = torch.stack([stack] * 3, 1)  # channels have one noise level
+    torch.testing.assert_close(restore(three, TIMING, other, **common)[:, 1], restore(stack, TIMING, other, **common))
 
 
 @pytest.mark.parametrize("method", INVARIANT)
-@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
+@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "reverse")])
 def test_orientation(scene_and_frames, method, scan_axis, direction):
     """The result for flipped or transposed frames is the flipped or transposed result."""
     common = {"method": method, "check": False, **INVARIANT[method][0]}

@@ -5,17 +5,15 @@ import json
 import os
 import resource
 import shutil
-import signal
 import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tifffile
-from attacks.small_runs import count_file_calls, fork
-from small_stack import CONFIG, FRAMES, OPTIONS, WINDOWS, process_small, write_small
+from attacks.small_runs import fork
+from small_stack import FRAMES, OPTIONS, WINDOWS, process_small, write_small
 
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.run_folder import work_folder
 
@@ -54,27 +52,10 @@ def check_whole(whole, folder, name):
     assert {path.name for path in folder.iterdir()} == {name, manifest}
 
 
-def run_killed(arguments, die_at):
-    """Run a command that dies at a call that changes a file."""
-    count_file_calls(die_at)
-    return run_command(arguments)
-
-
 def process_with_limit(source, sink, limit, **options):
     """Process the stack where files have at most ``limit`` bytes."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     process_small(source, sink, **options)
-
-
-def test_folder_of_a_command_killed_at_its_first_check_is_removed_by_the_next(whole, tmp_path):
-    (tmp_path / "camera.toml").write_text(CONFIG)
-    arguments = ["run", str(whole / "frames.tif"), str(tmp_path / "out"), "--config", str(tmp_path / "camera.toml")]
-    assert fork(run_killed, arguments, 2)[0] == -signal.SIGKILL
-    left = [path for path in tmp_path.iterdir() if path.name.startswith(".out.")]
-    assert [path.suffix for path in left] == [".part"]
-    assert run_command([*arguments, "--resume"]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"camera.toml", "out"}
-    assert (tmp_path / "out" / "restored.tif").read_bytes() == (whole / "out.tif").read_bytes()
 
 
 @pytest.fixture(name="interrupted")

@@ -14,7 +14,7 @@ from truth import decibel
 import rsvib_torch as rsv
 from rsvib_torch.io import open_stack, write_stack
 from rsvib_torch.stacks import cut_windows, detect_stack, read_manifest
-from rsvib_torch.stacks.memory import memory_needed, parse_memory, windows_at_once
+from rsvib_torch.stacks.memory import parse_memory
 
 
 @pytest.fixture(scope="module", name="place")
@@ -218,29 +218,6 @@ def test_frame_times_of_the_file_are_used_and_kept(place, tmp_path):
         turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - float(found.phase[0, 0])
         assert abs(np.angle(np.exp(1j * turn))) < 0.2
         assert float(found.amplitude[0, 0]) == pytest.approx(MOTION.amplitude[0], rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("restoration", "at_once"),
-    [
-        (None, [1, 2, 13]),
-        ({"method": "dewarp"}, [1, 2, 13]),
-        ({}, [1, 2, 10]),
-        ({"joint": True}, [1, 2, 10]),
-        ({"prior": "edges"}, [1, 1, 9]),
-        ({"method": "richardson-lucy"}, [0, 1, 7]),
-    ],
-)
-def test_windows_at_once_fit_into_the_memory(restoration, at_once):
-    info = rsv.StackInfo((1000, 1024, 1024), "uint16", 4095.0)
-    for text, count in zip(("1.3GB", "2GB", "8 GB"), at_once, strict=True):
-        memory = parse_memory(text)
-        if count == 0:
-            with pytest.raises(ValueError, match=r"memory of 1.3 GB is too little: a window of 8 frames of 1024 x"):
-                windows_at_once(info, 8, memory=memory, most=16, restoration=restoration)
-            continue
-        assert windows_at_once(info, 8, memory=memory, most=16, restoration=restoration) == count
-        assert memory_needed(info, 8, restoration, count) <= memory < memory_needed(info, 8, restoration, count + 1)
 
 
 def test_memory_sizes_are_parsed():

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from dataclasses import replace
 
 import av
 import numpy as np
@@ -12,10 +11,9 @@ from skimage.registration import phase_cross_correlation
 from small_video import sound_of, write_video
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration, read_manifest, read_stack, read_stack_info, sampling_map
+from rsvib_torch import SensorTiming, read_manifest, read_stack, read_stack_info
 from rsvib_torch.commands.main import run_command
 from rsvib_torch.stacks import process_video
-from rsvib_torch.stacks.video_frames import source_map
 
 HEIGHT, WIDTH, COUNT, RATE = 168, 144, 40, 30.0
 TIMING = SensorTiming(row_time=150e-6, exposure_rows=4, frame_rows=1 / RATE / 150e-6)
@@ -146,20 +144,6 @@ def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
     for found in read_manifest(report.manifest).detections():
         right = (found.vibration.frequency[:, 0] - torch.tensor([52.0, 71.0])).abs() < 0.2
         assert not (found.reliable & ~right).any()
-
-
-@pytest.mark.parametrize("direction", ["forward", "reverse"])
-@pytest.mark.parametrize("axis", ["x", "y"])
-@pytest.mark.parametrize("axes", [2, 4])
-def test_frames_are_sampled_where_the_exported_map_samples_them(axis, direction, axes):
-    timing = replace(TIMING, frame_start_times=(-0.01,), scan_axis=axis, readout_direction=direction)
-    amplitude, frequency = [[1.2], [0.8], [2e-3], [1e-3]], [[93.0], [61.0], [40.0], [30.0]]
-    speed, shift = [40.0, 20.0, 0.05, 0.01], [3.0, 2.0, 0.01, 0.005]
-    motion = Vibration(amplitude[:axes], frequency[:axes], 0.3, speed[:axes], image_shift=shift[:axes])
-    expected = sampling_map(motion, timing, (90, 80), 1)[0]
-    whole = motion.drift(torch.tensor([-0.01 + 0.5 * (timing.exposure_time + 89 * timing.row_time)])).abs()
-    assert whole.max() < 0.5  # px, which ``restore`` would leave in the frame
-    assert np.abs(source_map(motion, timing, (90, 80)) - expected.permute(2, 0, 1).numpy()).max() < 1e-3
 
 
 def test_held_pixels_change_less_from_frame_to_frame(clip, tmp_path):

@@ -6,7 +6,8 @@ from scipy.ndimage import map_coordinates
 from truth import draw_scene
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.tracking.camera_path import CornerFollower, camera_path, shake
+from rsvib_torch.registration.corners import CornerFollower
+from rsvib_torch.tracking.camera_path import camera_path, shake
 from rsvib_torch.tracking.steadying import largest_displacement, steady_places
 
 HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 48, 30.0, 3

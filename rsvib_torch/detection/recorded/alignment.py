@@ -31,6 +31,7 @@ from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.frames.orientation import (
+    frames_from_row_order,
     magnitudes_from_row_order,
     offsets_from_row_order,
     reasons_from_row_order,
@@ -242,10 +243,11 @@ def align_motion(
     timing = stack.timing
     if stack.batched:
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
-    grey, valid = stack.images, None if stack.valid is None else stack.valid[0]
+    grey = stack.images
     if isinstance(recorded, AngularRates):
+        valid = None if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
         return align_rates(
-            corner_tracks(((frame, None if valid is None else valid[i]) for i, frame in enumerate(grey[0])), timing),
+            corner_tracks(frames_from_row_order(grey[0], timing), valid, timing),
             grey.shape[1:],
             timing,
             recorded,

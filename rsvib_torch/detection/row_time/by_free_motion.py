@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg
 
 from rsvib_torch.core.progress import steps
-from rsvib_torch.core.splines import bspline_weights
+from rsvib_torch.core.splines import spline_taps
 from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.detection.row_time.joint_fit import FramePlaces
 from rsvib_torch.detection.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
@@ -113,7 +113,9 @@ class _Problem:
         times = table(record.frames) * self.period + rows * row_time
         first, last = float(times.min()), float(times.max())
         cells = max(1, math.ceil((last - first) / spacing))
-        index, basis, slope = _basis(times, first, (last - first) / cells, cells)
+        grid = first, (last - first) / cells, cells + DEGREE
+        index, basis = spline_taps(times, *grid, degree=DEGREE)
+        _, slope = spline_taps(times, *grid, degree=DEGREE, derivative=1)
         weights = np.stack([table(one.weights) for one in self.records])
         bands = normal_bands(index, basis, seen, weights, cells + DEGREE)
         cost, step, information = 0.0, 0.0, 0.0
@@ -159,13 +161,3 @@ def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor
     right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
     solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)
     return solution, values - table(record.relative(tensor((basis * solution[index]).sum(-1))))
-
-
-def _basis(times: Array, first: float, width: float, cells: int) -> tuple[Array, Array, Array]:
-    """The B-splines of degree ``DEGREE`` that are not 0 at times (...), (..., 8), their values and derivatives."""
-    place = (times - first) / width
-    cell = np.clip(np.floor(place), 0.0, cells - 1.0)
-    index = cell.astype(np.int64)[..., None] + np.arange(DEGREE + 1)
-    values, lower = (table(bspline_weights(tensor(place - cell), degree)) for degree in (DEGREE, DEGREE - 1))
-    none = np.zeros_like(lower[..., :1])
-    return index, values, (np.concatenate([none, lower], -1) - np.concatenate([lower, none], -1)) / width

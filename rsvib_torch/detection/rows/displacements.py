@@ -737,8 +737,8 @@ def _warp_to_scene(
     moment_slope = 0.5 * torch.gradient(_second_moments(paths, weights), dim=2)[0].to(real)[..., None]
     x, y = paths.flip(1).unbind(-1)  # of the other frame
     node_rows, node_shift = _between_rows(positions, timing, motion, -y)
-    node_shift = node_shift - x
-    factors = torch.stack([weights.expand_as(y), weights * y], -1).to(real)
+    node_rows, node_shift = node_rows.movedim(-1, 0), (node_shift - x).movedim(-1, 0)  # (N, B, G, S)
+    factors = torch.stack([weights.expand_as(y), weights * y]).to(real).movedim(-1, 0)[..., None, None]
     by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)  # derivative along the rows
     count = positions.rows.shape[-1]
 
@@ -747,10 +747,10 @@ def _warp_to_scene(
         index = torch.arange(first - 2, last + 2, device=y.device).clamp(0, count - 1)  # two neighbours, see below
         shape = (*y.shape[:2], len(index), len(by_x))
         mean, moment = (spectra.values.new_zeros(shape) for _ in range(2))  # mean of the copies; and of y times them
-        for node in range(len(weights)):
-            copy = torch.view_as_real(spectra.warped(node_rows[..., index, node], node_shift[..., index, node]))
-            for total, factor in zip((mean, moment), factors[:, :, index, node].unbind(-1), strict=True):
-                torch.view_as_real(total).addcmul_(copy, factor[..., None, None])
+        copies = spectra.warped_copies(node_rows[..., index], node_shift[..., index])
+        for copy, of_node in zip(copies, factors[..., index, :, :], strict=True):
+            for total, factor in zip((mean, moment), of_node, strict=True):
+                torch.view_as_real(total).addcmul_(torch.view_as_real(copy), factor)
 
         def neighbour(step: int) -> Tensor:
             return moment[:, :, 2 + step : len(index) - 2 + step]

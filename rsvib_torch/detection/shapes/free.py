@@ -23,7 +23,7 @@ from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.splines import bspline_weights, gauss_legendre
+from rsvib_torch.core.splines import gauss_legendre, spline_taps
 from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
@@ -402,13 +402,6 @@ class _SplineFit:
         return np.maximum(np.stack(variances, -1), 0.0)
 
 
-def _taps(times: Array, start: float, spacing: float, count: int) -> tuple[Array, Array]:
-    """The four coefficients of ``count`` that a spline at times (...) depends on, (..., 4), and their factors."""
-    place = np.clip((times - start) / spacing, 0.0, count - 3.0)
-    cell = np.minimum(np.floor(place), count - 4.0)
-    return cell.astype(np.int64)[..., None] + np.arange(4), table(bspline_weights(tensor(place - cell), 3))
-
-
 def _fit_spline(
     measurements: Measurements, spacing: float, record: tuple[float, float], report_times: Array | None = None
 ) -> _SplineFit:
@@ -435,7 +428,7 @@ def _fit_spline(
         known = max(float(measurements.num_measurements[0, axis]), 1.0)
         mean = None
         if report_times is not None:
-            index, weights = _taps(report_times, first, spacing, count)
+            index, weights = spline_taps(report_times, first, spacing, count)
             mean = np.bincount(index.ravel(), weights.ravel(), count) / len(report_times)
         value, covariance, step = _solved_spline(band, right, energy, known, mean)
         coefficients.append(value - value.mean())
@@ -451,7 +444,7 @@ def _normal_equations(
     average = measurements.average_times[min(axis, 1)] + measurements.exposure_time
     nodes, shares = (table(values) for values in gauss_legendre(3 + math.ceil(2 * average / spacing)))
     times = starts[..., None] + 0.5 * (measurements.exposure_time - average) + average * nodes  # (R, G, Q)
-    index, weights = _taps(times, start, spacing, count)
+    index, weights = spline_taps(times, start, spacing, count)
     index, weights = index.reshape(*seen.shape, -1), (shares[:, None] * weights).reshape(*seen.shape, -1)
     weighted = measurements.inverse_variances[0, :, axis, None] * measurements.displacements[0, ..., axis] * seen
     right = np.bincount(index.ravel(), (weights * weighted[..., None]).ravel(), count)
@@ -632,7 +625,7 @@ def _report(
     ``of_bands`` are the reasons of each axis from the row bands, ``apart`` (2,) px the rms difference of the
     displacements along a row that the motion does not explain.
     """
-    index, weights = _taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
+    index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
     std = tensor(np.sqrt(fit.variances(index, weights[:, None]))[:, 0]).unflatten(0, times.shape)
     std_seen, unseen = map(tensor, _visible_and_common(fit, measured))
     rest = tensor(measured.unexplained(residual_of_motion(measured, motion))[0])
@@ -671,7 +664,7 @@ def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array,
     several = seen.sum(-1) > 1
     seen, times = seen[several], measured.exposure_starts[0][several] + 0.5 * measured.exposure_time
     first = np.where(seen > 0, times, np.inf).min(1, keepdims=True)
-    index, weights = _taps(np.where(seen > 0, times, first), fit.start, fit.spacing, fit.coefficients.shape[-1])
+    index, weights = spline_taps(np.where(seen > 0, times, first), fit.start, fit.spacing, fit.coefficients.shape[-1])
     sums = np.zeros((2, len(fit.coefficients)))
     for part in runs(len(seen), 256):  # (256, G, 4 G, 4 G) at a time
         frames = seen[part].shape[1]

@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.validation import Count
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.report.export.exported import check_exportable, num_rows_of
+from rsvib_torch.report.export.exported import Size, num_rows_of
 
 _RATE_STEP = 1e-9  # rad/s, of the integers in the file; 1000 s of equal rounding errors add up to 5e-7 rad
 _LOWEST_RATE = 1000.0  # Hz; from here the rate is doubled, so that 1 / rate is a short decimal number
@@ -36,8 +37,8 @@ def write_gcsv(
     path: str | os.PathLike[str],
     motion: Motion,
     timing: SensorTiming,
-    size: tuple[int, int],
-    num_frames: int,
+    size: Size,
+    num_frames: Count,
     *,
     sample_rate: float | None = None,
 ) -> None:
@@ -80,9 +81,7 @@ def write_gcsv(
         >>> lines[lines.index("t,gx,gy,gz") + 1]  # 1e-9 rad/s: pitch rate 2 pi 80 / 1000, yaw rate -2 pi 50 2 / 1000
         '0,502654825,-628318531,0'
     """
-    check_exportable(motion)
-    rows = num_rows_of(timing, size)
-    check_whole_number("num_frames", num_frames, at_least=1)
+    rows = num_rows_of(motion, timing, size)
     if motion.camera is None:
         raise ValueError(
             "angular rates require the focal length in px: motion.with_camera(Camera(focal_length)), on the command "

@@ -33,13 +33,13 @@ from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.text import quoted
-from rsvib_torch.core.validation import read_json
+from rsvib_torch.core.validation import Positive, read_json
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import IsdModel
-from rsvib_torch.report.export.exported import check_exportable, num_rows_of
+from rsvib_torch.report.export.exported import Size, num_rows_of
 
 _FRAME, _LINE_SCAN = "USGS_ASTRO_FRAME_SENSOR_MODEL", "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
 _MAX_DEGREE = 12  # 8e-7 px for 5 px and 0.8 periods per frame; rounding of float64 stays below 1e-8 px up to 14
@@ -53,11 +53,11 @@ Array = NDArray[np.float64]
 @checks_arguments
 def camera_isd(
     camera: Camera,
-    size: tuple[int, int],
+    size: Size,
     *,
     position: tuple[float, float, float],
     look: tuple[float, float, float],
-    radii: tuple[float, float] = (6378.137, 6356.752),
+    radii: tuple[Positive, Positive] = (6378.137, 6356.752),
     ephemeris_time: float = 0.0,
 ) -> dict[str, Any]:
     """Build the ISD of a still frame camera, for users who have none: ``write_isd`` adds the motion.
@@ -86,13 +86,7 @@ def camera_isd(
         >>> isd["focal_length_model"], isd["detector_center"]
         ({'focal_length': 200000.0}, {'line': 512.0, 'sample': 512.0})
     """
-    names = ("height in size", "width in size")
-    height, width = (check_whole_number(name, count, at_least=1) for name, count in zip(names, size, strict=True))
-    for name, values, count in (("position", position, 3), ("look", look, 3), ("radii", radii, 2)):
-        if len(values) != count:
-            raise ValueError(f"{name} must be {count} numbers, got {values}")
-    for value in radii:
-        check_number("radii", value, above=0.0)
+    height, width = size
     forward = np.asarray(look, dtype=float)
     if not np.linalg.norm(forward) > 0:
         raise ValueError(f"look must be a direction, got {look}")
@@ -146,7 +140,7 @@ def write_isd(
     *,
     frame: int = 0,
     model: IsdModel = "auto",
-    tolerance: float = 0.005,
+    tolerance: Positive = 0.005,
 ) -> Literal["frame", "line-scan"]:
     """Write the ISD of one frame of a vibrating camera, for the Community Sensor Model.
 
@@ -196,9 +190,7 @@ def write_isd(
         >>> len(json.loads(Path(path).read_text())["instrument_pointing"]["quaternions"])  # 480 rows and 4 around them
         488
     """
-    check_exportable(motion)
     check_whole_number("frame", frame, at_least=0)
-    check_number("tolerance", tolerance, above=0.0)
     if timing.scan_axis != -2:
         raise ValueError(
             "scan_axis must be -2: the lines of these sensor models are image rows, one exposure time each; transpose "
@@ -247,7 +239,7 @@ def _displacements(motion: Motion, timing: SensorTiming, size: tuple[int, int], 
 
     Rows beyond the frame, ``_PADDING`` on each side, are included; columns are spread over the width.
     """
-    rows = num_rows_of(timing, size)
+    rows = num_rows_of(motion, timing, size)
     line = torch.arange(-_PADDING, rows + _PADDING, dtype=torch.float64, device=motion.device)
     row = rows - 1 - line if timing.readout_direction == "reverse" else line
     starts = timing.frame_starts(frame + 1, motion.device)[frame] + row * timing.row_time

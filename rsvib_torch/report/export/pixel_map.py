@@ -9,28 +9,23 @@ import numpy as np
 import tifffile
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import BarycentricInterpolator
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.frames.orientation import frames_from_row_order
-from rsvib_torch.motion.field import ColumnMotion, displacement_at
+from rsvib_torch.core.validation import Count
+from rsvib_torch.frames.orientation import offsets_from_row_order
+from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.sampling import source_map
+from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import StmapConvention
-from rsvib_torch.report.export.exported import check_exportable, num_rows_of
+from rsvib_torch.report.export.exported import Size, num_rows_of
 from rsvib_torch.restoration.frame_motion import frame_motion
-
-# Columns at which positions are computed; a polynomial interpolates them. Error for 2048 columns, 60 degrees and strong
-# distortion: 1e-9 px with 5 px and 5 mrad of roll at 400 Hz, 1e-7 px with a random free motion of 3 px and 2 mrad.
-_NODES = 17
-_STEPS = 12  # of the secant method; 4 leave less than 1e-9 px for 5 px at 100 Hz and 20 us per row
 
 
 @checks_arguments
-def sampling_map(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int) -> Tensor:
+def sampling_map(motion: Motion, timing: SensorTiming, size: Size, num_frames: Count) -> Tensor:
     """Position in the recorded frame that shows each pixel of the restored frame.
 
     The pixel at s of the restored frame shows the scene at ``s - shift``, which the recorded frame shows at
@@ -60,77 +55,23 @@ def sampling_map(motion: Motion, timing: SensorTiming, size: tuple[int, int], nu
         >>> round(x, 2), y
         (32.0, 25.0)
     """
-    check_whole_number("num_frames", num_frames, at_least=1)
-    return torch.stack(list(_maps(motion, timing, size, range(num_frames))))
+    return torch.stack(list(_maps(motion, timing, size, num_frames)))
 
 
-def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], frames: range) -> Iterator[Tensor]:
-    """Positions (H, W, 2) for each of these frames."""
-    check_exportable(motion)
-    rows = num_rows_of(timing, size)
+def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int) -> Iterator[Tensor]:
+    """Positions (H, W, 2) for each frame."""
+    rows = num_rows_of(motion, timing, size)
     columns = size[0] * size[1] // rows
-    rowwise, row_timing = motion.to_row_order(timing).detached(), timing.in_row_order()
-    bounding: Motion = rowwise.expanded(1)
-    shift = frame_motion(bounding, row_timing, frames.stop, rows).shift[0]
-    x = torch.arange(columns, dtype=torch.float64, device=motion.device)
+    row_timing = timing.in_row_order()
+    bounding: Motion = motion.to_row_order(timing).detached().expanded(1)
+    shift = offsets_from_row_order(frame_motion(bounding, row_timing, num_frames, rows).shift, timing)[0]
     if not motion.same_for_all_columns:
-        ends = x[[0, -1]] - 0.5 * (columns - 1)
-        bounding = ColumnMotion.of_columns(bounding, ends, row_timing, frames.stop, rows)
-    frame_motion(bounding, row_timing, frames.stop, rows).check_fits(columns)
-    starts = row_timing.frame_starts(frames.stop, motion.device)
-    y = torch.arange(rows, dtype=torch.float64, device=motion.device)
-    # where all columns are displaced alike, one is enough
-    nodes, weights = (x[:1], None) if motion.same_for_all_columns else _interpolation(x)
-    for frame in frames:
-        at_rest = nodes - shift[frame, 0], y - shift[frame, 1]
-        along, across = _position(rowwise, row_timing, starts[frame], *at_rest, (rows, columns)).unbind(-1)
-        along = along - nodes
-        if weights is not None:
-            along, across = along @ weights, across @ weights
-        yield _in_image_axes(along + x, across.expand(rows, columns), timing)
-
-
-def _interpolation(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Chebyshev nodes (N,) among columns x (C,), and the weights (N, C) of polynomial interpolation at all columns."""
-    count = min(_NODES, len(x))
-    points = np.cos(np.pi * np.arange(count) / max(count - 1, 1))
-    nodes = 0.5 * (len(x) - 1) * (1 - points)
-    weights = BarycentricInterpolator(nodes, np.eye(count))(x.cpu().numpy())
-    return x.new_tensor(nodes), x.new_tensor(weights.T)
-
-
-def _position(motion: Motion, timing: RowTiming, start: Tensor, x: Tensor, y: Tensor, frame: tuple[int, int]) -> Tensor:
-    """Positions (R, C, 2) of content at rest at columns x (C) and rows y (R) of the frame (rows, columns).
-
-    The row r solves ``r = y + D_y(r)``, since r determines the time of the exposure: secant method.
-    """
-    height, width = frame
-    y, x = y[:, None], x[None]
-
-    def displacement(rows: Tensor) -> Tensor:
-        components = motion.mean_displacement(start + rows * timing.row_time, timing.exposure_time)
-        return displacement_at(components, x - 0.5 * (width - 1), y - 0.5 * (height - 1), motion.camera)
-
-    before = y.expand(len(y), x.shape[1])
-    moved = displacement(before)
-    rows, slope = before + moved[..., 1], torch.zeros_like(before)
-    for _ in range(_STEPS):
-        again = displacement(rows)
-        gone = rows - before
-        # without a step, the old slope is kept; below 1: content that moves as fast as the rows is never passed
-        slope = torch.where(gone.abs() > 1e-9, (again[..., 1] - moved[..., 1]) / gone, slope)
-        step = (y + again[..., 1] - rows) / (1 - slope).clamp(min=0.1)
-        before, moved, rows = rows, again, rows + step
-        if bool((step.abs() < 1e-9).all()):  # px
-            break
-    return torch.stack([x + displacement(rows)[..., 0], rows], -1)
-
-
-def _in_image_axes(along: Tensor, across: Tensor, timing: SensorTiming) -> Tensor:
-    """Positions along and across rows, each (rows, columns) in row order, as (H, W, 2) in image axes."""
-    across = len(across) - 1 - across if timing.readout_direction == "reverse" else across
-    pair = (along, across) if timing.scan_axis == -2 else (across, along)
-    return torch.stack([frames_from_row_order(values, timing) for values in pair], -1)
+        ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (columns - 1)
+        bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, rows)
+    frame_motion(bounding, row_timing, num_frames, rows).check_fits(columns)
+    for frame in range(num_frames):
+        places = source_map(motion.detached(), timing, size, frame, shift[frame], np.float64)
+        yield torch.from_numpy(places).movedim(0, -1)
 
 
 def _channels(positions: Tensor, convention: StmapConvention) -> NDArray[np.float32]:
@@ -148,8 +89,8 @@ def write_stmap(
     folder: str | os.PathLike[str],
     motion: Motion,
     timing: SensorTiming,
-    size: tuple[int, int],
-    num_frames: int,
+    size: Size,
+    num_frames: Count,
     *,
     convention: StmapConvention = "nuke",
 ) -> list[Path]:
@@ -194,11 +135,10 @@ def write_stmap(
         >>> round(float(cv2.remap(frame, map_x, map_y, cv2.INTER_LINEAR)[25, 30]), 2)  # a quarter of a period: X = 2 px
         32.0
     """
-    check_whole_number("num_frames", num_frames, at_least=1)
     digits = max(4, math.ceil(math.log10(num_frames + 1)))
     names = []
     with whole_folder(folder) as part:
-        for frame, positions in enumerate(_maps(motion, timing, size, range(num_frames))):
+        for frame, positions in enumerate(_maps(motion, timing, size, num_frames)):
             names.append(f"stmap_{frame:0{digits}d}.tif")
             tifffile.imwrite(part / names[-1], _channels(positions, convention), photometric="rgb")
     return [Path(folder, name) for name in names]

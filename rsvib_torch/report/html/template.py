@@ -60,16 +60,6 @@ class BeforeAfter:
     # row and column of the frame that the magnifier shows first; None for its centre
     place: tuple[int, int] | None = None
 
-    @property
-    def before(self) -> str:
-        """Data URI of the first image."""
-        return self.images[0]
-
-    @property
-    def after(self) -> str:
-        """Data URI of the last image."""
-        return self.images[-1]
-
 
 @dataclass(frozen=True)
 class Blink:
@@ -143,6 +133,11 @@ def before_after(
         longest = max(height, width)
     reduced = [_pixels(image, longest) for image in images]
     levels, full = _grey_levels(reduced), None
+
+    def pair(pixels: Sequence[Any], text: str = "", **place: Any) -> BeforeAfter:
+        uris = tuple(_encoded(image, levels, exact) for image in pixels)
+        return BeforeAfter(uris, names, text, pixels[0].shape[1], pixels[0].shape[0], levels, **place)
+
     if full_at is not None and longest < max(height, width):
         columns = min(width, max(2048, _FULL_PIXELS // height))
         rows = min(height, _FULL_PIXELS // columns)
@@ -151,13 +146,8 @@ def before_after(
             for place, size, whole in zip(full_at, (rows, columns), (height, width), strict=True)
         )
         parts = [_pixels(image[..., top : top + rows, left : left + columns]) for image in images]
-        uris = tuple(_encoded(part, levels, exact) for part in parts)
-        full = BeforeAfter(uris, names, "", columns, rows, levels, left, top)
-    uris = tuple(_encoded(image, levels, exact) for image in reduced)
-    scale = reduced[0].shape[1] / width
-    return BeforeAfter(
-        uris, names, caption, reduced[0].shape[1], reduced[0].shape[0], levels, 0, 0, scale, full, full_at
-    )
+        full = pair(parts, left=left, top=top)
+    return pair(reduced, caption, scale=reduced[0].shape[1] / width, full=full, place=full_at)
 
 
 def blink(

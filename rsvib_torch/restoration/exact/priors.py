@@ -28,7 +28,7 @@ class Prior:
     finer_grid: bool = False  # whether it exists with ``scale=2``, whose solution does not call the function
     mosaic: bool = False  # whether it exists for colour mosaics, whose solution does not call the function
     # memory in bytes per pixel and channel of the frames beyond that of the Gaussian prior; measured by
-    # scripts/benchmark.py --only memory
+    # scripts/benchmark.py --only streaming
     pixel_bytes: int = 12
 
 

@@ -1,17 +1,22 @@
-"""The reproduction: its MTF compared with formulas, its statistics, and a small run."""
+"""The reproduction of the paper: its MTF compared with formulas, its statistics, and a small run."""
 
-import json
 import math
-import re
 
 import numpy as np
 import pytest
-import reproduce
+from benchmarks import reproduction
+from benchmarks.reproduction import (
+    AMPLITUDE,
+    DETECTED,
+    PERIOD,
+    RESTORED,
+    crossing,
+    detection_values,
+    shake_of,
+    straight_edge_mtf,
+)
 from edge_truth import draw_edge, gaussian, through_pixels
-from reproduction.esfr import crossing, straight_edge_mtf
-from reproduction.paper import AMPLITUDE, DETECTED, PERIOD, RESTORED
-from reproduction.scenes import shake_of
-from reproduction.trials import detection_values
+from harness import defaults
 
 import rsvib_torch as rsv
 
@@ -55,26 +60,19 @@ def test_percentages_of_the_paper_agree_with_its_values():
                 assert gain == pytest.approx(100 * (after / before - 1), abs=0.05)
 
 
-def test_small_run(tmp_path, capsys):
-    out = tmp_path / "reproduction"
-    reproduce.main(["--tiny", "--out", str(out)])
-    assert str(out) in capsys.readouterr().out
-    data = json.loads((out / "reproduction.json").read_text(encoding="utf-8"))
-    cells = data["cells"]
-    assert len(cells) == 2 * 4 + 16 + 8
-    errors = [cell for cell in cells if cell["row"].startswith("error")]
-    assert all(cell["default_better_worst"] for cell in errors)
-    assert all(cell["ours"]["default"]["worst"] < 0.3 for cell in errors)
-    for trials in data["trials"].values():
-        (trial,) = trials
-        for before, after in zip(trial["degraded"]["psnr"], trial["restoration"]["default"]["psnr"], strict=True):
-            assert before < 20
-            assert after > 36
-    for axis, true in (("x", 2.409), ("y", 6.205)):  # 50 and 30 Hz less multiples of 23.795 Hz
-        assert data["global_shutter"]["found"][axis] == pytest.approx(true, abs=0.02)
-    text = (out / "reproduction.md").read_text(encoding="utf-8")
-    for title in ("Table 2", "Table 3", "Table 4", "MTF", "Push-scan", "50 Hz from 24 frames per second"):
-        assert re.search(rf"^## {title}", text, re.MULTILINE)
+def test_small_run():
+    options = defaults(reproduction)
+    results = reproduction.rows(options)
+    found = reproduction.chosen(results, part="detection", method=reproduction.DEFAULT)
+    assert len(found) == 4
+    assert max(abs(row[f"{quantity}_error"]) for row in found for quantity in ("period", "amplitude")) < 0.3
+    for target in reproduction.TARGETS:
+        of_target = reproduction.chosen(results, target=target, part="restoration")
+        for method, least, most in ((reproduction.DEGRADED, 0, 20), (reproduction.DEFAULT, 36, 60)):
+            assert all(least < row["psnr"] < most for row in reproduction.chosen(of_target, method=method))
+    aliases = {row["axis"]: row["found"] for row in reproduction.chosen(results, part="shutter")}
+    assert aliases == pytest.approx({"x": 2.409, "y": 6.205}, abs=0.02)  # 50, 30 Hz less multiples of 23.795 Hz
+    text = "\n".join(reproduction.lines(results, options))
+    assert len(reproduction.detection_cells(results)) == 12
+    assert len(reproduction.restoration_cells(results)) == 24
     assert "nan" not in text
-    for name in ("detection_errors", "global_shutter"):
-        assert (out / f"{name}.png").stat().st_size > 5000

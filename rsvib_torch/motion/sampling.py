@@ -1,0 +1,81 @@
+"""Where in a recorded frame each pixel of the restored frame was recorded."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rsvib_torch.motion.field import displacement_at
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import SensorTiming
+
+# Columns at which displacements that differ along a row are computed; a polynomial interpolates them. Without a camera,
+# the displacement is linear along a row, up to the motion between its rows. With one, for 2048 columns, 60 degrees and
+# strong distortion, the error is 1e-9 px with 5 px and 5 mrad of roll at 400 Hz, 1e-7 px with a random free motion of
+# 3 px and 2 mrad.
+_NODES, _NODES_WITH_CAMERA = 5, 17
+_CLOSE = 1e-6  # px, change of a position in the last round
+_ROUNDS = 60  # at most; 5 suffice for 5 px at 100 Hz and 20 us per row
+
+Array = NDArray[Any]
+
+
+def recorded_offsets(
+    motion: Motion, timing: SensorTiming, size: tuple[int, int], frame: int = 0, shift: Tensor | None = None
+) -> tuple[Array, Array]:
+    """How far (x, y) from each pixel of the restored frame it was recorded, (2, n, m) px, and weights (m, length).
+
+    Content that is at rest at s - shift in a frame was recorded at ``q = s - shift + D(s - shift, t(q))`` with the
+    mean displacement D during the exposure of the row of q. Rows in the order of the sensor are n. Along them, the
+    offsets at all pixels are ``offsets @ weights``, a polynomial through m columns of which the first and the last are
+    those of the frame; where all columns are displaced alike, there is one.
+    """
+    height, width = size
+    along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)  # axes (x, y) along which rows follow, and along rows
+    count, length = (height, width) if along == 1 else (width, height)
+    nodes = 1 if motion.same_for_all_columns else _NODES if motion.camera is None else _NODES_WITH_CAMERA
+    columns, weights = _interpolation(length, min(nodes, length))
+    pixels = torch.empty(2, count, len(columns), dtype=torch.float64, device=motion.device)
+    pixels[along] = torch.arange(count, device=motion.device)[:, None]
+    pixels[across] = torch.from_numpy(columns).to(motion.device)
+    still = pixels if shift is None else pixels - shift[:2, None, None]
+    x, y = still[0] - 0.5 * (width - 1), still[1] - 0.5 * (height - 1)
+    start = timing.frame_starts(frame + 1, motion.device)[frame]
+    places = still
+    for _ in range(_ROUNDS):  # the row of a place determines when it was recorded
+        rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
+        moved = motion.mean_displacement(start + rows * timing.row_time, timing.exposure_time)
+        before, places = places, still + displacement_at(moved, x, y, motion.camera).movedim(-1, 0)
+        if float((places[along] - before[along]).abs().max()) < _CLOSE:
+            break
+    return (places - pixels).detach().cpu().numpy(), weights
+
+
+def _interpolation(length: int, count: int) -> tuple[Array, Array]:
+    """Chebyshev nodes (count,) among columns, and the weights (count, length) of interpolation at all columns."""
+    nodes, series = -np.cos(np.pi * np.arange(count) / max(count - 1, 1)), np.polynomial.chebyshev.chebvander
+    weights = series(np.linspace(-1.0, 1.0, length), count - 1) @ np.linalg.inv(series(nodes, count - 1))
+    return 0.5 * (length - 1) * (nodes + 1), weights.T
+
+
+def source_map(
+    motion: Motion,
+    timing: SensorTiming,
+    size: tuple[int, int],
+    frame: int = 0,
+    shift: Tensor | None = None,
+    dtype: Any = np.float32,
+) -> Array:
+    """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded."""
+    offsets, weights = recorded_offsets(motion, timing, size, frame, shift)
+    along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)
+    count, length = size[::-1][along], size[::-1][across]
+    offsets = offsets.astype(dtype)
+    if len(weights) > 1:
+        offsets = offsets @ weights.astype(dtype)
+    result = np.empty((2, count, length), dtype)
+    np.add(np.arange(count, dtype=dtype)[:, None], offsets[along], out=result[along])
+    np.add(np.arange(length, dtype=dtype), offsets[across], out=result[across])
+    return result if along == 1 else result.transpose(0, 2, 1)
