@@ -78,7 +78,7 @@ def test_corrector_restores_a_batch_and_states_its_options(frames, scene):
 
 def test_batches_without_channels_are_refused_with_the_remedy(frames):
     grey = frames[:, :, 0]  # (B, T, H, W)
-    message = r"frames of shape \(2, 2, 256, 160\) are read as 2 frames of 2 channels.*pass frames\[:, :, None\]"
+    message = r"frames of shape \(2, 2, 256, 160\) appear to be a batch.*pass frames\[:, :, None\]"
     with pytest.raises(ValueError, match=message):
         rsv.VibrationCorrector(TIMING)(grey)
     with pytest.raises(ValueError, match=message):

@@ -13,6 +13,7 @@ from kornia.augmentation import GeometricAugmentationBase2D
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.core.arguments import check_tensor, checks_arguments
 from rsvib_torch.core.arrays import channels_appear_last
@@ -22,7 +23,7 @@ from rsvib_torch.core.splines import gauss_legendre, mirrored
 from rsvib_torch.core.text import quoted
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
-from rsvib_torch.imaging import blur_rows, gauss_node_count, rows_showing, trajectory_psf
+from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
 from rsvib_torch.imaging.blur import Interpolation
 from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_frame
 from rsvib_torch.motion.motion import Motion
@@ -32,6 +33,11 @@ from rsvib_torch.motion.vibration import Vibration
 Range = float | Sequence[float] | Sequence[Sequence[float]]
 Parameters = dict[str, Tensor]
 _DRAWN = ("amplitude", "frequency", "phase", "image_motion", "exposure_rows")
+
+
+def _with_turns(components: Tensor) -> Tensor:
+    """Components (..., A) of a motion along x, y, with roll and zoom, (..., 4)."""
+    return functional.pad(components, (0, 4 - components.shape[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,31 +69,25 @@ class ImageMotion:
         return self.vibration.displacement(times), weights
 
     def mean_displacement(self, rows: Tensor) -> Tensor:
-        """Mean components (B, S, A) over the exposures of frame rows (B, S) (Eq. 2)."""
+        """Mean components (B, S, 4) over the exposures of frame rows (B, S) (Eq. 2); missing ones are 0."""
         starts = self.starts[:, None] + rows * self.timing.row_time
-        return self.vibration.mean_displacement(starts, self.exposure_time[:, None])
+        return _with_turns(self.vibration.mean_displacement(starts, self.exposure_time[:, None]))
 
     def move(self, points: Tensor) -> Tensor:
-        """Positions (B, S, 2) in the frame of scene points (B, S, 2) in px, both (x, y)."""
-        if self.turns:
-            return self._turn(points)
-        rows = rows_showing(
-            points[..., 1],
-            self.starts[:, None],
-            self.timing,
-            self.vibration,
-            exposure_time=self.exposure_time[:, None],
-        )
-        return torch.stack([points[..., 0] + self.mean_displacement(rows)[..., 0], rows], dim=-1)
+        """Positions (B, S, 2) in the frame of scene points (B, S, 2) in px, both (x, y).
 
-    def _turn(self, points: Tensor) -> Tensor:
-        """``move`` with roll or zoom: Newton's method for the row of each point, as in ``rows_showing``."""
-        x, y = ((points[..., 1 - axis] - 0.5 * (self.size[axis] - 1)) for axis in (1, 0))
-        rows = points[..., 1]
+        Newton's method for the row that shows each point, as in ``rows_showing``.
+        """
+        x, y = (points[..., 1 - axis] - 0.5 * (self.size[axis] - 1) for axis in (1, 0))
+        rows, exposure = points[..., 1], self.exposure_time[:, None]
         for _ in range(8):
             residual = points[..., 1] + displacement_at(self.mean_displacement(rows), x, y)[..., 1] - rows
-            middle = self.starts[:, None] + rows * self.timing.row_time + 0.5 * self.exposure_time[:, None]
-            slope = displacement_at(self.vibration.velocity(middle), x, y)[..., 1].detach() * self.timing.row_time
+            starts = self.starts[:, None] + rows * self.timing.row_time
+            begin, end = (
+                displacement_at(_with_turns(self.vibration.displacement(times)), x, y)[..., 1].detach()
+                for times in (starts, starts + exposure)
+            )
+            slope = (end - begin) * self.timing.row_time / exposure
             rows = rows + residual / (1.0 - slope).clamp(min=0.1)
         return torch.stack([points[..., 0] + displacement_at(self.mean_displacement(rows), x, y)[..., 0], rows], -1)
 
@@ -119,11 +119,11 @@ class ImageMotion:
 
     def _of_strips(self, components: Tensor, strips: ColumnStrips) -> Tensor:
         """Displacements (B S, R, N, 2) of the middles of strips in the rows of the frame; components (B, R, N, A)."""
-        components = components.repeat_interleave(len(strips.firsts), 0)
+        components = _with_turns(components).repeat_interleave(len(strips.firsts), 0)
         x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
         rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]
-        scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else 1.0
-        y = (rows - 0.5 * (self.size[0] - 1) - components[..., 1] - components[..., 2] * x) / scale
+        across, roll, zoom = components[..., 1:].unbind(-1)
+        y = (rows - 0.5 * (self.size[0] - 1) - across - roll * x) / (1.0 + zoom)
         return displacement_at(components, x, y)
 
     def move_masks(self, masks: Tensor) -> Tensor:
@@ -131,21 +131,16 @@ class ImageMotion:
         B, _, R, W = masks.shape
         rows = torch.arange(R, dtype=torch.float64, device=masks.device)
         columns = torch.arange(W, dtype=torch.float64, device=masks.device)
-        components = self.mean_displacement(rows.expand(B, -1))[:, :, None]  # (B, R, 1, A)
-        right, down = columns - components[..., 0], rows[:, None] - components[..., 1]
-        if self.turns:  # the inverse of the displacement field
-            middle = [0.5 * (W - 1), 0.5 * (R - 1)]
-            right, down, roll = right - middle[0], down - middle[1], components[..., 2]
-            scale = 1.0 + components[..., 3] if components.shape[-1] > 3 else torch.ones_like(roll)
-            size = scale.square() + roll.square()
-            right, down = (scale * right + roll * down) / size, (scale * down - roll * right) / size
-            right, down = right + middle[0], down + middle[1]
+        # the inverse of the displacement field, about the middle of the image
+        x, y, roll, zoom = self.mean_displacement(rows.expand(B, -1))[:, :, None].unbind(-1)  # (B, R, 1)
+        middle_x, middle_y, scale = 0.5 * (W - 1), 0.5 * (R - 1), 1.0 + zoom
+        right, down = columns - x - middle_x, rows[:, None] - y - middle_y
+        size = scale.square() + roll.square()
+        right, down = (scale * right + roll * down) / size + middle_x, (scale * down - roll * right) / size + middle_y
         source_rows, source_columns = (
-            mirrored(down.round().to(torch.int64), R),
-            mirrored(right.round().to(torch.int64), W),
+            mirrored(place.round().to(torch.int64), length) for place, length in ((down, R), (right, W))
         )
-        index = source_rows * W + source_columns
-        index = index.flatten(1)[:, None].expand(-1, masks.shape[1], -1)
+        index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, masks.shape[1], -1)
         return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
 
     def move_boxes(self, boxes: Tensor) -> Tensor:

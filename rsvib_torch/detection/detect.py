@@ -203,6 +203,5 @@ class VibrationDetector(TimedModule):
 
     def forward(self, frames: FramesOrFiles) -> DetectionResult:
         """Detect the vibration in a stack of frames."""
-        self.check_stacks(frames)
         result: DetectionResult = detect_vibration(frames, self.timing, **vars(self.options))
         return result

@@ -126,21 +126,6 @@ class TimedModule(nn.Module):
                 stated.append(f"{name}={value!r}")
         return ", ".join(stated)
 
-    def check_stacks(self, frames: FramesOrFiles) -> None:
-        """Refuse tensors (B, T, H, W): batches without a channel axis are not stacks (T, C, H, W).
-
-        Raises:
-            ValueError: If frames have 2 or more than 4 channels and the option ``channels`` does not state them.
-        """
-        if isinstance(frames, Tensor) and frames.ndim == 4 and self.options.channels is None:
-            count, channels = frames.shape[:2]
-            if channels not in (1, 3, 4) and frames.shape[-1] > 4:
-                raise ValueError(
-                    f"frames of shape {tuple(frames.shape)} are read as {count} frames of {channels} channels, "
-                    f"(T, C, H, W): pass frames[:, :, None] if they are {count} grey stacks of {channels} frames, or "
-                    f'make the module with channels="first" if they have {channels} channels'
-                )
-
 
 def entry_point(options: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None) -> Any:
     """A function with flat options, outside of compiled graphs; arguments as of ``flat_options``."""

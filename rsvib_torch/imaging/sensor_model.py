@@ -1,10 +1,11 @@
 """Optics in front of a sensor as a transfer function, and the noise and fixed pattern of the sensor."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Annotated
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
@@ -48,7 +49,8 @@ class Optics(OpticsOptions):
             s = (squared.sqrt() / self.cutoff).clamp(max=1.0)
             transfer = transfer * (2 / math.pi) * (s.arccos() - s * (1 - s.square()).sqrt())
         if self.mtf is not None:
-            transfer = transfer * _interpolated(squared.sqrt(), *_checked_mtf(self.mtf))
+            rho = squared.sqrt().detach().cpu().numpy()
+            transfer = transfer * torch.as_tensor(np.interp(rho, *_checked_mtf(self.mtf), right=0.0)).to(transfer)
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
     def apply(self, scene: Tensor) -> Tensor:
@@ -113,16 +115,6 @@ def _checked_mtf(mtf: object) -> tuple[tuple[float, ...], tuple[float, ...]]:
         if high <= low:
             raise ValueError(f"the frequencies of mtf must increase, but {high:g} follows {low:g} cycles/px")
     return tuple(frequencies), tuple(values)
-
-
-def _interpolated(place: Tensor, places: Sequence[float], values: Sequence[float]) -> Tensor:
-    """Linear interpolation; 0 beyond the last place."""
-    known, level = place.new_tensor([*places, places[-1]]), place.new_tensor([*values, 0.0])
-    index = torch.searchsorted(known[:-1], place.contiguous(), right=True).clamp(max=len(places))
-    low, high = known[index - 1], known[index]
-    share = torch.where(high > low, (place - low) / (high - low).clamp(min=1e-30), 0.0)
-    inside = level[index - 1] + share * (level[index] - level[index - 1])
-    return torch.where(place <= known[-1], inside, 0.0)
 
 
 @options

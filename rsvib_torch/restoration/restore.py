@@ -257,5 +257,4 @@ class VibrationRestorer(TimedModule):
         self, frames: FramesOrFiles, vibration: Motion | DetectedVibration, ignore: ArrayLike | None = None
     ) -> Tensor:
         """Restore a stack of frames."""
-        self.check_stacks(frames)
         return restore(frames, self.timing, vibration, ignore=ignore, **vars(self.options))

@@ -104,18 +104,3 @@ def test_pairs_with_a_frame_without_data_are_not_judged():
     verdict = judge_restoration(frames, found, camera(), MOTION.vibration())
     assert verdict.outcome == ("helps", "unknown")
     assert verdict.findings[1] == (Reason("pixels_missing", None, 1.0, 0.5),)
-
-
-def test_stacks_of_a_batch_are_independent():
-    frames = noisy_frames(2, rows=100)[None, :, None]
-    weak, strong = Vibration([0.2, 0.1], [50.0, 30.0]), Vibration([40.0, 1.0], [50.0, 30.0])
-    for other, most in ((weak, 2e-4), (strong, 5e-3)):  # one period of the rows, the largest
-        both = Vibration(
-            *(
-                torch.stack([getattr(v, name) for v in (MOTION.vibration(), other)])
-                for name in ("amplitude", "frequency", "phase")
-            )
-        )
-        together = quietly(torch.cat([frames, frames.flip(-1)]), camera(100), both)
-        alone = quietly(frames[0, :, 0], camera(100), MOTION.vibration())
-        torch.testing.assert_close(together[0, :, 0], alone, rtol=0, atol=most)

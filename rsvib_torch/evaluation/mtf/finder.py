@@ -4,8 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
+import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
@@ -75,7 +76,7 @@ def find_slanted_edges(
 ) -> list[SlantedEdge]:
     """Find ROIs for ``slanted_edge_mtf``: straight edges, 2 ... 30 degrees off an axis, between even sides.
 
-    Ridges of the gradient are fitted by lines; around each line, the widest ROI is used that contains only the edge
+    Around each line segment in the image, the widest ROI is used that contains only the edge
     and even sides.
 
     Args:
@@ -111,7 +112,7 @@ def find_slanted_edges(
     edges = []
     for near_vertical in (True, False):
         turned = values if near_vertical else values.mT
-        for line, rows in _lines(turned, least, min_length, max_length):
+        for line, rows in _lines(turned, (float(low), float(high)), min_length, max_length):
             edge = _roi_around(turned, line, rows, near_vertical, least)
             if edge is not None:
                 edges.append(edge)
@@ -123,76 +124,28 @@ def find_slanted_edges(
     return kept
 
 
-def _gradients(values: Tensor, blur: float) -> tuple[Tensor, Tensor]:
-    """Derivatives (right, down) of the image after a Gaussian filter of ``blur`` px."""
-    reach = math.ceil(4 * blur)
-    offset = torch.arange(-reach, reach + 1, dtype=values.dtype, device=values.device)
-    smooth = torch.exp(-0.5 * (offset / blur).square())
-    smooth = smooth / smooth.sum()
-    slope = offset * smooth
-    slope = slope / (slope * offset).sum()
-    padded = torch.nn.functional.pad(values[None, None], (reach,) * 4, mode="replicate")
-    right, down = (
-        torch.nn.functional.conv2d(torch.nn.functional.conv2d(padded, x[None, None, None]), y[None, None, :, None])[
-            0, 0
-        ]
-        for x, y in ((slope, smooth), (smooth, slope))
-    )
-    return right, down
-
-
 def _lines(
-    values: Tensor, least: float, min_length: int, max_length: int, blur: float = 1.2
+    values: Tensor, limits: tuple[float, float], min_length: int, max_length: int, ends: int = 5
 ) -> list[tuple[tuple[float, float], range]]:
-    """Near-vertical lines, ``column = a + b row``, along ridges of the gradient, with the rows that they span."""
-    right, down = _gradients(values, blur)
-    slope = (down.abs() / right.abs().clamp(min=1e-300)).atan().rad2deg()
-    size = right.abs()
-    ridge = torch.zeros_like(size, dtype=torch.bool)
-    ridge[:, 1:-1] = (size[:, 1:-1] > size[:, :-2]) & (size[:, 1:-1] >= size[:, 2:])
-    # a step as blurred as its gradient's peak allows: half of it still counts, for noise and blur
-    ridge &= (size > 0.3 * least / (blur * 2.5)) & (slope < 40)
-    lines = []
-    for sign in (1, -1):
-        labels, count = ndimage.label((ridge & (sign * right > 0)).cpu().numpy(), structure=[[1, 1, 1]] * 3)
-        for label, window in enumerate(ndimage.find_objects(labels, count), start=1):
-            if window[0].stop - window[0].start < min_length:
-                continue
-            rows, columns = (labels[window] == label).nonzero()
-            rows, columns = rows + window[0].start, columns + window[1].start
-            lines.extend(_split(right, torch.from_numpy(rows), torch.from_numpy(columns), min_length, max_length))
-    return lines
+    """Near-vertical lines, ``column = a + b row``, along edges, with the rows that they span.
 
-
-def _split(
-    right: Tensor, rows: Tensor, columns: Tensor, min_length: int, max_length: int, ends: int = 5
-) -> list[tuple[tuple[float, float], range]]:
-    """Fit a line to the pixels of a ridge; bent ridges are split at their farthest point.
-
-    ``ends`` px are removed at either end, because of corners.
+    The detector (von Gioi et al. 2010) has the image in 8 bits between ``limits``. ``ends`` px are removed at either
+    end, because of corners.
     """
-    if len(rows) < 0.8 * min_length or int(rows[-1] - rows[0]) + 1 < min_length:
-        return []
-    rows, columns = rows.to(right.device), columns.to(right.device)
-    before, at, after = (right[rows, columns + shift].abs() for shift in (-1, 0, 1))
-    place = columns + 0.5 * (after - before) / (2 * at - before - after).clamp(min=1e-12 * float(at.max()))
-    y = rows.to(right.dtype)
-    design = torch.stack([torch.ones_like(y), y], dim=1)
-    line = torch.linalg.lstsq(design, place[:, None]).solution[:, 0]
-    apart = (place - design @ line).abs()
-    if float(apart.square().mean().sqrt()) > 0.7:  # px: not straight
-        # usually a corner: split at the pixel farthest from the chord between the ends
-        chord = place[0] + (place[-1] - place[0]) * (y - y[0]) / (y[-1] - y[0])
-        cut = int((place - chord).abs().argmax())
-        parts = [slice(None, max(cut - 2, 0)), slice(cut + 3, None)]
-        return [piece for part in parts for piece in _split(right, rows[part], columns[part], min_length, max_length)]
-    angle = abs(float(line[1].atan().rad2deg()))
-    begin, end = int(rows[0]) + ends, int(rows[-1]) + 1 - ends
-    surplus = max(end - begin - max_length, 0) // 2
-    begin, end = begin + surplus, end - surplus
-    if end - begin < max(min_length - 2 * ends, 16) or not 2.0 <= angle <= 30.0:
-        return []
-    return [((float(line[0]), float(line[1])), range(begin, end))]
+    low, high = limits
+    counts = ((values - low) * (255 / (high - low))).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
+    segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE).detect(np.ascontiguousarray(counts))[0]
+    lines = []
+    for x, y, end_x, end_y in () if segments is None else segments.reshape(-1, 4).astype(float).tolist():
+        if abs(end_y - y) < max(min_length - 2, 1):
+            continue
+        slope = (end_x - x) / (end_y - y)
+        begin, end = math.ceil(min(y, end_y)) + ends, math.floor(max(y, end_y)) + 1 - ends
+        surplus = max(end - begin - max_length, 0) // 2
+        begin, end = begin + surplus, end - surplus
+        if end - begin >= max(min_length - 2 * ends, 16) and 2.0 <= math.degrees(math.atan(abs(slope))) <= 30.0:
+            lines.append(((x - slope * y, slope), range(begin, end)))
+    return lines
 
 
 def _roi_around(
