@@ -25,6 +25,7 @@ import rsvib_torch as rsv
 
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
 RESULTS = Path(__file__).parent / "attacks" / "results.json"
+sys.path.append(str(PAGE.parents[1] / "tests"))  # attacks share cases with the tests
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,16 @@ ATTACKS: dict[str, Attack] = {
     "inputs": Attack("outputs that are or contain inputs", 250),
     "concurrent": Attack("several runs with one output", 45),
     "disks": Attack("full and read-only disks", 69),
-    "live_sessions": Attack("recordings of a camera", 32),
+    "live_sessions": Attack("recordings of a camera", 204),
     "memory": Attack("`--memory` in different layouts", 17),
     "crafted": Attack("crafted files", 200),
     "workers": Attack("killed and missing Dask workers", 9),
     "api": Attack("hostile arguments of Python functions", 4000),
     "mutated": Attack("randomly damaged files", 2400),
+    "readers": Attack("damaged files of motion and gyroscopes", 300),
+    "buffers": Attack("buffers of the caller, written to later", 100),
+    "spans": Attack("frames over long time spans", 50),
+    "images": Attack("frames that do not determine a motion", 200),
 }
 
 

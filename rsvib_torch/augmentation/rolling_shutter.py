@@ -20,6 +20,7 @@ from rsvib_torch.core.arrays import channels_appear_last
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
 from rsvib_torch.core.precision import full_precision
 from rsvib_torch.core.splines import gauss_legendre, mirrored
+from rsvib_torch.core.text import quoted
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
@@ -180,7 +181,7 @@ def _axis_ranges(
     pairs = value if any(isinstance(part, Sequence) for part in value) else (value, value)
     if len(pairs) != 2 or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
         raise TypeError(
-            f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {value!r}"
+            f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {quoted(value)}"
         )
     x, y = (tuple(check_number(name, number, at_least=at_least) for number in pair) for pair in pairs)  # type: ignore[union-attr]
     for low, high in (x, y):
@@ -269,7 +270,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         turns = []
         for name, of_turn in (("roll", roll), ("zoom", zoom)):
             if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
-                raise TypeError(f"{name} must be a number or (low, high), got {of_turn!r}")
+                raise TypeError(f"{name} must be a number or (low, high), got {quoted(of_turn)}")
             turns.append((0.0, 0.0) if of_turn is None else _axis_ranges(name, of_turn, at_least=0.0)[0])
         turns = turns if zoom is not None else turns[:1] if roll is not None else []
         frequencies, phases = _axis_ranges("frequency", frequency, at_least=0.0), _axis_ranges("phase", phase)

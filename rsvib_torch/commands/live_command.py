@@ -102,11 +102,12 @@ def live_session(given: LiveOptions) -> Answer:
     """
     settings = given.settings_for(None if given.file is None else Path(given.source), given.frame_range)
     _check_options(given)
-    files = [] if given.written is None else [given.written]
+    files, saved = [] if given.written is None else [given.written], []
     if given.spectrogram is not None:
-        files += [given.spectrogram.with_name(given.spectrogram.name + ending) for ending in (".png", ".zarr")]
-    check_new(files, given.overwrite, [*([] if given.file is None else io.stack_files(given.file)), settings.path])
-    for path in files:
+        saved = [given.spectrogram.with_name(given.spectrogram.name + ending) for ending in (".png", ".zarr")]
+    inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
+    check_new([*files, *saved], given.overwrite, inputs)
+    for path in [*files, *saved]:
         check_writable(path)
     method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
     restoration = {
@@ -122,6 +123,12 @@ def live_session(given: LiveOptions) -> Answer:
         spectrogram = None
         if given.spectrogram is not None:
             spectrogram = live.Spectrogram(settings.timing, max_frequency=given.max_frequency)
+
+        def save() -> None:
+            if spectrogram is not None and given.spectrogram is not None:
+                check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
+                live.save_spectrogram(given.spectrogram, spectrogram)
+
         tracker = tracking.VibrationTracker(
             settings.timing,
             **restoration | given.tracker | {"method": method},
@@ -140,14 +147,13 @@ def live_session(given: LiveOptions) -> Answer:
             max_frames=given.num_frames,
             spectrogram=spectrogram,
             progress=_StateText(shown[0]) if shown else None,
+            save=save,
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
-    if spectrogram is not None and given.spectrogram is not None:
-        live.save_spectrogram(given.spectrogram, spectrogram)
     if report.dropped or report.lost:
         error_line(_missing(report), "warning")
-    return _answer(given.source, report, files, drops=drops)
+    return _answer(given.source, report, [*files, *saved], drops=drops)
 
 
 def _source(given: LiveOptions, settings: Config) -> FrameSource:

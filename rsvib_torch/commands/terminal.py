@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.text import Text
 
 from rsvib_torch.core.progress import listening
-from rsvib_torch.core.text import json_text, printable, wrapped
+from rsvib_torch.core.text import json_text, printable, shortened, wrapped
 
 
 @dataclass
@@ -111,15 +111,17 @@ def show_answer(command: str, answer: Answer) -> None:
 
 def note(message: str) -> None:
     """Print a sentence with the answer of the running command: what a file states, or what it does not contain."""
-    _outputs[-1].notes.append(printable(message))
+    _outputs[-1].notes.append(printable(shortened(message)))
 
 
 def error_line(message: str, kind: str = "error") -> None:
-    """Print a message to standard error, with the prefix ``rsvib: error:``; control codes are escaped.
+    """Print a message to standard error, with the prefix ``rsvib: error:``.
 
+    Control codes are escaped, and long texts are shortened.
     Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
     end of a terminal, the command continues.
     """
+    message = shortened(message)
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)

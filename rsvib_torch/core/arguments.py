@@ -32,6 +32,7 @@ from pydantic_core import core_schema
 from torch import Tensor
 
 from rsvib_torch.core.checks import MAX_NUMBER, described
+from rsvib_torch.core.text import one_line, quoted
 from rsvib_torch.core.validation import Number, members_of, validated, without_alias
 
 P = ParamSpec("P")
@@ -212,8 +213,8 @@ def check_device(name: str, value: object) -> torch.device:
         device = torch.device(value)
         torch.empty(0, device=device, dtype=torch.float32)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).partition("\n")[0]
-        raise ValueError(f"{name}={str(value)!r} is not available: {reason}; use 'cpu'") from error
+        reason = one_line(str(error).partition("\n")[0], 200)
+        raise ValueError(f"{name}={quoted(str(value))} is not available: {reason}; use 'cpu'") from error
     return device
 
 

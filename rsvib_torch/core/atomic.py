@@ -4,6 +4,7 @@ import errno
 import fcntl
 import glob
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -89,9 +90,22 @@ def _locked(folder: Path, *, wait: bool = False) -> Iterator[int]:
         os.close(file)
 
 
+def error_of_full_disk(error: Exception) -> int | None:
+    """Number of the error of the system if a disk is full, or a file larger than permitted; otherwise None."""
+    stated = re.search(r"errno = (\d+)", str(error))  # in a text of HDF5
+    number = int(stated[1]) if stated else getattr(error, "errno", None)
+    if "requested and" in str(error):  # NumPy does not state why an array is cut off
+        number = errno.ENOSPC
+    return number if number in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) else None
+
+
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder on the file system of ``path``; those that killed processes left for it are removed."""
+    """A temporary folder on the file system of ``path``; those that killed processes left for it are removed.
+
+    Raises:
+        OSError: With the name of ``path``, if the disk is full.
+    """
     parent = nearest_folder(path)
     remove_abandoned(path)
     with ExitStack() as opened:
@@ -104,7 +118,13 @@ def temporary_folder(path: Path) -> Iterator[Path]:
             with suppress(OSError):  # file systems without locks
                 opened.enter_context(_locked(folder, wait=True))
         opened.callback(shutil.rmtree, folder, ignore_errors=True)
-        yield folder
+        try:
+            yield folder
+        except (OSError, RuntimeError) as error:
+            number = error_of_full_disk(error)
+            if number is None:
+                raise
+            raise OSError(number, os.strerror(number), str(path)) from error
 
 
 def check_not_special(path: str | os.PathLike[str]) -> None:

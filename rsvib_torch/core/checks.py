@@ -5,6 +5,8 @@ from importlib import import_module
 from numbers import Real
 from typing import Any
 
+from rsvib_torch.core.text import quoted
+
 # Largest magnitude of numbers and pixels of public functions: squares of float32 are finite up to 1.8e19, and sums of
 # squares over an image of 1e8 px up to 1.8e15. No quantity in px, s or Hz reaches it.
 MAX_NUMBER = 1e15
@@ -23,8 +25,7 @@ def described(value: object) -> str:
     if shape is not None and dtype is not None:
         return f"{type(value).__name__} of shape {tuple(shape)} and {dtype}"
     if isinstance(value, (bool, float, complex, str, bytes)):
-        shown = value[:60] if isinstance(value, (str, bytes)) else value
-        return f"{shown!r} ({type(value).__name__})"
+        return f"{quoted(value)} ({type(value).__name__})"
     if isinstance(value, int):
         return f"{value} (int)" if abs(value) < 10**30 else "a very large int"
     if isinstance(value, (list, tuple)) and len(value) < 10 and all(isinstance(item, (int, float)) for item in value):

@@ -10,7 +10,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.text import one_line
+from rsvib_torch.core.text import one_line, quoted
 
 MAX_SAMPLES = 10**7  # rows of a table of numbers; 80 minutes of a gyroscope with 2 kHz
 _MAX_LINE = 2**16  # characters of a line; a line without end is not read as a whole
@@ -42,7 +42,7 @@ def rows_of_numbers(
     """
     repeated = next((header[column] for column in columns if header.count(header[column]) > 1), None)
     if repeated is not None:
-        raise ValueError(f"{path}: column {one_line(repr(repeated), 60)} occurs twice; rename one of them")
+        raise ValueError(f"{path}: column {quoted(repeated)} occurs twice; rename one of them")
     values = array("d")
     limit = MAX_SAMPLES * len(columns)
     reader = csv.reader(lines, skipinitialspace=True)
@@ -61,8 +61,8 @@ def rows_of_numbers(
             except ValueError:
                 value = math.nan
             if not math.isfinite(value):
-                name, shown = one_line(header[column], 60), one_line(repr(text), 60)
-                raise ValueError(f"{path}, line {number}: {name} must be a number, got {shown}")
+                name = one_line(header[column], 60)
+                raise ValueError(f"{path}, line {number}: {name} must be a number, got {quoted(text)}")
             values.append(value)
         if len(values) > limit:
             raise ValueError(f"{path}: more than {MAX_SAMPLES:,} samples; cut the recording to the time of the frames")

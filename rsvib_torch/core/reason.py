@@ -12,6 +12,8 @@ from functools import partial
 from string import Formatter
 from typing import Any
 
+from rsvib_torch.core.text import quoted
+
 
 @dataclass(frozen=True)
 class ReasonKind:
@@ -62,11 +64,13 @@ class Reason:
 
     def __post_init__(self) -> None:
         if self.code not in REASONS:
-            raise ValueError(f"code must be one of {', '.join(REASONS)}, got {self.code!r}")
+            raise ValueError(f"code must be one of {', '.join(REASONS)}, got {quoted(self.code)}")
         try:
             str(self)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"value, limit or details of the reason {self.code!r} do not fit its text") from error
+            raise ValueError(
+                f"value, limit or details of the reason {quoted(self.code)} do not fit its text"
+            ) from error
 
     @property
     def kind(self) -> ReasonKind:
@@ -140,7 +144,7 @@ def read_findings(values: Any) -> Any:
     if isinstance(values, Mapping):
         return Reason.from_dict(values)
     if not isinstance(values, (list, tuple)):
-        raise ValueError(f"findings: expected a list of reasons, got {values!r}")
+        raise ValueError(f"findings: expected a list of reasons, got {quoted(values)}")
     return tuple(map(read_findings, values))
 
 

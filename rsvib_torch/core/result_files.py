@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.reason import read_findings
+from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def load_result(kind: type[Any], path: Path) -> Any:
     if data.get("format") != kind.file_format or data.get("version") != 1:
         raise ValueError(
             f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "
-            f"{data.get('format')!r} of version {data.get('version')!r}"
+            f"{quoted(data.get('format'))} of version {quoted(data.get('version'))}"
         )
     try:
         return decode(kind, data, "")
@@ -58,22 +59,22 @@ def decode(kind: Any, value: Any, path: str, missing: float = math.nan) -> Any:
     origin, parts = get_origin(kind), get_args(kind)
     if origin is dict:
         if not isinstance(value, dict):
-            raise ValueError(f"{path}: expected a table, got {value!r}")
+            raise ValueError(f"{path}: expected a table, got {quoted(value)}")
         return {key: decode(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
     if origin is tuple and is_dataclass(parts[0]):
         if not isinstance(value, list):
-            raise ValueError(f"{path}: expected a list of tables, got {value!r}")
+            raise ValueError(f"{path}: expected a list of tables, got {quoted(value)}")
         return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
     if origin is Literal and value not in parts:
-        raise ValueError(f"{path}: expected {' or '.join(map(repr, parts))}, got {value!r}")
+        raise ValueError(f"{path}: expected {' or '.join(map(repr, parts))}, got {quoted(value)}")
     if kind in (float, int, str, bool) and not isinstance(value, (float, int) if kind is float else kind):
-        raise ValueError(f"{path}: expected {kind.__name__}, got {value!r}")
+        raise ValueError(f"{path}: expected {kind.__name__}, got {quoted(value)}")
     return value if kind is Any else _tuples(value)
 
 
 def _dataclass(kind: type[Any], value: Any, path: str) -> Any:
     if not isinstance(value, dict):
-        raise ValueError(f"{path}: expected a table, got {value!r}")
+        raise ValueError(f"{path}: expected a table, got {quoted(value)}")
     # SensorTiming does not import torch, whose Tensor its annotations name
     hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
     missing = getattr(kind, "_MISSING", math.nan)

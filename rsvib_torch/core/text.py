@@ -82,15 +82,34 @@ def measured_text(
     return text if hidden is None or not float(hidden) > 1.1 * deviation else f"{text} (± {float(hidden):#.2g})"
 
 
-def one_line(message: object, most: int = 400) -> str:
-    """A message in one line of at most ``most`` characters: it may contain what a damaged file contains.
+def shortened(text: str, most: int = 1000) -> str:
+    """A text without its middle if it is longer than ``most`` characters: it may repeat an option, or what a file has.
 
     Example:
-        >>> one_line(" two  words "), one_line("a" * 100, 8)
-        ('two words', 'aaaaaaa…')
+        >>> shortened("a" * 100 + "b", 8)
+        'aaaaaa…ab'
     """
-    line = " ".join(str(message).split())
-    return line if len(line) <= most else f"{line[: most - 1]}…"
+    return text if len(text) <= most else f"{text[: most - most // 4]}…{text[-(most // 4) :]}"
+
+
+def one_line(message: object, most: int = 400) -> str:
+    """A message in one line of about ``most`` characters.
+
+    Example:
+        >>> one_line(" two  words ")
+        'two words'
+    """
+    return shortened(" ".join(str(message).split()), most)
+
+
+def quoted(value: object) -> str:
+    """A value of the user in a message: as in Python, in at most 200 characters.
+
+    Example:
+        >>> quoted("a"), quoted([1.5]), len(quoted("a" * 10**6))
+        ("'a'", '[1.5]', 201)
+    """
+    return one_line(repr(value), 200)
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:

@@ -19,6 +19,7 @@ from pydantic_core import PydanticCustomError, core_schema
 
 from rsvib_torch.core.checks import MAX_NUMBER, described
 from rsvib_torch.core.reading import read_text
+from rsvib_torch.core.text import one_line, quoted
 
 _Group = TypeVar("_Group")
 _Result = TypeVar("_Result")
@@ -188,7 +189,7 @@ class _Mistake:
     def in_python(self) -> Exception:
         """The exception."""
         if self.known:
-            return TypeError(f"unknown option {self.path!r}; the options are {', '.join(self.known)}")
+            return TypeError(f"unknown option {quoted(self.path)}; the options are {', '.join(self.known)}")
         if self.choices:
             names = ", ".join(map(repr, self.choices))
             return ValueError(f"{self.path} must be one of {names}; got {described(self.value)}")
@@ -197,10 +198,10 @@ class _Mistake:
 
     def in_file(self, source: str) -> str:
         """The line about a file."""
-        place = f"{source}: {self.path}" if self.path else source
+        place = f"{source}: {one_line(self.path, 200)}" if self.path else source
         if self.known:
             return f"{place}: unknown key; expected one of {', '.join(self.known)}"
-        return f"{place}: {self.text or f'expected {self.expected}, got {self.value!r}'}"
+        return f"{place}: {self.text or f'expected {self.expected}, got {quoted(self.value)}'}"
 
 
 def _mistakes(model: Any, data: Any, error: ValidationError) -> Iterable[_Mistake]:

@@ -136,8 +136,8 @@ def entry_point(options: Any, function: Callable[..., Any], build: Callable[...,
             return function(*args, **kwargs)
         except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             raise ValueError(
-                f"{function.__name__}: the frames do not determine the motion: they show too little detail, or objects "
-                "that move by themselves; use other frames"
+                f"{function.__name__}: the frames do not determine the motion: they show too little detail, objects "
+                "that move by themselves, or are far apart in time; use other frames"
             ) from error
         except RuntimeError as error:
             if torch._C._functorch.peek_interpreter_stack() is None:  # no transform of torch.func

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rsvib_torch.core.reading import check_regular
+from rsvib_torch.core.text import quoted
 from rsvib_torch.io.stack_format import StackFormat
 
 
@@ -137,5 +138,5 @@ def target_format(path: Path) -> StackFormat:
         return FORMATS[path.suffix.lower()]
     known = ", ".join(ending for ending in FORMATS if ending)
     raise ValueError(
-        f"{path}: unknown file ending {path.suffix!r}; expected {known} or a folder of PNG, TIFF or JPEG files"
+        f"{path}: unknown file ending {quoted(path.suffix)}; expected {known} or a folder of PNG, TIFF or JPEG files"
     )

@@ -4,6 +4,7 @@ Pillow reads headers and metadata and verifies PNG files; OpenCV decodes them: P
 """
 
 import io
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from rsvib_torch.io.time_metadata import exif_fields
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
 _LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032
 _CHANNELS = {"1": 1, "L": 1, "I;16": 1, "P": 3, "RGB": 3, "LA": 4, "RGBA": 4}  # of a decoded PNG file, by mode
+_LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and previews have 64 KB each, colour profiles 3 MB
 _PNG_HEADER = 8 + 25  # bytes of the signature and the chunk with the size
 
 
@@ -29,8 +31,12 @@ def image_info(path: Path) -> StackInfo:
     """The stack of one frame in a PNG or JPEG file."""
     is_png = path.suffix.lower() == ".png"
     with readable_stack(path, "PNG" if is_png else "JPEG"), path.open("rb") as file:
-        image = PngImageFile(file) if is_png else JpegImageFile(file)
+        head = io.BytesIO(file.read(_LONGEST_HEADER))  # Pillow would search a file of any size for it, at 20 MB/s
+        image = PngImageFile(head) if is_png else JpegImageFile(head)
         info = _png_info(path, image) if is_png else _jpeg_info(image)
+        file_size = file.seek(0, io.SEEK_END)
+        if file_size > 4 * np.dtype(info.dtype).itemsize * math.prod(info.shape) + _LONGEST_HEADER:
+            raise ValueError(f"{file_size} bytes are too many for {image.width} x {image.height} px")
         return replace(info, **exif_fields(image.info.get("exif", b"")))
 
 

@@ -35,7 +35,9 @@ def open_npy(path: Path) -> BlockReader:
             return reader
         reader.close()
         # all frames together: the pixels of a frame lie everywhere in the file
-        return BlockReader(path, info, lambda *_: np.load(path).reshape(shape), shape[0], info.frame_bytes)
+        return BlockReader(
+            path, info, lambda *_: np.load(path, allow_pickle=False).reshape(shape), shape[0], info.frame_bytes
+        )
 
 
 def write_npy(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:

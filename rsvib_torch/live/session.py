@@ -6,8 +6,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,7 @@ def run_live(
     max_frames: int | None = None,
     spectrogram: Spectrogram | None = None,
     progress: Callable[[TrackedFrame, LiveReport], None] | None = None,
+    save: Callable[[], object] | None = None,
 ) -> LiveReport:
     """Track the frames of a source, and write the restored ones, until the source ends or a signal arrives.
 
@@ -92,6 +94,7 @@ def run_live(
         max_frames: Number of frames to process; None for all.
         spectrogram: Collects the offsets.
         progress: Called for every tracked frame.
+        save: Called when all frames are written, also after an error; no signal ends the process before it returns.
 
     Returns:
         The report.
@@ -107,8 +110,10 @@ def run_live(
     with ExitStack() as ending:  # frames before an error of the source are not lost
         ending.callback(torch.set_num_threads, threads)
         ending.enter_context(_signals_call(reader.stop))
+        ending.push(partial(_save, save, report))
         ending.callback(reader.close)
         ending.callback(writer.finish)
+        reader.start()
         for tracked, arrived in _tracked(reader, tracker, report, drops, max_frames):
             if spectrogram is not None:
                 spectrogram.add(tracked)
@@ -119,6 +124,13 @@ def run_live(
     report.dropped, report.lost = reader.dropped, source.lost
     report.seconds = time.perf_counter() - begin
     return report
+
+
+def _save(save: Callable[[], object] | None, report: LiveReport, _: Any, error: BaseException | None, *__: Any) -> None:
+    """Save what belongs to the written frames; after an error of the session, errors of ``save`` are not shown."""
+    if save is not None and report.frames > 0:
+        with suppress(*[] if error is None else [Exception]):
+            save()
 
 
 @contextmanager

@@ -232,6 +232,9 @@ class FrameReader:
         self.dropped = 0
         self.stopped_at: float | None = None
         self._thread = threading.Thread(target=self._read, name="rsvib-read", daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
         self._thread.start()
 
     def _read(self) -> None:

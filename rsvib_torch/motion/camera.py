@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import check_broadcast, checked_methods
 from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.text import quoted
 
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees
 
@@ -64,7 +65,7 @@ class Camera:
         for name, count in (("principal_point", 2), ("distortion", 5)):
             values = getattr(self, name)
             if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != count:
-                raise ValueError(f"{name} must be {count} numbers, got {values!r}")
+                raise ValueError(f"{name} must be {count} numbers, got {quoted(values)}")
             for value in values:
                 check_number(name, value, at_least=-1e6, at_most=1e6)
             object.__setattr__(self, name, tuple(float(value) for value in values))
@@ -193,7 +194,7 @@ class Camera:
         """
         check_whole_number("axes", axes, at_least=2, at_most=4)
         u, v = self.rays(x, y)
-        x, y = torch.broadcast_tensors(x, y)
+        x, y = torch.broadcast_tensors(x.to(u), y.to(u))
         f = self.focal_length
         rotation = torch.stack(
             [torch.stack([1 + u * u, u * v, -f * v], -1), torch.stack([u * v, 1 + v * v, f * u], -1)], -2

@@ -10,7 +10,7 @@ from functools import cache
 from importlib.resources import files
 
 from rsvib_torch.core.checks import check_number, check_whole_number, described
-from rsvib_torch.core.text import measured_text, number_of, one_line
+from rsvib_torch.core.text import measured_text, number_of, quoted
 from rsvib_torch.motion.timing import SensorTiming
 
 # Ratio of heights; of pairs of modes in the table with equal aspect and rate, 21 of 24 up to this ratio have the same
@@ -155,7 +155,7 @@ def _unknown(name: str, modes: Iterable[CameraMode]) -> ValueError:
     near = difflib.get_close_matches(_letters(name), names, n=4)
     similar = dict.fromkeys([f"{mode.brand} {mode.model}" for mode in modes] or [names[key] for key in near])
     listed = ", ".join([*similar][:4]) or "none (rsvib cameras lists all)"
-    return ValueError(f"no camera {one_line(repr(name), 60)} in the table of readout times; similar: {listed}")
+    return ValueError(f"no camera {quoted(name)} in the table of readout times; similar: {listed}")
 
 
 def camera_mode(name: str, *, width: int, height: int, frame_rate: float) -> CameraMode:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.number_table import MAX_SAMPLES
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import text_table
@@ -127,6 +128,7 @@ class AngularRates(
         """
         from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
+        reference = check_number("reference", reference)
         steps = Rotation.from_rotvec(self.rotation(self.times[:-1], self.times[1:]).cpu().numpy())
         turned = _running_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps.as_quat()]))
         nearest = int((self.times - reference).abs().argmin())

@@ -206,6 +206,7 @@ class Vibration(
         sizes = [check_whole_number("batch_shape", size, at_least=1, at_most=MAX_BATCH) for size in batch_shape]
         if math.prod(sizes) > MAX_BATCH:
             raise ValueError(f"batch_shape must have at most {MAX_BATCH} motions, got {tuple(sizes)}")
+        check_whole_number("axes", axes, at_least=2, at_most=4)
         zeros = torch.zeros(*sizes, axes, 1, dtype=torch.float64, device=device)
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0], zeros[..., 0])
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.presentation import Result, plain_values
+from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -79,8 +80,8 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
     data = read_json(path, "vibration.json")
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
-            f"{path}: not a vibration.json, but a file of the format {data.get('format')!r}; give the vibration.json, "
-            "or the manifest.json of windows, that rsvib detect or run wrote"
+            f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
+            "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
         )
     result = DetectionResult.load(path)
     if result.batch_shape:

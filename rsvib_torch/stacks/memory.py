@@ -8,6 +8,7 @@ import numpy as np
 import psutil
 
 from rsvib_torch.core.free_memory import check_fits, free_memory, size_text
+from rsvib_torch.core.text import quoted
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.restoration.exact.priors import PRIORS
 
@@ -33,7 +34,7 @@ def parse_memory(text: str | float) -> int:
         number, prefix, binary = match.groups()
         size = int(float(number) * (1024 if binary else 1000) ** (" KMGT".index(prefix) if prefix else 0))
     if size <= 0:
-        raise ValueError(f"memory must be like '2GB' or '500MB', got {text!r}")
+        raise ValueError(f"memory must be like '2GB' or '500MB', got {quoted(text)}")
     return size
 
 

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rsvib_torch.core.atomic import PART, make_folder, nearest_folder, sync
+from rsvib_torch.core.atomic import PART, error_of_full_disk, make_folder, nearest_folder, sync
 from rsvib_torch.core.free_memory import size_text
 from rsvib_torch.core.text import one_line
 
@@ -306,9 +306,11 @@ def disk_errors_named(folder: RunFolder) -> Iterator[None]:
     """Add the name of the output and the number of finished windows to errors of the disk."""
     try:
         yield
-    except OSError as error:
+    except (OSError, RuntimeError) as error:
+        number = error_of_full_disk(error) or getattr(error, "errno", None)
+        if number is None and not isinstance(error, OSError):
+            raise
         kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
-        # the words of the system: libraries add long descriptions; NumPy does not state why an array is cut off
-        number = errno.ENOSPC if "requested and" in str(error) else error.errno
+        # the words of the system: libraries add long descriptions
         reason = os.strerror(number) if number else " ".join(str(error).split())
         raise OSError(number, f"{reason}{kept}", str(folder.sink)) from error

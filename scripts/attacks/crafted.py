@@ -552,13 +552,6 @@ def _read(path: Path) -> None:
         rsv.detect_vibration(frames[:3, ..., :256, :256], TIMING, method="bands", tones=1)
 
 
-def _unclear(text: str) -> str:
-    lines = text.splitlines()
-    if len(lines) > 25 or max(map(len, lines), default=0) > 5000:
-        return f"message of {len(lines)} lines, {len(text)} characters"
-    return ""
-
-
 def attempt(folder: Path, item: Item | None) -> Trial:
     """Read one crafted file."""
     if item is None:
@@ -570,7 +563,7 @@ def attempt(folder: Path, item: Item | None) -> Trial:
         _read(path)
         return ""
 
-    return tried(name, work, _unclear)
+    return tried(name, work)
 
 
 def crafted(names: Sequence[str], folder: Path) -> Iterator[Trial]:

@@ -29,10 +29,10 @@ def vibrating_counts(timing: rsv.SensorTiming, count: int, size: tuple[int, int]
     scene = 0.5 + 0.2 * torch.nn.functional.avg_pool2d(texture, 3, 1, 1)[0, 0]
     vibration = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
     counts = np.empty((count, *size), np.uint16)
+    starts = timing.frame_starts(count).tolist()
     for first in range(0, count, _AT_ONCE):
-        starts = [number * timing.frame_period for number in range(first, min(first + _AT_ONCE, count))]
-        part = replace(timing, frame_start_times=starts)
-        frames = rsv.simulate_frames(scene, part, vibration, len(starts), frame_size=size)
+        part = replace(timing, frame_start_times=starts[first : first + _AT_ONCE])
+        frames = rsv.simulate_frames(scene, part, vibration, min(_AT_ONCE, count - first), frame_size=size)
         frames += 0.002 * torch.randn(frames.shape, generator=generator)
         counts[first : first + _AT_ONCE] = (FULL_SCALE * frames).round().clamp(0, FULL_SCALE).numpy()
     return counts

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -28,7 +28,7 @@ _SIZE, _RATE = 128, 30  # px, frames/s
 _RECORDED = (12, 40)  # frames in the file, after which a session is ended
 _WAITING = 4  # frames that may be missing at the end of a recording: those in queues, and an incomplete one
 _LIMIT = 120.0  # s for the start of a session, which takes 4 s on an idle machine, and for its end without a signal
-_LONGEST_END = 20.0  # s from a signal to the end, which takes 1 to 3 s on an idle machine
+_LONGEST_END = 20.0  # s from a signal to the end, which takes 1 to 3 s on an idle machine; at most 10 s are waited
 _CAMERA = ("--row-time", "200us", "--exposure", "0.8ms", "--frame-rate", str(_RATE))
 
 
@@ -47,8 +47,8 @@ class _Camera(ThreadingHTTPServer):
     """
 
     def __init__(self, frames: int, *, disappears: bool = True) -> None:
-        pictures = np.random.default_rng(0).integers(0, 256, (8, _SIZE, _SIZE), np.uint8)
-        self.parts = [cv2.imencode(".jpg", cv2.blur(one, (5, 5)))[1].tobytes() for one in pictures]
+        scene = cv2.blur(np.random.default_rng(0).integers(0, 256, (_SIZE, _SIZE), np.uint8), (5, 5))
+        self.parts = [cv2.imencode(".jpg", np.roll(scene, (n // 3, n), (0, 1)))[1].tobytes() for n in range(8)]
         self.frames, self.disappears = frames, disappears
         self.viewers, self.begin, self.end = threading.Semaphore(0), threading.Event(), threading.Event()
         super().__init__(("127.0.0.1", 0), _Stream)
@@ -116,6 +116,7 @@ class _Session:
     out: Path
     printed: Path
     reader: int = -1
+    begin: float = field(default_factory=time.monotonic)
 
     def recorded(self, least: int) -> int:
         """Wait until the recording has a number of frames; returns their number, which is less after an early end."""
@@ -139,9 +140,19 @@ class _Session:
         """Close the other end of the pipe or terminal."""
         os.close(self.reader)
 
-    def ended(self, limit: float = _LIMIT) -> Process:
-        """Wait for the end of the process; it is killed after the limit."""
+    def save_while_signals_arrive(self) -> None:
+        """Send SIGTERM until the spectrogram is saved, which must not be interrupted."""
+        end = time.monotonic() + _LIMIT
+        while self.child.poll() is None and not self.out.with_suffix(".zarr").exists() and time.monotonic() < end:
+            self.send(signal.SIGTERM)
+
+    def ended(self, limit: float | None = None) -> Process:
+        """Wait for the end of the process; it is killed after the limit.
+
+        Without a limit it is ``_LONGEST_END``, or three times the duration up to now if the machine is slow.
+        """
         begin = time.perf_counter()
+        limit = limit or max(_LONGEST_END, 3.0 * (time.monotonic() - self.begin))
         try:
             code: int | None = self.child.wait(limit)
         except subprocess.TimeoutExpired:
@@ -151,10 +162,10 @@ class _Session:
         return Process(code, self.printed.read_text(errors="replace"), time.perf_counter() - begin, 0)
 
 
-def _start(url: str, out: Path, output: str = "file") -> _Session:
+def _start(url: str, out: Path, output: str = "file", *options: str | Path) -> _Session:
     """Start a session that records to ``out``; its output is a ``file``, a ``pipe``, or a ``terminal``."""
     printed = out.with_name(f"{len(list(out.parent.iterdir()))}.txt")
-    command = rsvib("live", url, *_CAMERA, "--out", out)
+    command = rsvib("live", url, *_CAMERA, "--out", out, *options)
     reader, writer = os.pipe() if output == "pipe" else pty.openpty() if output == "terminal" else (-1, -1)
     with printed.open("wb") as file:
         if output == "terminal":
@@ -191,22 +202,25 @@ class _Ending:
         expected: Its outcome.
         message: Part of what it prints; {out} is the recording.
         output: See ``_start``.
+        spectrogram: Whether one is saved.
     """
 
     act: Callable[[_Session], None]
     expected: Outcome = "completed"
     message: str = ""
     output: str = "file"
+    spectrogram: bool = False
 
     def __call__(self, name: str, out: Path, frames: int) -> Trial:
         """A trial."""
         with _camera(begins=True) as camera:
-            session = _start(camera.url, out, self.output)
+            options = ("--spectrogram", out.with_suffix("")) if self.spectrogram else ()
+            session = _start(camera.url, out, self.output, *options)
             count = session.recorded(frames)
             if session.child.poll() is None:
                 self.act(session)
             message = self.message.format(out=out)
-            process = session.ended(_LONGEST_END)
+            process = session.ended()
             return _judged(name, session, process, least=max(count, frames), expected=self.expected, message=message)
 
 
@@ -227,7 +241,7 @@ def _killed(name: str, out: Path, frames: int) -> Trial:
         session.child.kill()
         session.child.wait()
         again = _start(camera.url, out)
-        process = again.ended()
+        process = again.ended(_LIMIT)
         return _judged(name, again, process, least=max(count, frames), expected="refused", message=out.name)
 
 
@@ -238,7 +252,7 @@ def _camera_ends(name: str, out: Path, frames: int, *, disappears: bool) -> Tria
         if not disappears:
             session.recorded(least)
             session.send(signal.SIGTERM)
-        process = session.ended(_LIMIT if disappears else _LONGEST_END)
+        process = session.ended(_LIMIT if disappears else None)
         return _judged(name, session, process, least=least, expected="completed")
 
 
@@ -249,7 +263,7 @@ def _before_the_first_frame(name: str, out: Path, frames: int) -> Trial:
         camera.viewers.acquire(timeout=_LIMIT)
         time.sleep(0.5)
         session.send(signal.SIGINT)
-        process = session.ended(_LONGEST_END)
+        process = session.ended()
         return _judged(name, session, process, least=0, expected="refused", message="no frame was read")
 
 
@@ -260,7 +274,7 @@ def _created_during_the_session(name: str, out: Path, frames: int) -> Trial:
         camera.viewers.acquire(timeout=_LIMIT)
         out.write_bytes(b"of another program")
         camera.begin.set()
-        process = session.ended(_LONGEST_END)
+        process = session.ended()
         if out.read_bytes() != b"of another program":
             return Trial(name, "lost", "the file was replaced")
         return _judged(name, session, process, least=0, expected="refused", message=str(out))
@@ -280,7 +294,7 @@ def _same_name(name: str, out: Path, frames: int) -> Trial:
         count = max((session.recorded(frames) for session in recording), default=0)
         for session in recording:
             session.send(signal.SIGTERM)
-        outcomes = [outcome_of_command(session.ended(_LONGEST_END)) for session in sessions]
+        outcomes = [outcome_of_command(session.ended()) for session in sessions]
         if len(recording) != 1 or sorted(outcomes) != ["completed", "refused"]:
             return Trial(name, "lost", f"{len(recording)} sessions record to one file: {outcomes}")
         process = recording[0].ended()
@@ -304,7 +318,7 @@ def _pipe(name: str, out: Path, frames: int, *, reader_ends: bool) -> Trial:
     else:
         time.sleep(1.0)  # the pipe is full: it holds four frames
         session.send(signal.SIGTERM)
-    process = session.ended(2 * _LONGEST_END)  # it waits 10 s for the reader
+    process = session.ended()
     child.stdin.close()
     child.stdout.close()
     return _judged(name, session, process, least=0, expected="completed")
@@ -317,6 +331,9 @@ _WAYS: dict[str, Callable[[str, Path, int], Trial]] = {
     "answer into a closed pipe": _Ending(_without_reader, "refused", "the answer cannot be written", "pipe"),
     "SIGINT before the first frame": _before_the_first_frame,
     "two sessions with one name": _same_name,
+    "SIGTERM while the spectrogram is saved": _Ending(
+        _Session.save_while_signals_arrive, message="recorded.zarr", spectrogram=True
+    ),
     "SIGINT": _Ending(_signals(signal.SIGINT)),
     "SIGHUP": _Ending(_signals(signal.SIGHUP)),
     "SIGINT twice": _Ending(_signals(signal.SIGINT, signal.SIGINT)),
@@ -334,6 +351,9 @@ _WAYS: dict[str, Callable[[str, Path, int], Trial]] = {
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """All ways in turn, with .mkv and .mp4; the number of frames before the end is random."""
     choice = random.Random(seed)
+    for ignored in (signal.SIGINT, signal.SIGHUP):  # by nohup, or in the background of a script; sessions inherit it
+        if signal.getsignal(ignored) is signal.SIG_IGN:
+            signal.signal(ignored, signal.SIG_DFL)
     for number in range(count):
         way, ending = list(_WAYS)[number % len(_WAYS)], (".mkv", ".mp4")[number // len(_WAYS) % 2]
         frames, place = choice.randint(*_RECORDED), folder / "trial"

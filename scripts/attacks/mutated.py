@@ -4,7 +4,7 @@ import contextlib
 import io
 import random
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from attacks.files import (
 )
 from attacks.trial import Trial
 from attacks.warm import in_warm_child, tried
+from gpmf_file import mp4, packets_of
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -141,6 +142,8 @@ ORIGINALS = {
     "camera.toml": Original("camera.toml", read_config, text=True),
     "motion.csv": Original("motion.csv", lambda path: str(rsv.read_motion(path, unit="px")), text=True),
     "clip.gcsv": Original("clip.gcsv", lambda path: str(rsv.read_gyroscope(path)), text=True),
+    "rates.csv": Original("rates.csv", lambda path: str(rsv.read_gyroscope(path, unit="rad/s")), text=True),
+    "clip.mp4": Original("clip.mp4", lambda path: str(rsv.read_gyroscope(path))),
     "out.npy.manifest.json": Original("out.npy.manifest.json", _read_manifest, text=True),
     "vibration.json": Original("vibration.json", lambda path: str(read_vibration(path, TIMING)), text=True),
     "detection.json": Original("detection.json", lambda path: str(rsv.DetectionResult.load(path)), text=True),
@@ -184,6 +187,8 @@ def write_originals(folder: Path) -> dict[str, bytes]:
     (folder / "motion.csv").write_text("\n".join(["time,x,y", *lines]))
     head = ["GYROFLOW IMU LOG", "version,1.3", "orientation,YxZ", "tscale,1", "gscale,1", "t,gx,gy,gz"]
     (folder / "clip.gcsv").write_text("\n".join([*head, *(f"{line},0" for line in lines)]))
+    (folder / "rates.csv").write_text("\n".join(["time,gx,gy,gz", *(f"{line},0" for line in lines)]))
+    mp4(folder / "clip.mp4", packets_of())
     return {name: (folder / name).read_bytes() for name in ORIGINALS}
 
 
@@ -271,13 +276,14 @@ def attempt(folder: Path, item: Item | None) -> Trial:
         path.write_bytes(contents[name])
 
 
-def trials(folder: Path, count: int, seed: int, run_every: int = 12) -> Iterator[Trial]:
+def trials(
+    folder: Path, count: int, seed: int, run_every: int = 12, names: Sequence[str] = tuple(ORIGINALS)
+) -> Iterator[Trial]:
     """Damaged files in turn; the program is run on every twelfth stack, the other files are read."""
-    names = list(ORIGINALS)
     stacks = [name for name, original in ORIGINALS.items() if original.read is _read_stack]
     items = []
     for index in range(count):
-        runs = index % run_every == 0
+        runs = bool(run_every) and index % run_every == 0
         chosen = stacks[index // run_every % len(stacks)] if runs else names[index % len(names)]
         items.append((1_000_003 * seed + index, chosen, runs))
     yield from in_warm_child(attempt, items, _name, folder / "files", limit=SECONDS, memory=MEMORY)

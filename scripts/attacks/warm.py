@@ -22,18 +22,27 @@ __all__ = ["in_warm_child", "tried"]
 Attempt = Callable[[Path, Any], Trial]
 
 
-def tried(name: str, work: Callable[[], str], unclear: Callable[[str], str]) -> Trial:
+def _unclear(text: str) -> str:
+    """What is wrong with the form of a message; empty if nothing is."""
+    lines = text.splitlines()
+    if len(lines) not in range(1, 26) or len(max(lines, key=len)) > 1200:  # a path has 40 characters here
+        return f"message of {len(lines)} lines, {len(text)} characters: {text}"
+    return ""
+
+
+def tried(name: str, work: Callable[[], str], unclear: Callable[[str], str] = lambda _: "") -> Trial:
     """Trial of a call of Python.
 
     Args:
         name: Name of the trial.
         work: The call; it returns what is wrong with the result, an empty text if nothing is.
-        unclear: What is wrong with the message of a ``ValueError``, ``TypeError`` or ``OSError``; empty if nothing is.
+        unclear: What else is wrong with the message of a ``ValueError``, ``TypeError`` or ``OSError``.
     """
     try:
         wrong = work()
     except (ValueError, TypeError, OSError) as error:
-        fault = unclear(str(error))
+        text = str(getattr(error, "strerror", None) or error)  # the system repeats names that are too long
+        fault = _unclear(text) or unclear(str(error))
         return Trial(name, "wrong" if fault else "refused", (fault or str(error))[:300])
     except MemoryError as error:
         return Trial(name, "memory", str(error)[:300])

@@ -125,7 +125,9 @@ def test_names_of_files_are_escaped_and_kept(raw, camera, capsysbinary):
         assert printable(lines, lines=True) == lines
     assert printable(name) in text.decode().splitlines()[0]
     assert run_command(["detect", f"{name}.tif", "--out", "found", "--json", *camera]) == 0
-    answer = json.loads(capsysbinary.readouterr().out)
+    printed = capsysbinary.readouterr().out
+    assert printed.isascii()
+    answer = json.loads(printed)
     assert answer["open_first"] == "found/offsets.png"
     assert all(printable(step, lines=True) == step for step in answer["next_steps"])
     assert run_command(["detect", f"{name}.missing.tif", "--out", "other", *camera]) == 2

@@ -2,15 +2,12 @@
 
 import itertools
 import math
-import struct
 
 import numpy as np
 import pytest
+from gpmf_file import RATES, TIMES, box, mp4, packet, packets_of
 
 import rsvib_torch as rsv
-
-TIMES = np.arange(60) / 200.0
-RATES = np.round(np.stack([0.5 * np.sin(20 * TIMES), -0.3 * np.cos(9 * TIMES), 0.1 + 0.4 * TIMES], -1), 3)
 
 
 def lines_of(times, rates):
@@ -59,68 +56,6 @@ def test_csv(tmp_path, names, factor, options):
     found = rsv.read_gyroscope(path, **options)
     assert np.allclose(found.times.numpy(), TIMES, atol=1e-9)
     assert np.allclose(found.rates.numpy(), RATES, atol=1e-8)
-
-
-# GoPro: a writer of boxes and entries that shares nothing with the reader
-
-
-def box(kind, *contents):
-    content = b"".join(contents)
-    return struct.pack(">I", 8 + len(content)) + kind + content
-
-
-def entry(key, kind, size, count, content):
-    return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
-
-
-def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None):
-    accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
-    if first is not None:
-        accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
-    parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
-    if stamp is not None:
-        parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
-    parts.append(entry(b"SCAL", b"s", 2, 1, struct.pack(">h", scale)))
-    if orientation:
-        parts.append(entry(b"ORIN", b"c", 1, 3, orientation))
-    raw = np.round(np.asarray(rates) * scale).astype(">i2").tobytes()
-    parts.append(entry(b"GYRO", b"s", 6, len(rates), raw))
-    other = entry(b"STRM", b"\0", 1, len(accelerations), accelerations)
-    own = b"".join(parts)
-    content = entry(b"DVID", b"L", 4, 1, b"\0\0\0\1") + other + entry(b"STRM", b"\0", 1, len(own), own)
-    return entry(b"DEVC", b"\0", 1, len(content), content)
-
-
-def mp4(path, packets, *, duration=300, timescale=1000, kind=b"gpmd", count=None, offsets=None):
-    """A video whose only track has the packets, each in a chunk of its own."""
-    start = box(b"ftyp", b"mp41", b"\0\0\0\0")
-    places, place = [], len(start) + 8
-    for data in packets:
-        places.append(place)
-        place += len(data)
-    number = len(packets) if count is None else count
-    table = box(
-        b"stbl",
-        box(b"stsd", struct.pack(">II", 0, 1), struct.pack(">I4s", 16, kind), b"\0" * 8),
-        box(b"stts", struct.pack(">IIII", 0, 1, number, duration)),
-        box(b"stsc", struct.pack(">IIIII", 0, 1, 1, 1, 1)),
-        box(b"stsz", struct.pack(">III", 0, 0, number), *(struct.pack(">I", len(data)) for data in packets)),
-        box(b"stco", struct.pack(">II", 0, len(packets)), *(struct.pack(">I", at) for at in offsets or places)),
-    )
-    header = box(b"mdhd", struct.pack(">IIIII", 0, 0, 0, timescale, 0), b"\0" * 4)
-    track = box(b"trak", box(b"mdia", header, box(b"minf", table)))
-    path.write_bytes(start + box(b"mdat", *packets) + box(b"moov", box(b"mvhd", b"\0" * 20), track))
-    return path
-
-
-def packets_of(size=20, **options):
-    """Packets of the rates, at 200 Hz; ``stamp`` and ``first`` are times of it and of another sensor."""
-    parts = []
-    for number, at in enumerate(range(0, len(RATES), size)):
-        own = {name: value(number) for name, value in options.items() if callable(value)}
-        rest = {name: value for name, value in options.items() if not callable(value)}
-        parts.append(packet(RATES[at : at + size], total=at + size, **own, **rest))
-    return parts
 
 
 def test_gopro_video(tmp_path):

@@ -1,15 +1,18 @@
 """Files that would exhaust time or memory are refused in a moment, with one line."""
 
 import os
+import resource
 
 import h5py
 import numpy as np
 import psutil
 import pytest
+import torch
 import zarr
 from time_limit import at_most
 
 import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
 from rsvib_torch.config import read_config
 from rsvib_torch.io import read_stack, read_stack_info
 
@@ -110,3 +113,48 @@ def test_video_frames_that_do_not_fit(tmp_path, monkeypatch):
     set_free(monkeypatch, 10**5)
     with pytest.raises(ValueError, match=r"not a readable video stack: .* 64 x 64 px need 197 KB of memory"):
         read_stack_info(tmp_path / "a.mkv")
+
+
+def test_a_full_disk_is_named_with_the_output(tmp_path):
+    vibration, before = rsv.Vibration(1.0, 50.0), resource.getrlimit(resource.RLIMIT_FSIZE)
+    frames = torch.rand(4, 64, 64, generator=torch.Generator().manual_seed(0))
+    info = rsv.StackInfo((4, 64, 64), "uint8", 255.0, frame_rate=30.0)
+    writers = {
+        "maps": lambda path: rsv.write_stmap(path, vibration, TIMING, size=(64, 64), num_frames=1),
+        "a.mkv": lambda path: rsv.write_stack(path, frames, dtype="uint8", like=info),
+        "a.json": lambda path: rsv.write_gcsv(
+            path, vibration.with_camera(rsv.Camera(900.0)), TIMING, size=(64, 64), num_frames=9
+        ),
+    }
+    for name in ("a.h5", "a.tif", "a.npy", "a.raw", "a.zarr"):
+        writers[name] = lambda path: rsv.write_stack(path, frames)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))
+    try:
+        for name, write in writers.items():
+            with pytest.raises(OSError, match=f"(File too large|No space left on device): '{tmp_path / name}'$"):
+                write(tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "start"), [("a.jpg", b"\xff\xd8\xff\xe0"), ("a.png", _PNG), ("b.png", _PNG + b"\x40\0\0\0tEXt")]
+)
+def test_sparse_images(tmp_path, name, start):
+    """Pillow searches a file of any size for its header, at 20 MB/s."""
+    (tmp_path / name).write_bytes(start)
+    os.truncate(tmp_path / name, 6 << 30)
+    with pytest.raises(ValueError, match=f"{name}: not a readable (JPEG|PNG) stack"):
+        read_stack_info(tmp_path / name)
+
+
+@pytest.mark.parametrize("option", ["--row-time", "--camera", "--frames", "--vibration"])
+def test_messages_do_not_repeat_long_options(tmp_path, capsys, option):
+    (tmp_path / "a.toml").write_text(f"[sensor]\n{'key' * 10**5} = [{'1, ' * 10**5}]\nrow_time = '{'1' * 10**5}'\n")
+    assert run_command(["init", str(tmp_path / "a.tif"), option, "1" * 10**5]) == 2
+    assert run_command(["detect", "a.tif", "--out", str(tmp_path / "b"), "--config", str(tmp_path / "a.toml")]) == 2
+    assert all(len(line) < 1100 for line in capsys.readouterr().err.splitlines())

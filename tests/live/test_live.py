@@ -63,6 +63,7 @@ def values(reader):
 
 def test_the_oldest_waiting_frames_are_dropped_and_counted():
     reader = FrameReader(source := Numbers(), waiting=8)
+    reader.start()
     time.sleep(0.2)
     assert values(reader) == list(range(42, 50))
     assert reader.dropped == 42
@@ -72,6 +73,7 @@ def test_the_oldest_waiting_frames_are_dropped_and_counted():
 
 def test_a_source_that_may_wait_loses_no_frame():
     reader = FrameReader(Numbers(), waiting=8, drops=False)
+    reader.start()
     time.sleep(0.1)
     assert values(reader) == list(range(50))
     assert reader.dropped == 0
@@ -79,6 +81,7 @@ def test_a_source_that_may_wait_loses_no_frame():
 
 def test_an_error_of_the_source_arrives_behind_its_frames():
     reader = FrameReader(Numbers(3, error=OSError("unplugged")), drops=False)
+    reader.start()
     with pytest.raises(OSError, match="unplugged"):
         values(reader)
 
@@ -290,8 +293,14 @@ def test_signals_end_a_session(tmp_path, number):
             signal.raise_signal(number)
             signal.raise_signal(number)  # a second one does not end the process
 
-    report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end)
-    assert report.frames == len(rsv.read_stack(tmp_path / "video.mkv")) == 6
+    saved = []
+
+    def save():
+        signal.raise_signal(number)
+        saved.append(rsv.read_stack(tmp_path / "video.mkv"))
+
+    report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
+    assert report.frames == len(saved[0]) == 6
     assert signal.getsignal(number) == before
 
 

@@ -133,6 +133,12 @@ def test_text_of_the_user_is_escaped(page):
     assert "method = <exact>" in text
 
 
+def test_the_page_needs_no_network(page):
+    loaded = [dict(attributes).get("src", "") for _, attributes in page[2].tags]
+    loaded += [dict(attributes).get("href", "") for tag, attributes in page[2].tags if tag == "link"]
+    assert not any("//" in address for address in loaded if not address.startswith("data:"))
+
+
 def test_page_has_all_sections(page):
     text = "".join(page[2].text)
     assert text.index("restoration improves the frames") < text.index("Input and restored frame")

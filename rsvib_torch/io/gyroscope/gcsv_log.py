@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.number_table import rows_of_numbers, text_lines
-from rsvib_torch.core.text import one_line
+from rsvib_torch.core.text import one_line, quoted
 from rsvib_torch.io.gyroscope.rates_table import angular_rates
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
@@ -37,8 +37,9 @@ def check_orientation(text: str) -> str:
         ValueError: orientation must have x, y and z once each, a small letter for a negative axis, got 'YxY'
     """
     if sorted(text.lower()) != ["x", "y", "z"]:
-        shown = one_line(repr(text), 40)
-        raise ValueError(f"orientation must have x, y and z once each, a small letter for a negative axis, got {shown}")
+        raise ValueError(
+            f"orientation must have x, y and z once each, a small letter for a negative axis, got {quoted(text)}"
+        )
     return text
 
 
@@ -99,5 +100,4 @@ def _scale(path: Path, header: dict[str, str], name: str) -> float:
     except KeyError:
         raise ValueError(f"{path}: the header has no {name}") from None
     except ValueError:
-        shown = one_line(repr(header[name]), 60)
-        raise ValueError(f"{path}: {name} must be a positive number, got {shown}") from None
+        raise ValueError(f"{path}: {name} must be a positive number, got {quoted(header[name])}") from None

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.number_table import rows_of_numbers, text_lines
-from rsvib_torch.core.text import one_line
+from rsvib_torch.core.text import one_line, quoted
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import SECONDS
 
@@ -57,7 +57,7 @@ def _columns(path: Path, names: list[str], time_unit: str | None, unit: str | No
             quantity = "time" if kind == "time" else match["axis"]
             if quantity in found:
                 raise ValueError(
-                    f"{path}: columns {one_line(repr(names[found[quantity]]), 60)} and {one_line(repr(name), 60)} "
+                    f"{path}: columns {quoted(names[found[quantity]])} and {quoted(name)} "
                     f"could both be {quantity}; rename one of them"
                 )
             found[quantity] = column

@@ -32,6 +32,7 @@ from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import Positive, read_json
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_at
@@ -294,7 +295,7 @@ class _Camera:
     def _table(self, *names: str) -> dict[str, Any]:
         value = self._value(names)
         if not isinstance(value, Mapping):
-            raise ValueError(f"{self.source}: {'.'.join(names)}: expected a table, got {value!r}")
+            raise ValueError(f"{self.source}: {'.'.join(names)}: expected a table, got {quoted(value)}")
         return dict(value)
 
     def _number(self, *names: str, whole: bool = False) -> float:
@@ -306,7 +307,7 @@ class _Camera:
     def _numbers(self, name: str, count: int) -> list[float]:
         value = self._value((name,))
         if not isinstance(value, list) or len(value) != count:
-            raise ValueError(f"{self.source}: {name}: expected {count} numbers, got {value!r}")
+            raise ValueError(f"{self.source}: {name}: expected {count} numbers, got {quoted(value)}")
         return [check_number(f"{self.source}: {name}", number) for number in value]
 
     def state(self, name: str, values: str, count: int) -> Array:
@@ -333,8 +334,8 @@ class _Camera:
         count = {"radial": 3, "radtan": 5}.get(self.lens)
         if count is None or not isinstance(self.distortion, list) or len(self.distortion) != count:
             raise ValueError(
-                f"{self.source}: optical_distortion {self.lens!r} is not supported for a line scanner, only radial "
-                "with three and radtan with five coefficients; model='frame' keeps it as it is"
+                f"{self.source}: optical_distortion {quoted(self.lens)} is not supported for a line scanner, only "
+                "radial with three and radtan with five coefficients; model='frame' keeps it as it is"
             )
         if not any(self.distortion):
             return plane

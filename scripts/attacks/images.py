@@ -1,0 +1,88 @@
+"""Frames that hardly determine a motion end in a result or in a one-line error.
+
+Of ``detect_vibration``, a reliable axis must also have the right motion, unless the frames are without noise, as none
+of a sensor are.
+"""
+
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import torch
+from attacks.files import TIMING
+from attacks.trial import Trial
+from attacks.warm import in_warm_child, tried
+from torch import Tensor
+
+import rsvib_torch as rsv
+
+__all__ = ["attempt", "trials"]
+
+_FUNCTIONS = (rsv.detect_vibration, rsv.detect_motion, rsv.detect_swept_tone)
+_SIZE = 128  # px
+# images of rows y, columns x and a random number n, which move by a few px per frame
+_IMAGES: dict[str, Callable[[Tensor, Tensor, int], Tensor]] = {
+    "constant": lambda y, x, n: 0 * (y + x) + n % 10 / 10,
+    "pixel": lambda y, x, n: (y == n % 128) & (x == n // 7 % 128),
+    "line of pixels": lambda y, x, n: (y == 20 + n % 88) & (x >= 0),
+    "checkerboard": lambda y, x, n: (y // (2 + n % 9) + x // (2 + n % 9)) % 2,
+    "stripes": lambda y, x, n: ((n % 7 - 3) * y + (1 + n % 5) * x) // 5 % 2,
+    "ramp": lambda y, x, n: (y + n % 5 * x) / 1000,
+    "step": lambda y, x, n: (x > 64) + 0 * y,
+    "circle": lambda y, x, n: (y - 64) ** 2 + (x - 64) ** 2 < (5 + n % 40) ** 2,
+    "waves": lambda y, x, n: 0.5 + 0.4 * torch.sin(0.1 * (1 + n % 25) * y) * torch.sin(0.2 * x),
+    "noise": lambda y, x, n: torch.rand(_SIZE, _SIZE),
+    "rows of noise": lambda y, x, n: torch.rand(_SIZE, 1).expand(_SIZE, _SIZE),
+    "columns of noise": lambda y, x, n: torch.rand(_SIZE).expand(_SIZE, _SIZE),
+}
+_NOISELESS = ", without noise"
+_OF_CHANCE = ("noise", "rows of noise", "columns of noise")  # other ones in every frame
+_CHANGES: dict[str, Callable[[Tensor], Tensor]] = {
+    "": lambda frames: frames + 1e-4 * torch.randn(frames.shape),
+    _NOISELESS: lambda frames: frames,
+    ", x 1e-30": lambda frames: (frames + 1e-4 * torch.randn(frames.shape)) * 1e-30,
+    ", x 1e12": lambda frames: (frames + 1e-4 * torch.randn(frames.shape)) * 1e12,
+    ", alternating brightness": lambda frames: (
+        frames * torch.tensor([1.0, 0.01, 1.0, 0.01])[:, None, None] + 1e-4 * torch.randn(frames.shape)
+    ),
+    ", dark": lambda frames: frames * 0.0,
+}
+
+
+def _name(item: int) -> str:
+    choice = random.Random(item)
+    kind, change = list(_IMAGES)[item % len(_IMAGES)], choice.choice(list(_CHANGES))
+    return f"{choice.choice(_FUNCTIONS).__name__}, {kind}{change}, seed {item}"
+
+
+def attempt(folder: Path, item: int | None) -> Trial:
+    """Four frames and one function."""
+    if item is None:
+        return Trial("", "completed")
+    choice = random.Random(item)
+    kind = list(_IMAGES)[item % len(_IMAGES)]
+    change, function = choice.choice(list(_CHANGES)), choice.choice(_FUNCTIONS)
+    torch.manual_seed(item)
+    number, dy, dx = choice.randrange(1000), choice.randint(-3, 3), choice.randint(-3, 3)
+    rows, columns = torch.arange(_SIZE)[:, None], torch.arange(_SIZE)
+    frames = torch.stack([_IMAGES[kind](rows - i * dy, columns - i * dx, number).float() for i in range(4)])
+    timing = rsv.SensorTiming(TIMING.row_time, TIMING.exposure_rows, 140)
+
+    def work() -> str:
+        found = function(_CHANGES[change](frames), timing)
+        if not found.reliable.any() or function is not rsv.detect_vibration or change == _NOISELESS:
+            return ""
+        times = timing.frame_starts(4)[:, None] + timing.row_time * torch.arange(_SIZE)
+        error = found.vibration.displacement(times) - torch.tensor([dx, dy]) * times[..., None] / timing.frame_period
+        error = (error - error.mean((0, 1))).square().mean((0, 1)).sqrt()
+        allowed = 0.3 + 0.3 * torch.tensor([dx, dy]).abs()  # px; whole frames move, and not rows
+        is_wrong = kind in _OF_CHANCE or (error > allowed)[found.reliable].any()
+        return f"reliable {found.reliable.tolist()}, error {error.tolist()} px" if is_wrong else ""
+
+    return tried(_name(item), work)
+
+
+def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+    """The images in turn; motion, change and function are random."""
+    items = range(seed * 10**6, seed * 10**6 + count)
+    yield from in_warm_child(attempt, items, _name, folder, limit=60.0, memory=10**9)
