@@ -21,7 +21,7 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
 Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
 
-_MIN_MEASURED = 0.5  # of the visible rows or bands
+MIN_MEASURED = 0.5  # of the visible rows or bands
 MAX_DISPLACEMENT_STD = 0.25  # of the displacement of the rows
 _MAX_WITHIN_ROW_TIME = 0.1  # px; condition (24) of the paper
 _MIN_MOTION = 0.05  # px between frames; offsets of bands have errors of this size
@@ -145,10 +145,10 @@ def _reasons_against_stack(stack: dict[str, Any], timing: RowTiming, max_tones: 
 
 def _measurement_reasons(stack: dict[str, Any]) -> list[Reason]:
     """Reasons from the fraction of the visible rows or bands that were measured."""
-    if stack["measured"] >= _MIN_MEASURED:
+    if stack["measured"] >= MIN_MEASURED:
         return []
     what = f"{stack['bands']:g} row bands" if "bands" in stack else "the rows"
-    return [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
+    return [Reason("rows_not_registered", None, stack["measured"], MIN_MEASURED, {"what": what})]
 
 
 def _tone_reasons(axis: str, numbers: dict[str, Any], tone: int, num_tones: int, timing: RowTiming) -> list[Reason]:

@@ -56,7 +56,7 @@ from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions, TrackerOptions
 from rsvib_torch.registration.gradients import RowGradients
-from rsvib_torch.registration.register import fits_frame
+from rsvib_torch.registration.register import MIN_CORRELATION, fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.tracking.tone_filter import ToneFilter
@@ -78,7 +78,6 @@ _BANDS = RegistrationOptions()
 _DIRECT_ATTEMPTS = 2  # consecutive attempts; after them only bands are tried
 _FEW_ROWS = 256  # rows of a frame; smaller frames have few bands, and every attempt uses the direct method as well
 _MIN_VALID = 0.1  # of the pixels of each frame, to detect the vibration; as in detect_vibration
-_MIN_CORRELATION = 0.3  # of the typical band with the next frame; bands of independent noise reach 0.1
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
 _PATIENCE = 3  # consecutive frames that contradict the tones, before the state is "searching"
 
@@ -410,7 +409,7 @@ class VibrationTracker:
         for method, number in _STARTS[:1] if only_bands else _STARTS:
             found = attempt(stacks, timing, DetectionOptions(method, number, model, _BANDS), hypothesis)
             quality = found.fitted.offsets.quality
-            other_scene = method == "bands" and float(quality.median()) < _MIN_CORRELATION
+            other_scene = method == "bands" and float(quality.median()) < MIN_CORRELATION
             if other_scene or found.statuses[0] == "not visible":
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.

@@ -1,7 +1,7 @@
 """Frames that hardly determine a motion end in a result or in a one-line error.
 
-Of ``detect_vibration``, a reliable axis must also have the right motion, unless the frames are without noise, as none
-of a sensor are.
+No axis of independent noise may be reliable. Of ``detect_vibration``, a reliable axis must also have the right motion,
+unless the frames are without noise, as none of a sensor are.
 """
 
 import random
@@ -70,13 +70,17 @@ def attempt(folder: Path, item: int | None) -> Trial:
 
     def work() -> str:
         found = function(_CHANGES[change](frames), timing)
-        if not found.reliable.any() or function is not rsv.detect_vibration or change == _NOISELESS:
+        if not found.reliable.any():
+            return ""
+        if kind in _OF_CHANCE:
+            return f"noise is reliable: {found.reliable.tolist()}"
+        if function is not rsv.detect_vibration or change == _NOISELESS:
             return ""
         times = timing.frame_starts(4)[:, None] + timing.row_time * torch.arange(_SIZE)
         error = found.vibration.displacement(times) - torch.tensor([dx, dy]) * times[..., None] / timing.frame_period
         error = (error - error.mean((0, 1))).square().mean((0, 1)).sqrt()
         allowed = 0.3 + 0.3 * torch.tensor([dx, dy]).abs()  # px; whole frames move, and not rows
-        is_wrong = kind in _OF_CHANCE or (error > allowed)[found.reliable].any()
+        is_wrong = (error > allowed)[found.reliable].any()
         return f"reliable {found.reliable.tolist()}, error {error.tolist()} px" if is_wrong else ""
 
     return tried(_name(item), work)

@@ -232,7 +232,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
     uncertain = torch.stack([_rms_std(_relative(measured, _columns(times, fits[i])), covariances[i]) for i in range(2)])
     moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
-    against = bands_reasons(banded, motion)
+    against = bands_reasons(curve, banded, motion)
     chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
     for axis, error in enumerate(band_errors(banded, motion)):
         if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
