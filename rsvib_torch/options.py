@@ -478,12 +478,18 @@ class TrackerOptions(RestorationOptions, InputOptions):
 
 @options
 class WindowSize:
-    """Length of the windows that a stack is cut into."""
+    """The windows that a stack is cut into."""
 
     window: Frames = Field(
         default=8,
         json_schema_extra=COMMAND_LINE,
         description="Largest number of frames in which one vibration is detected.",
+    )
+    follow: bool = Field(
+        default=False,
+        json_schema_extra=COMMAND_LINE,
+        description="Follow a vibration that changes, e.g. decays, from frame to frame, instead of detecting a steady "
+        "one in each window. The result of a window is the vibration at its middle frame.",
     )
 
 
@@ -521,7 +527,9 @@ class ResourceOptions:
 class StackDetectionOptions(WindowSize, ResourceOptions):
     """Detection in windows."""
 
-    detection: OptionTable = Field(default=None, description="Options of ``detect_vibration``.")
+    detection: OptionTable = Field(
+        default=None, description="Options of ``detect_vibration``; none with ``follow=True``."
+    )
 
 
 @options
@@ -531,7 +539,7 @@ class StackOptions(StackDetectionOptions):
     restoration: OptionTable = Field(
         default=None,
         description="Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window "
-        "becomes one image.",
+        "becomes one image. With ``follow=True`` not ``joint``, ``scale``, ``mosaic`` or ``optics``.",
     )
     force: bool = Field(
         default=False, description="Whether to keep restored frames even if they are judged worse than the raw ones."

@@ -120,7 +120,9 @@ def _run_windows(
 ) -> Answer:
     """Process a stack in windows."""
     settings, frames, out = given.settings, given.stack, given.out
-    common |= {"window": chosen.window, "detection": settings.detection, "force": given.force}
+    common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
+    if not chosen.follow:  # a tracker has no options of detection
+        common["detection"] = settings.detection
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
     counts = info.shape[0] > chosen.window
     with working(f"restoring {frames.name}", counts=counts) as progress:
@@ -143,7 +145,7 @@ def _run_windows(
             with working("drawing the frames"):
                 names += draw_safely(folder / "before_after.png", lambda: _comparison(given, common, first))
         names += [restored.name, "manifest.json"]
-        if result.windows == 1:
+        if result.windows == 1 and not chosen.follow:
             assert isinstance(first.detection, detection.DetectionResult)
             assert first.restoration is not None
             restoration = common["restoration"]
@@ -165,8 +167,7 @@ def _answer_of_windows(
     if result.bad_frames:
         error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
     note_lost(restored, result.not_kept)
-    if result.windows == 1:
-        assert isinstance(first.detection, detection.DetectionResult)
+    if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
         assert first.restoration is not None
         warn_of_restoration(first.restoration)
         answer = stack_answer(frames, first.detection, given.pixel_size, first.restoration, count)
@@ -229,6 +230,7 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
     only_windows = {
         "--window": given.windows.get("window"),
+        "--follow": given.windows.get("follow"),
         "--bad-frames skip": given.windows.get("bad_frames") == "skip",
         "--scheduler": "scheduler" in given.processing,
         "--compression": "compression" in given.processing,

@@ -201,7 +201,7 @@ class DetectOptions(StackCommand, PixelSizeOptions):
         dict[str, Any],
         Given(
             DetectStackOptions,
-            ("memory", "workers"),
+            ("memory", "workers", "follow"),
             forms={
                 "window": {
                     "text": "Detect separately in windows of at most this number of frames; writes manifest.json and "
@@ -220,8 +220,9 @@ def detect(given: DetectOptions) -> Answer:
     """
     settings, frames, out = given.settings, given.stack, given.out
     check_folder(out, (*OF_DETECTION, *OF_WINDOWS), given.overwrite, given.inputs)
-    windows = {name: value for name, value in settings.stack.items() if name == "window"} | given.windows
-    if "window" not in windows:
+    windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")}
+    windows |= given.windows
+    if "window" not in windows and not windows.get("follow"):
         stack = load(given)
         result = _detect(stack, settings)
         with whole_folder(out) as folder:
@@ -239,7 +240,7 @@ def detect(given: DetectOptions) -> Answer:
                     folder / "manifest.json",
                     settings.timing,
                     **windows,
-                    detection=settings.detection,
+                    detection=None if windows.get("follow") else settings.detection,
                     full_scale=full_scale_of(frames, info, settings, given.full_scale),
                     device=str(given.torch_device),
                     progress=progress,
@@ -250,7 +251,11 @@ def detect(given: DetectOptions) -> Answer:
         warn_of_failures(manifest)
         title = f"Vibration in {len(manifest.windows)} windows of {frames.name}"
         answer = windows_answer(title, manifest, pixel_size=given.pixel_size)
-        answer.next_steps += steps_after_detection(None, frames, settings, out / "manifest.json")
+        if windows.get("follow"):
+            run_it = command_text("run", frames, out / "restored", *settings.arguments, "--follow")
+            answer.next_steps.append(next_step("restore the frames", run_it))
+        else:
+            answer.next_steps += steps_after_detection(None, frames, settings, out / "manifest.json")
     answer.files += [out / name for name in names]
     return answer
 
@@ -313,6 +318,11 @@ def _restore_windows(given: RestoreOptions) -> Answer:
         raise ValueError(
             f"{vibration}: it describes a video that was followed frame by frame, and its parts are not windows; "
             "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
+        )
+    if manifest.settings.get("follow"):
+        raise ValueError(
+            f"{vibration}: its vibration was followed from frame to frame, and each window states that of one frame; "
+            "repeat rsvib run --follow"
         )
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")

@@ -149,7 +149,8 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
-_TONES_OR_FREE = "try more tones or model='free'"
+_FOLLOW = "use follow=True (--follow) if the vibration changes"
+_TONES_OR_FREE = f"{_FOLLOW}, try more tones or model='free'"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
@@ -212,7 +213,7 @@ _TONES = {
     ),
     "displacement_ambiguous": ReasonKind(
         f"{_UNCERTAIN}, {{limit:.2g}} px are allowed, because the frames also agree with other tones",
-        _MORE_FRAMES,
+        f"{_FOLLOW}, or use more frames",
         "standard deviation of the displacement of the rows, above 4 % of it and 0.01 px, with several tones or if it "
         "exceeds 1.5 times the one of the fit alone",
         "px",

@@ -31,8 +31,16 @@ from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import BadFrames, ProcessStackOptions, RestorationOptions, StackDetectionOptions, StackOptions
+from rsvib_torch.options import (
+    BadFrames,
+    OptionTable,
+    ProcessStackOptions,
+    RestorationOptions,
+    StackDetectionOptions,
+    StackOptions,
+)
 from rsvib_torch.restoration.restore import check_optics
+from rsvib_torch.stacks.followed_window import WARM_UP, follow_window
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
 from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
@@ -52,6 +60,9 @@ class WindowResult(Summarised):
         detection: The detection, with the time origin at the window's first frame; None if it failed.
         restoration: Details of the restoration; None without a detection.
         error: Why detection or restoration failed.
+        unchanged: Indices of ``frames`` that are as taken, in a window that is restored: with ``follow=True``, those
+            whose motion is not known.
+        middle: With ``follow=True``, the frame whose vibration ``detection`` states.
         bad_frames: Frames of ``window.written`` that could not be used, with the reason; they are not in ``frames``.
     """
 
@@ -63,6 +74,8 @@ class WindowResult(Summarised):
     restoration: RestoredFrames | None
     error: str | None
     bad_frames: Mapping[int, str]
+    unchanged: tuple[int, ...] = ()
+    middle: int | None = None
 
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
@@ -102,6 +115,7 @@ class StackJob:
     force: bool = False  # whether to write restored frames even if they are judged worse than the raw ones
     device: str = "cpu"  # device for the computation
     window: int = StackOptions.window  # maximum number of frames of a window
+    follow: bool = False  # whether the vibration is followed from frame to frame
 
     @property
     def joined(self) -> bool:
@@ -149,9 +163,13 @@ class StackJob:
             frames = counts_to_frames(stored, self.full_scale, str(self.source), nodata).to(self.device)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), False, None, None, None, bad)
+        skipped = sum(index < window.first for index in usable)  # frames before the window
+        taken = self._unchanged(frames[skipped : skipped + len(kept)])
+        as_taken = WindowResult(window, kept, taken, False, None, None, None, bad)
         if faults and len(usable) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
+        if self.follow:
+            return self._followed(as_taken, list(usable), frames)
         timing = window_timing(self.timing, window, list(usable))
         detection: DetectionResult | DetectedVibration | None = None
         try:
@@ -188,6 +206,33 @@ class StackJob:
             restoration=restoration,
         )
 
+    def _followed(self, as_taken: WindowResult, indices: list[int], frames: Tensor) -> WindowResult:
+        """The result of a window by a tracker, from its usable frames and those before it."""
+        window = as_taken.window
+        starts = self.timing.frame_starts(window.last + 1).tolist()
+        times = [starts[index] - starts[window.first] for index in indices]
+        try:
+            found = follow_window(frames, indices, times, window, self.timing, self.restoration, force=self.force)
+        except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+            return replace(as_taken, error=" ".join(str(error).split()))
+        if found is None:
+            return replace(as_taken, error="the vibration could not be followed: its motion is not known in any frame")
+        detection, middle, restoration, unchanged = found
+        if restoration is None or not restoration.restored:
+            return replace(as_taken, detection=detection, middle=middle, restoration=restoration)
+        restored = restoration.frames[: len(as_taken.indices)]
+        if self.info.nodata is not None:
+            restored = without_data(restored, as_taken.frames)
+        return replace(
+            as_taken,
+            frames=restored,
+            restored=True,
+            detection=detection,
+            restoration=restoration,
+            unchanged=unchanged,
+            middle=middle,
+        )
+
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
 
@@ -201,10 +246,10 @@ class StackJob:
         restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
         frames = []
         for index in [written[len(written) // 2]] if self.joined else written:
-            if index in restored:
+            if index in restored and index not in result.unchanged:
                 frames.append(frames_to_counts(restored[index], dtype, self.full_scale, self.info.nodata))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
-                frame = pixels[index - result.window.first]
+                frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
                 same = self.scale == 1 and self.mosaic is None
@@ -234,18 +279,23 @@ class StackJob:
             "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
             "error": result.error,
             "bad_frames": {str(index): reason for index, reason in result.bad_frames.items()},
+            "middle": result.middle,
+            "restored_frames": result.restored * len(set(result.indices) - {*result.unchanged})
+            if self.follow
+            else None,
         }
 
 
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
     """Windows with the pixels of their frames as stored, or why they cannot be read.
 
-    The frame that neighbours share is read once.
+    The frames that neighbours share are read once.
     """
     with closing(open_stack(job.source)) as reader:
         if reader.info != job.info:
             raise ValueError(f"{job.source} has changed since it was first opened; start again")
-        last: dict[int, NDArray[Any] | str] = {}  # the last frame of the window before
+        last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
+        shared = 1 + (WARM_UP if job.follow else 0)
         for window in windows:
             frames: WindowFrames = []
             for index in window.frames:
@@ -253,8 +303,17 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
                     frames.append(last[index] if index in last else reader.frame(index))
                 except FrameError as error:
                     frames.append(" ".join(str(error).split()))
-            last = {window.last: frames[-1]}
+            last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
             yield window, frames
+
+
+def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
+    """Options of ``restore`` without those that frames which are restored one by one do not have."""
+    given = dict(restoration or {})
+    for name in ("joint", "scale", "mosaic", "optics"):
+        if given.pop(name, None) not in (None, False, 1):
+            raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
+    return given
 
 
 def plan_job(
@@ -280,29 +339,35 @@ def plan_job(
     if detection.get("model", "tones") != "tones":
         raise ValueError(f"model={detection['model']!r}: in windows only tones are detected; see detect_vibration")
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
-    device = options.device
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    default = "cuda" if torch.cuda.is_available() else "cpu"
+    device = default if options.device == "auto" else options.device
     restored = options if isinstance(options, StackOptions) else None
     run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
+    if options.follow and (detection or run.given is not None):
+        raise ValueError("follow=True has no options of detection, and no given detections")
+    restoration = None
+    if restored is not None:
+        restoration = single_frame_options(restored.restoration) if options.follow else dict(restored.restoration or {})
     job = StackJob(
         Path(source),
         info,
         timing,
         full_scale,
         detection,
-        None if restored is None else dict(restored.restoration or {}),
+        restoration,
         None if run.given is None else dict(enumerate(run.given)),
         run.bad_frames,
         restored is not None and restored.force,
         device,
         options.window,
+        options.follow,
     )
     if job.mosaic is not None:
         check_mosaic(job.mosaic, info.shape, str(source))
     if job.restoration is not None:
         check_optics(RestorationOptions(**job.restoration).optics)
-    windows = cut_windows(info.shape[0], job.window)
+    before = WARM_UP if job.follow else 0
+    windows = cut_windows(info.shape[0], job.window, before)
     if options.workers is not None:
         most = options.workers
     elif device != "cpu":
@@ -312,7 +377,13 @@ def plan_job(
     if not here:  # the memory of other machines is not known
         return job, windows, most
     at_once = windows_at_once(
-        info, job.window, memory=options.memory, most=most, restoration=job.restoration, on_gpu=device != "cpu"
+        info,
+        job.window,
+        memory=options.memory,
+        most=most,
+        restoration=job.restoration,
+        on_gpu=device != "cpu",
+        before=before,
     )
     return job, windows, at_once
 

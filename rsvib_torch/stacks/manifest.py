@@ -44,6 +44,8 @@ class WindowRecord:
         bad_frames: Index of each frame that could not be used, with the reason.
         shaking: Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``,
             changes of the motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
+        middle: With ``follow=True``, the frame whose vibration ``detection`` states; None if it is not known.
+        restored_frames: With ``follow=True``, number of frames written that are restored; None otherwise.
     """
 
     window: int
@@ -60,6 +62,8 @@ class WindowRecord:
     error: str | None
     bad_frames: dict[str, str]
     shaking: dict[str, tuple[float, ...]] | None = None
+    middle: int | None = None
+    restored_frames: int | None = None
 
 
 def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[str, tuple[float, ...]]:
@@ -124,19 +128,23 @@ class StackManifest(Result, file_format="rsvib stack"):
                 "bad_frames": len(record.bad_frames),
                 "note": note,
             }
+            last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
             tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)
             lines += [{**first, **tone, **last} for tone in tones]
         return joined_columns(lines)
 
     def _middle_times(self) -> list[float | None]:
-        """Middle of the frames of each window in s."""
+        """Middle of the frames of each window in s; of windows that were followed, the middle of their middle frame."""
         if self.settings.get("sensor") is None:
             return [None] * len(self.windows)
         timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
         rows = self.input["shape"][timing.scan_axis]
         half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
         starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
-        return [0.5 * (starts[record.first] + starts[record.last]) + half_frame for record in self.windows]
+        ends = [
+            (record.first, record.last) if record.middle is None else 2 * (record.middle,) for record in self.windows
+        ]
+        return [0.5 * (starts[first] + starts[last]) + half_frame for first, last in ends]
 
     @property
     def shaking(self) -> dict[str, tuple[float, ...]] | None:
@@ -195,6 +203,10 @@ class StackManifest(Result, file_format="rsvib stack"):
             "median ± standard deviation over the windows",
         ]
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
+        followed = [record for record in self.windows if record.restored_frames is not None]
+        if followed:
+            count = sum(record.restored_frames or 0 for record in followed)
+            restoration.append(f"{count} of {sum(record.written for record in followed)} frames restored")
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
             restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
@@ -300,6 +312,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
             "sensor": job.timing.to_dict(),
             "full_scale": job.full_scale,
             "window": job.window,
+            "follow": job.follow,
             "detection": dict(job.detection),
             "restoration": None if job.restoration is None else dict(job.restoration),
             "given": given,

@@ -78,15 +78,18 @@ def windows_at_once(
     most: int,
     restoration: Mapping[str, Any] | None,
     on_gpu: bool = False,
+    before: int = 0,
 ) -> int:
     """Number of windows that can be processed at once, at most ``most``, within the memory of the machine.
+
+    As many frames ``before`` each window are read as well.
 
     The error about too little memory states the required size and the largest window that fits.
     """
     limit = memory_limit(memory)
 
     def needed(frames: int, count: int = 1) -> int:
-        return memory_needed(info, frames, restoration, count, on_gpu=on_gpu)
+        return memory_needed(info, frames + before, restoration, count, on_gpu=on_gpu)
 
     process, one = needed(window, 0), needed(window)
     count = (limit - process) // (one - process)

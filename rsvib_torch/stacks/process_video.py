@@ -26,7 +26,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
-from rsvib_torch.stacks.job import plan_job
+from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import manifest_header, rms_shaking
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
@@ -205,10 +205,7 @@ class _Progress:
 
 def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -> tuple[VideoPasses, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
-    given = dict(options.restoration or {})
-    for name in ("joint", "scale", "mosaic", "optics"):
-        if given.pop(name, None) not in (None, False, 1):
-            raise ValueError(f"{name} is not available for videos that are followed frame by frame; use process_stack")
+    given = single_frame_options(options.restoration)
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     reader: FrameReader = open_stack(source)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -15,8 +15,6 @@ from rsvib_torch.core.prefetch import prefetched
 from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.tables import Array
-from rsvib_torch.frames.pixels import detailed_columns
-from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import FrameError
 from rsvib_torch.io.stack_reading import open_stack
@@ -25,18 +23,16 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.sampling import recorded_offsets
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.corners import CornerFollower, Corners
-from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
-from rsvib_torch.restoration.restore import restore_prepared
-from rsvib_torch.restoration.verdict.judge import judge_prepared
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer
+from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.tracking import Margins
 from rsvib_torch.tracking.camera_path import CameraPath, Tone, camera_path, shake
 from rsvib_torch.tracking.steadying import steady_places
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
 CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
-_JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
@@ -193,20 +189,9 @@ class VideoPasses:
         (first, one), (_, other) = frames
         pixels = np.stack([self.layout.luma(one), self.layout.luma(other)])
         images = counts_to_frames(pixels, self.layout.full_scale, str(self.job.source)).to(self.job.device)
-        timing = self.job.timing
-        if timing.scan_axis == -2:
-            images = images[..., detailed_columns(images, _JUDGED_COLUMNS)]
-        start = self.restorer.timing_of(0).frame_start_times
-        assert start is not None
-        starts = (float(start[0]), float(start[0]) + frames[1][0].time - first.time)
-        prepared = prepare_frames(images, replace(timing, frame_start_times=starts), channels="first")
         motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
-        if not bool((motion.amplitude > 0).any()):
-            return None
-        with suppress(TooLittleInCommonError), torch.no_grad():
-            restored = restore_prepared(prepared, motion, self.restorer.options)
-            return judge_prepared(prepared, restored, motion, most_pairs=1)
-        return None
+        interval = frames[1][0].time - first.time
+        return pair_verdict(images, self.job.timing, motion, interval, self.restorer.options)
 
     def record(
         self,

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from rsvib_torch.core.checks import MAX_NUMBER
 from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.frames.grey import constant_frame
+from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.io.full_scale import (
@@ -22,11 +23,14 @@ from rsvib_torch.io.full_scale import (
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
+
+_JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +101,24 @@ def restore_trusted(
         restored = sharpened(restored, optics, scale)
     result = prepared.from_row_order(restored) if keep else unchanged_frames(prepared, joint, scale)
     return RestoredFrames(result, keep, left_alone, verdict, True, vibration.num_axes)
+
+
+def pair_verdict(
+    frames: Tensor, timing: SensorTiming, motion: Vibration, interval: float, options: RestorationOptions
+) -> RestorationVerdict | None:
+    """Whether restoration helps, from two neighbouring frames of a motion that is followed; None if unknown.
+
+    The time origin of the motion is the middle of the first frame, and the other one starts an ``interval`` in s later.
+    """
+    if timing.scan_axis == -2:
+        frames = frames[..., detailed_columns(frames, _JUDGED_COLUMNS)]
+    if not bool((motion.amplitude > 0).any()):
+        return None
+    start = -0.5 * ((frames.shape[-1 if timing.scan_axis == -1 else -2] - 1) * timing.row_time + timing.exposure_time)
+    prepared = prepare_frames(frames, replace(timing, frame_start_times=(start, start + interval)), channels="first")
+    with suppress(TooLittleInCommonError), torch.no_grad():
+        return judge_prepared(prepared, restore_prepared(prepared, motion, options), motion, most_pairs=1)
+    return None
 
 
 def without_data(frames: Tensor, taken: Tensor) -> Tensor:

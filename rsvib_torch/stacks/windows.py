@@ -21,17 +21,19 @@ class Window:
         first: Index of its first frame.
         last: Index of its last frame (inclusive).
         kept: Number of frames that it writes.
+        before: Number of frames before the first that are read as well, to begin to follow the vibration.
     """
 
     index: int
     first: int
     last: int
     kept: int
+    before: int = 0
 
     @property
     def frames(self) -> range:
-        """Indices of its frames."""
-        return range(self.first, self.last + 1)
+        """Indices of the frames that are read."""
+        return range(self.first - self.before, self.last + 1)
 
     @property
     def written(self) -> range:
@@ -44,12 +46,13 @@ class Window:
         return self.index == 0 and self.kept == len(self.frames)
 
 
-def cut_windows(num_frames: int, window: int) -> list[Window]:
+def cut_windows(num_frames: int, window: int, before: int = 0) -> list[Window]:
     """Cut a stack into windows of at most ``window`` frames, of equal length to within one frame.
 
     Args:
         num_frames: Number of frames of the stack.
         window: Maximum number of frames of a window, at least 2.
+        before: Number of frames before each window that are read as well, if there are so many.
 
     Returns:
         Windows in order; a stack of up to ``window`` frames is one window.
@@ -64,7 +67,7 @@ def cut_windows(num_frames: int, window: int) -> list[Window]:
     borders = [index * pairs // count for index in range(count + 1)]
     borders[-1] = num_frames - 1
     return [
-        Window(index, first, last, last - first + (index == count - 1))
+        Window(index, first, last, last - first + (index == count - 1), min(before, first))
         for index, (first, last) in enumerate(itertools.pairwise(borders))
     ]
 

@@ -225,7 +225,7 @@ class VibrationTracker:
                 self.timing,
                 full_scale=self.options.full_scale,
                 channels=self.options.channels,
-                saturation="auto" if "clipped" in METHODS[self.options.method].masks else None,
+                saturation=self.options.saturation if "clipped" in METHODS[self.options.method].masks else None,
             )
             latest = _GreyFrame.of(prepared, time)
         before = self._state.frames[-1] if self._state.frames else None

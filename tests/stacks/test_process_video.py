@@ -232,7 +232,7 @@ def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
     cases = [
         ({"border": "zoom"}, "border must be one of"),
         ({"steady": -1.0}, "steady must be at least 0"),
-        ({"restoration": {"joint": 3}}, "joint is not available for videos that are followed frame by frame"),
+        ({"restoration": {"joint": 3}}, "joint is not available for frames that are followed one by one"),
         ({"restoration": {"method": "exact", "chunk_rows": 3}}, "has no option 'chunk_rows'"),
         ({"border": "crop", "steady": 60.0, "memory": "1kB"}, "memory of"),
     ]
