@@ -78,7 +78,9 @@ WORK = {
     ),
     "detect, few columns": lambda images, timing: rsv.detect_vibration(images, timing, columns=100).vibration,
     "detect, holes": lambda images, timing: rsv.detect_vibration(with_missing(images), timing).vibration,
-    "detect, batch": lambda images, timing: rsv.detect_vibration(images[None].expand(2, -1, -1, -1), timing).vibration,
+    "detect, batch": lambda images, timing: (
+        rsv.detect_vibration(images[None, :, None].expand(2, -1, -1, -1, -1), timing).vibration
+    ),
     "free": lambda images, timing: rsv.detect_vibration(images, timing, model="free").motion,
     "swept": lambda images, timing: rsv.detect_vibration(images, timing, model="swept").amplitude,
     "exact": lambda images, timing: rsv.restore(images, timing, SHAKE),

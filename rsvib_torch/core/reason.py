@@ -159,8 +159,8 @@ _TONES = {
         "only {value:.0%} of {what} can be registered, {limit:.0%} are needed: the motion is beyond the search range, "
         "or the frames lack detail or show different scenes",
         "increase search",
-        "fraction of the visible rows or bands that were registered (of a free or swept motion: of the bands whose "
-        "correlation exceeds 0.3), below 0.5",
+        "fraction of the visible rows or bands that were registered and of the registered bands that correlate more "
+        "than independent noise, below 0.5",
         refuses="all axes",
     ),
     "no_tone": ReasonKind(

@@ -34,7 +34,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit
 from rsvib_torch.detection.tones.uncertainty import with_further_tones, with_unknown_amplitudes, without_aliasing
-from rsvib_torch.detection.verdict import BandOffsets, Findings, judged
+from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_reasons, with_reasons_of_all
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
@@ -207,6 +207,9 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         max_tones=options.max_tones,
         radius=scale.radius,
     )
+    if scale.same_for_all_columns:
+        against = zip(scene_reasons(start.curve, scale.width), findings, strict=True)
+        findings = tuple(with_reasons_of_all(of_scene, of_stack) for of_scene, of_stack in against)
     return Attempt(
         statuses=_statuses(fitted),
         options=options,

@@ -18,10 +18,11 @@ from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.registration.register import OffsetCurve, similar_share
 
 Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
 
-MIN_MEASURED = 0.5  # of the visible rows or bands
+_MIN_MEASURED = 0.5  # of the visible rows or bands
 MAX_DISPLACEMENT_STD = 0.25  # of the displacement of the rows
 _MAX_WITHIN_ROW_TIME = 0.1  # px; condition (24) of the paper
 _MIN_MOTION = 0.05  # px between frames; offsets of bands have errors of this size
@@ -143,12 +144,32 @@ def _reasons_against_stack(stack: dict[str, Any], timing: RowTiming, max_tones: 
     return against
 
 
+def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
+    """For each stack, the reason against frames that show different scenes or noise; ``columns`` is their width in px.
+
+    Of independent noise, up to half of the axes of four and more frames were reliable, with errors of 5 to 60 px.
+    """
+    shares, what = similar_share(curve, columns).tolist(), {"what": "the row bands"}
+    return [
+        [Reason("rows_not_registered", None, share, _MIN_MEASURED, what)] if share < _MIN_MEASURED else []
+        for share in shares
+    ]
+
+
+def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
+    """The findings of a stack with further reasons against each axis, unless the axis has one with the same code."""
+    return tuple(
+        (*(reason for reason in of_all if all(one.code != reason.code for one in of_axis)), *of_axis)
+        for of_axis in findings
+    )
+
+
 def _measurement_reasons(stack: dict[str, Any]) -> list[Reason]:
     """Reasons from the fraction of the visible rows or bands that were measured."""
-    if stack["measured"] >= MIN_MEASURED:
+    if stack["measured"] >= _MIN_MEASURED:
         return []
     what = f"{stack['bands']:g} row bands" if "bands" in stack else "the rows"
-    return [Reason("rows_not_registered", None, stack["measured"], MIN_MEASURED, {"what": what})]
+    return [Reason("rows_not_registered", None, stack["measured"], _MIN_MEASURED, {"what": what})]
 
 
 def _tone_reasons(axis: str, numbers: dict[str, Any], tone: int, num_tones: int, timing: RowTiming) -> list[Reason]:

@@ -46,7 +46,7 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
-from rsvib_torch.detection.verdict import contradicted_axes, judged
+from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
@@ -56,7 +56,7 @@ from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions, TrackerOptions
 from rsvib_torch.registration.gradients import RowGradients
-from rsvib_torch.registration.register import MIN_CORRELATION, fits_frame
+from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.tracking.tone_filter import ToneFilter
@@ -408,9 +408,7 @@ class VibrationTracker:
         started = state
         for method, number in _STARTS[:1] if only_bands else _STARTS:
             found = attempt(stacks, timing, DetectionOptions(method, number, model, _BANDS), hypothesis)
-            quality = found.fitted.offsets.quality
-            other_scene = method == "bands" and float(quality.median()) < MIN_CORRELATION
-            if other_scene or found.statuses[0] == "not visible":
+            if scene_reasons(found.start.curve, stacks.images.shape[-1])[0] or found.statuses[0] == "not visible":
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.
             plausible = _plausible(found)

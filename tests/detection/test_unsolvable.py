@@ -31,3 +31,12 @@ def test_frames_that_do_not_determine_a_motion(function, name):
     with suppress(ValueError):
         reliable = function(FRAMES[name], TIMING).reliable
     assert not reliable.any()
+
+
+@pytest.mark.parametrize(("count", "size", "seed"), [(4, 256, 0), (7, 192, 1)])
+def test_independent_noise_at_a_low_frame_rate_has_no_vibration(count, size, seed):
+    """Few rows agree by chance, and slow tones of many pixels explain them; without the verdict they are reliable."""
+    noise = 0.5 + 0.1 * torch.randn(count, size, size, generator=torch.Generator().manual_seed(seed))
+    found = rsv.detect_vibration(noise, rsv.SensorTiming(50e-6, 10, 1600))
+    assert not found.reliable.any()
+    assert all("rows_not_registered" in [reason.code for reason in against] for against in found.findings)

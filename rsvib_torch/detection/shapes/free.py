@@ -31,7 +31,7 @@ from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
-from rsvib_torch.detection.verdict import MIN_MEASURED, rotation_reasons
+from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
@@ -47,7 +47,6 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
-from rsvib_torch.registration.register import MIN_CORRELATION
 
 MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
 _SECOND = (1.0, -2.0, 1.0)  # second difference
@@ -209,7 +208,7 @@ def _detect(
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
-    of_bands = bands_reasons(curve, banded, of_middle[0], scale.axes)
+    of_bands = bands_reasons(scene_reasons(curve, scale.width)[0], banded, of_middle[0], scale.axes)
     report = _report(motion[0], fit, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
@@ -341,21 +340,18 @@ def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
     return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
 
 
-def bands_reasons(curve: OffsetCurve, banded: Measurements, motion: Motion, axes: int = 2) -> list[list[Reason]]:
+def bands_reasons(of_scene: list[Reason], banded: Measurements, motion: Motion, axes: int = 2) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the row bands of one stack contradict.
 
-    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it; its bands
-    hardly correlate.
+    Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it. The
+    reasons ``of_scene`` are those of all axes.
     """
-    similar = float((curve.quality[curve.good] > MIN_CORRELATION).double().mean())
-    what = {"what": "the row bands"}
-    of_all = [Reason("rows_not_registered", None, similar, MIN_MEASURED, what)] if similar < MIN_MEASURED else []
     values = _offsets_of_bands(banded, banded.displacements)
     size = np.abs(values - values.mean(0)).mean(0).tolist()
     allowed = [max(MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
     compared = zip(AXIS_NAMES, band_errors(banded, motion), allowed, strict=False)
     against = [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
-    return [of_all + of_axis for of_axis in [*against, [], []][:axes]]
+    return [of_scene + of_axis for of_axis in [*against, [], []][:axes]]
 
 
 def unexplained_reasons(axis: str, residual: float, moved: float, model: str) -> list[Reason]:
