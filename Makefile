@@ -22,7 +22,7 @@ check: setup ## format, lint and type checks, without tests
 quick: setup ## tests that a change of the algorithms needs (about 2 minutes on two cores)
 	OMP_NUM_THREADS=1 $(PYTHON) -m pytest tests --quick -n auto --dist loadfile --no-loadscope-reorder
 
-test: ## all checks and tests (about 10 minutes on two cores)
+test: ## all checks and tests (7 to 10 minutes on two cores)
 	bash scripts/test.sh
 
 slow: ## all checks and tests, the long ones included

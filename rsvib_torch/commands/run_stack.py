@@ -213,16 +213,17 @@ def _video_name(frames: Path, output: str) -> str:
     """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
     if output != "restored.tif":
         raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-    ending = frames.suffix.lower().partition("[")[0]  # of frames[START:END]
-    return f"restored{ending if ending in ('.mp4', '.mov', '.m4v') else '.mkv'}"
+    from rsvib_torch.io.stack_format import H264, split_range  # noqa: PLC0415
+
+    ending = split_range(frames)[0].suffix.lower()
+    return f"restored{ending if ending in H264 else '.mkv'}"
 
 
 def _is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
     """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
-    from rsvib_torch.io.stack_format import split_range  # noqa: PLC0415 - loads PyTorch, which others do not need
-    from rsvib_torch.io.video import ENDINGS  # noqa: PLC0415
+    from rsvib_torch.io.stack_format import VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
 
-    return requested or (split_range(frames)[0].suffix.lower() in ENDINGS and count > window)
+    return requested or (split_range(frames)[0].suffix.lower() in VIDEO and count > window)
 
 
 def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> Answer:

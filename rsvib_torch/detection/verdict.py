@@ -147,7 +147,7 @@ def _reasons_against_stack(stack: dict[str, Any], timing: RowTiming, max_tones: 
 def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
     """For each stack, the reason against frames that show different scenes or noise; ``columns`` is their width in px.
 
-    Of independent noise, up to half of the axes of four and more frames were reliable, with errors of 5 to 60 px.
+    Without it, 6 of 24 stacks of 2 to 8 frames of independent noise had reliable axes, with amplitudes of 5 to 52 px.
     """
     shares, what = similar_share(curve, columns).tolist(), {"what": "the row bands"}
     return [

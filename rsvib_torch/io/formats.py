@@ -11,7 +11,7 @@ from typing import Any
 
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import quoted
-from rsvib_torch.io.stack_format import StackFormat
+from rsvib_torch.io.stack_format import FFV1, H264, READ_ONLY_VIDEO, StackFormat
 
 
 def packaged_format(
@@ -44,7 +44,6 @@ def packaged_format(
 _KEPT = ("full_scale", "frame_times", "orientation", "resolution")
 _KEPT_BY_PNG = ("full_scale", "orientation", "resolution")
 _KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
-_READ_ONLY_VIDEO = (".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
@@ -69,14 +68,14 @@ _FORMATS_OF_THE_PACKAGE = (
         compressions=("zlib", "lzma"), keeps=(*_KEPT, "metadata"),
     ),
     packaged_format(
-        "FFV1 video", (".mkv",), "rsvib_torch.io.video", "VideoReader", write="write_video",
+        "FFV1 video", FFV1, "rsvib_torch.io.video", "VideoReader", write="write_video",
         check="check_video", dtypes=("uint8", "uint16"), keeps=_KEPT_BY_VIDEO,
     ),
     packaged_format(
-        "H.264 video", (".mp4", ".mov", ".m4v"), "rsvib_torch.io.video", "VideoReader", write="write_video",
+        "H.264 video", H264, "rsvib_torch.io.video", "VideoReader", write="write_video",
         check="check_video", keeps=_KEPT_BY_VIDEO,
     ),
-    packaged_format("avi, webm, mpeg, 3gp and wmv", _READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
+    packaged_format("avi, webm, mpeg, 3gp and wmv", READ_ONLY_VIDEO, "rsvib_torch.io.video", "VideoReader"),
     packaged_format(
         "zarr", (".zarr",), "rsvib_torch.io.zarr_store", "open_zarr", write="write_zarr", kind="tree",
         marker="zarr.json", keeps=_KEPT,

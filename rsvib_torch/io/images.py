@@ -31,10 +31,10 @@ def image_info(path: Path) -> StackInfo:
     """The stack of one frame in a PNG or JPEG file."""
     is_png = path.suffix.lower() == ".png"
     with readable_stack(path, "PNG" if is_png else "JPEG"), path.open("rb") as file:
-        head = io.BytesIO(file.read(_LONGEST_HEADER))  # Pillow would search a file of any size for it, at 20 MB/s
-        image = PngImageFile(head) if is_png else JpegImageFile(head)
-        info = _png_info(path, image) if is_png else _jpeg_info(image)
+        head = file.read(_LONGEST_HEADER)  # Pillow would search a file of any size for it, at 20 MB/s
         file_size = file.seek(0, io.SEEK_END)
+        image = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
+        info = _png_info(image, head, file_size) if is_png else _jpeg_info(image)
         if file_size > 4 * np.dtype(info.dtype).itemsize * math.prod(info.shape) + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {image.width} x {image.height} px")
         return replace(info, **exif_fields(image.info.get("exif", b"")))
@@ -47,12 +47,10 @@ def _jpeg_info(image: Any) -> StackInfo:
     return StackInfo(shape, "uint8", 255.0, channels_last=image.mode == "RGB")
 
 
-def _png_info(path: Path, image: Any) -> StackInfo:
+def _png_info(image: Any, head: bytes, file_size: int) -> StackInfo:
     if image.is_animated:
         raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
-    with path.open("rb") as file:
-        dtype = np.dtype(np.uint16 if file.read(_PNG_HEADER)[24] == 16 else np.uint8)
-        file_size = file.seek(0, io.SEEK_END)
+    dtype = np.dtype(np.uint16 if head[24] == 16 else np.uint8)  # bits of a value
     channels = _CHANNELS[image.mode]
     if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
         channels = 4

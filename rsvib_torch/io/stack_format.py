@@ -12,6 +12,11 @@ from rsvib_torch.io.stack_info import StackInfo
 
 Frame = NDArray[Any]
 
+# Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
+H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
+READ_ONLY_VIDEO = (".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
+VIDEO = (*FFV1, *H264, *READ_ONLY_VIDEO)
+
 
 class FrameReader(Protocol):
     """An open stack; frames are read one at a time, in any order."""

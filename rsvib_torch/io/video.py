@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.io.stack_format import H264, VIDEO
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import camera_name
 
-H264 = (".mp4", ".mov", ".m4v")
 CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written
-ENDINGS = (*CONTAINERS, ".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
 _FFV1_OPTIONS = {"level": "3", "g": "1"}  # each frame can be decoded alone: damage does not affect other frames
 _BT709, _LIMITED_RANGE = 1, 1  # codes of ITU-T H.273 and FFmpeg
@@ -274,7 +273,7 @@ class VideoReader:
 
 def _source(info: StackInfo) -> Path | None:
     """The video from which the frames to write were computed, one for each of its frames."""
-    return info.path if info.path is not None and info.path.suffix.lower() in ENDINGS else None
+    return info.path if info.path is not None and info.path.suffix.lower() in VIDEO else None
 
 
 def presentation_times(info: StackInfo) -> tuple[Fraction, list[int]]:

@@ -65,13 +65,14 @@ class CornerFollower:
     def __init__(self, timing: SensorTiming, *, most: int = 256, consistent: bool = True) -> None:
         self._timing, self._most, self._consistent = timing, most, consistent
         self._start = 0.0  # s, of the frame before
-        self._before: tuple[Grey, Grey | None] | None = None  # the frame before and its mask, of reduced size
+        self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
         self._known: Points | None = None  # corners in it
 
     def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
         """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
 
-        There are none where the mask (H, W) is 0.
+        There are none where the mask (H, W) is 0. A mask is for corners that are not ``consistent``: frames are reduced
+        otherwise, and masks are not.
 
         Returns:
             The corners; None for the first frame, and if too few move together.

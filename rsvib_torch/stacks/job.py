@@ -218,20 +218,12 @@ class StackJob:
         if found is None:
             return replace(as_taken, error="the vibration could not be followed: its motion is not known in any frame")
         detection, middle, restoration, unchanged = found
+        result = replace(as_taken, detection=detection, middle=middle, restoration=restoration)
         if restoration is None or not restoration.restored:
-            return replace(as_taken, detection=detection, middle=middle, restoration=restoration)
-        restored = restoration.frames[: len(as_taken.indices)]
-        if self.info.nodata is not None:
-            restored = without_data(restored, as_taken.frames)
-        return replace(
-            as_taken,
-            frames=restored,
-            restored=True,
-            detection=detection,
-            restoration=restoration,
-            unchanged=unchanged,
-            middle=middle,
-        )
+            return result
+        has_gaps = self.info.nodata is not None
+        restored = without_data(restoration.frames, as_taken.frames) if has_gaps else restoration.frames
+        return replace(result, frames=restored, restored=True, unchanged=unchanged)
 
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.

@@ -17,9 +17,7 @@ from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
-from rsvib_torch.io.full_scale import (
-    beyond_full_scale,
-)
+from rsvib_torch.io.full_scale import beyond_full_scale
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming

@@ -208,7 +208,7 @@ def _detect(
     if not scale.same_for_all_columns:
         middle = torch.zeros(1, dtype=torch.float64, device="cpu")
         of_middle = ColumnMotion.of_columns(scale.free_motion(motion), middle, rowwise, len(starts), scale.height)
-    of_bands = bands_reasons(scene_reasons(curve, scale.width)[0], banded, of_middle[0], scale.axes)
+    of_bands = bands_reasons(curve, scale.width, banded, of_middle[0], scale.axes)
     report = _report(motion[0], fit, measured, timing, times, scale, of_bands, rows.differential()[0])
     return report.to(stack.images.device)
 
@@ -340,18 +340,21 @@ def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:
     return np.diff(displacements[0], axis=1)[banded.weights[0].min(-1) > 0, 0]
 
 
-def bands_reasons(of_scene: list[Reason], banded: Measurements, motion: Motion, axes: int = 2) -> list[list[Reason]]:
+def bands_reasons(
+    curve: OffsetCurve, columns: int, banded: Measurements, motion: Motion, axes: int = 2
+) -> list[list[Reason]]:
     """Reasons against a motion of each axis in row order that the row bands of one stack contradict.
 
     Noise without a scene has offsets of any size, and rows that are measured around a fit to them confirm it. The
-    reasons ``of_scene`` are those of all axes.
+    measurements ``banded`` are those of the curve, of frames of ``columns`` px.
     """
     values = _offsets_of_bands(banded, banded.displacements)
     size = np.abs(values - values.mean(0)).mean(0).tolist()
     allowed = [max(MAX_BAND_ERROR, 0.3 * axis) for axis in size]  # px
     compared = zip(AXIS_NAMES, band_errors(banded, motion), allowed, strict=False)
     against = [[Reason("bands_contradict", *of_axis)] if of_axis[1] > of_axis[2] else [] for of_axis in compared]
-    return [of_scene + of_axis for of_axis in [*against, [], []][:axes]]
+    of_all = scene_reasons(curve, columns)[0]
+    return [of_all + of_axis for of_axis in [*against, [], []][:axes]]
 
 
 def unexplained_reasons(axis: str, residual: float, moved: float, model: str) -> list[Reason]:

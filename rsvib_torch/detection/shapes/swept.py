@@ -30,7 +30,7 @@ from rsvib_torch.detection.shapes.free import (
 )
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.periodogram import explained_power
-from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD, scene_reasons
+from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
@@ -232,7 +232,7 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
     uncertain = torch.stack([_rms_std(_relative(measured, _columns(times, fits[i])), covariances[i]) for i in range(2)])
     moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
-    against = bands_reasons(scene_reasons(curve, stack.images.shape[-1])[0], banded, motion)
+    against = bands_reasons(curve, stack.images.shape[-1], banded, motion)
     chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
     for axis, error in enumerate(band_errors(banded, motion)):
         if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
