@@ -314,8 +314,9 @@ def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) 
     if size >= 0.25 or not (is_low or is_high):
         return []
     details: dict[str, float | str] = {"exposure_rows": timing.exposure_rows}
-    if ratio > 0:
-        details["likely"] = timing.exposure_rows * math.sqrt(ratio)
+    likely = timing.exposure_rows * math.sqrt(max(ratio, 0.0))
+    if 0 < likely * timing.row_time <= timing.frame_period:  # longer ones are no exposures; another error is the cause
+        details["likely"] = likely
     return [Reason("blur_contradicts_exposure", None, ratio, low if is_low else high, details)]
 
 

@@ -113,12 +113,13 @@ def test_slow_errors_count_for_slow_tones():
 
 @pytest.mark.parametrize("num_frames", [2, 4])
 def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
-    """Bias b sin(2 pi (d_p - d_q)), mean over the frames q: b is known if the motion exceeds a pixel."""
+    """Bias b sin(2 pi (d_p - d_q)), mean over the frames q, and c cos(2 pi d_p): known if it moves by a pixel."""
     generator, size, batch = np.random.default_rng(num_frames), 5e-3, 100
     amplitude, starts = np.repeat([0.1, 2.0], batch), starts_of(TIMING, num_frames)
     phase = generator.uniform(-3, 3, 2 * batch)
     true = mean_sine(amplitude, np.full(2 * batch, 37.0), phase, starts, TIMING.exposure_time)
     biased = true - size * np.sin(2 * np.pi * (true[..., :, None] - true[..., None, :])).mean(-1)
+    biased = biased + 0.3 * size * np.cos(2 * np.pi * true)
     measurements = measured(biased, TIMING, generator, noise=0.5 * NOISE)
     raw = fitted(measurements, np.full(2 * batch, 37.0))
     corrected = without_aliasing(measurements, raw, np.full(2 * batch, 3e-3))

@@ -105,9 +105,13 @@ def tone_response(measurements: Measurements, frequencies: Array) -> Array:
     Returns:
         complex128 (B, N, G, 2, K).
     """
+    return measurements.relative(_tones_at(measurements, frequencies))
+
+
+def _tones_at(measurements: Measurements, frequencies: Array) -> Array:
+    """``tone_response`` without subtraction of the mean."""
     attenuation = np.sinc(frequencies * measurements.smearing_times).prod(0)[:, None, None]
-    angle = 2 * math.pi * frequencies[:, None, None] * measurements.middles
-    return measurements.relative(attenuation * unit_wave(angle))
+    return attenuation * unit_wave(2 * math.pi * frequencies[:, None, None] * measurements.middles)
 
 
 def drift_response(measurements: Measurements, order: int) -> Array:
@@ -121,6 +125,14 @@ def model_displacements(measurements: Measurements, fit: ToneFit) -> Array:
     tones = fit.coefficients[:, None, None] * tone_response(measurements, fit.frequencies)
     response = drift_response(measurements, fit.drift.shape[-1])
     return tones.real.sum(-1) + np.einsum("bngj,baj->bnga", response, fit.drift)
+
+
+def displacements(measurements: Measurements, fit: ToneFit) -> Array:
+    """Displacements (B, N, G, A) in px of the fitted motion at the measurements, up to a constant."""
+    fit = fit.about(measurements.centre)
+    tones = (fit.coefficients[:, None, None] * _tones_at(measurements, fit.frequencies)).real.sum(-1)
+    powers = [measurements.middles[..., 0] ** order / order for order in range(1, fit.drift.shape[-1] + 1)]
+    return sum((power * fit.drift[:, None, None, :, j] for j, power in enumerate(powers)), tones)
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Array:

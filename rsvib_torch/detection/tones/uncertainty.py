@@ -4,15 +4,15 @@ Each effect of response Z and size v changes the parameters of the fit by ``-X^+
 whitened Jacobian of the free parameters. An uncertainty C of v therefore adds ``X^+ Z C (X^+ Z)^T`` to their covariance
 (``LinearisedFit``).
 
-*Aliasing.* Frames contain an aliased part of the scene, which a displacement d multiplies by ``exp(2 pi i d)`` along
-its axis whatever its frequency. It biases the displacement of a row in frame p, relative to the mean over the G
-frames, by
+*Aliasing.* A displacement d multiplies the aliased part of the scene by ``exp(2 pi i d)`` along its axis, whatever its
+frequency. Products of this part with itself and with the scene bias the displacement in frame p by
 
-    b / G sum_q sin(2 pi (d_p - d_q))
+    b Im(exp(2 pi i d_p) conj(m)) + c cos(2 pi d_p) + s sin(2 pi d_p)
 
-with one size b for each axis. With four frames, b is 2e-3 px for optics of 0.3 px (Gaussian, standard deviation) and
-below 3e-5 px for 0.7 px. The phase of the bias turns with every pixel of displacement, so that motions of more than
-about 1 px determine b from the residuals.
+less its mean over the G frames, with the mean m of ``exp(2 pi i d_q)`` over the frames q. Along rows, b is negative and
+has about the size that follows from the spectrum of the frames: 2e-3 px for optics of 0.4 px (Gaussian, standard
+deviation). c and s are small, unless many edges have the same place within a pixel. The phase of the bias turns with
+every pixel of displacement, so that motions of more than about 1 px determine all three from the residuals.
 
 *Further tones.* A record of few frames often agrees with several numbers of tones. The covariance of a fit holds for
 its number only. It is extended by the mean over models with a further tone of any frequency, each weighted with its
@@ -39,6 +39,7 @@ from rsvib_torch.detection.tones.fit import (
     axis_jacobian,
     displacement_jacobian,
     displacement_std,
+    displacements,
     model_displacements,
     offset_gain,
     residual_of,
@@ -47,10 +48,12 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 
-# Errors of amplitudes A in px over the expected bias by aliasing: at most 2 A, and 0.8 / (1 + 2 A). In 54 and 55 axes
-# with one tone in 4 and 8 frames behind optics of 0.4 px, the rms error over the standard deviation was 1.26 and 1.93
-# (largest 3.8 and 7.9) without this term, and is 0.89 and 0.98 (3.1 and 2.7) with it
-_UNKNOWN_ALIASING = 2.0, 0.8
+# Mean, and standard deviations of b, c and s, of x and of y over the expected size of b; chosen with 220 recordings of
+# drawn and real scenes. In 60 others each behind optics of 0.4 and 0.55 px, with one tone in 2 to 8 frames, the rms
+# error of the amplitude along x over its standard deviation was 1.24 and 1.26 with b alone, of mean 0, and is 1.06 and
+# 1.07; its median error fell by a quarter and a tenth
+_MEAN_BIAS = (-0.7, 0.0, 0.0), (0.0, 0.0, 0.0)
+_BIAS_STD = (0.7, 0.7, 0.7), (0.5, 0.3, 0.3)
 # px^-2, relative, per square of the path within an exposure, of x, y, roll and zoom: with paths of 4 to 7 px, errors
 # were 2e-4 to 8e-4; of roll with paths of 1.5 and 2.8 px at half the width 2.2e-3 and 8e-3, 3.4 and 5.8 standard
 # deviations with the value of x and y
@@ -167,18 +170,20 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     Args:
         measurements: The measurements of the fit, with its weights.
         fit: With its covariance.
-        size: (B,) px, prior standard deviation of b.
+        size: (B,) px, expected size of b.
     """
-    precision = (1 / np.square(np.maximum(size, 1e-9)))[:, None]
+    size = np.maximum(size, 1e-9)[:, None]
     covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
     change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
-    bias = _unit_bias(measurements, model_displacements(measurements, fit))
+    bias = _unit_bias(measurements, fit)
     for axis, problem in _problems(measurements, fit)[:2]:
-        Z, by_unit = problem.unexplained(bias[..., axis, None], axis)
-        variance = 1 / (np.square(Z).sum(1) + problem.rounding(axis)[:, None] + precision)  # (B, 1), of b
-        b = variance * (Z[..., 0] * problem.residual).sum(1, keepdims=True)
-        problem.add_covariance(covariance, by_unit * variance[..., None] @ by_unit.mT)
-        problem.add_change(change, -b * by_unit[..., 0])
+        Z, by_unit = problem.unexplained(bias[:, :, :, axis], axis)
+        precision = 1 / np.square(size * _BIAS_STD[axis])  # (B, 3), of b, c and s before they are measured
+        normal = Z.mT @ Z + (problem.rounding(axis)[:, None] + precision)[..., None] * np.eye(3)
+        right = Z.mT @ problem.residual[..., None] + (precision * size * _MEAN_BIAS[axis])[..., None]
+        inverse = np.linalg.inv(normal)
+        problem.add_covariance(covariance, by_unit @ inverse @ by_unit.mT)
+        problem.add_change(change, -(by_unit @ inverse @ right)[..., 0])
     tones, drift = np.split(change, [3 * fit.frequencies.shape[-1]], -1)
     real, imaginary, frequency = np.moveaxis(split_axis(tones, -1, -1, 3), -1, 0)
     return replace(
@@ -190,34 +195,29 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     )
 
 
-def _unit_bias(measurements: Measurements, displacements: Array) -> Array:
-    """Bias (B, N, G, A) of relative displacements of that shape, for b = 1."""
-    angle = 2 * math.pi * displacements
-    turn = unit_wave(angle)
+def _unit_bias(measurements: Measurements, fit: ToneFit) -> Array:
+    """Bias (B, N, G, A, 3) of the relative displacements for b, c and s of 1."""
+    turn = unit_wave(2 * math.pi * displacements(measurements, fit))
     visible = measurements.visible[..., None]
     mean = (visible * turn).sum(2, keepdims=True) / np.maximum(visible.sum(2, keepdims=True), 1.0)
-    return measurements.relative((turn * mean.conj()).imag)
+    return measurements.relative(np.stack([(turn * mean.conj()).imag, turn.real, turn.imag], -1))
 
 
 # --- Errors of the amplitudes ---
 
 
-def with_unknown_amplitudes(fit: ToneFit, aliasing: Array, intervals: Array, exposure_time: float) -> ToneFit:
-    """The fit with errors of its amplitudes that the models of aliasing and of unequal blur do not contain.
+def with_unknown_amplitudes(fit: ToneFit, intervals: Array, exposure_time: float) -> ToneFit:
+    """The fit with errors of its amplitudes that the model of unequal blur does not contain.
 
     Args:
         fit: With its covariance.
-        aliasing: (B,) px, expected size of the bias by aliasing.
         intervals: (M,) s, times between the frames that are compared; errors of offsets are amplified by a small gain.
         exposure_time: T_e in seconds.
     """
     size = fit.amplitude  # (B, A, K)
     path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
     gain = np.maximum(offset_gain(fit.frequencies, intervals), 1e-3)
-    small, large = _UNKNOWN_ALIASING
-    by_aliasing = aliasing[:, None, None] * np.minimum(small * size, large / (1 + 2 * size))
-    by_blur = np.array(_UNKNOWN_BLUR)[: size.shape[1], None] * np.square(path) * size * 2.0 / gain
-    error = np.hypot(by_aliasing, by_blur) / np.maximum(size, 1e-300)  # relative
+    error = np.array(_UNKNOWN_BLUR)[: size.shape[1], None] * np.square(path) * 2.0 / gain  # relative
     unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
     unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
     covariance, (axes, parameters) = fit.covariance.copy(), unknown.shape[1:]

@@ -1,12 +1,12 @@
 """Strength of the prior by generalised cross-validation, at a sample of the rows and frequencies of the frames.
 
-The spectra of the sampled rows are computed on the device of the frames. All else are small tables, of all scenes
-together, in NumPy on the CPU.
+The spectra and kernels of the sampled rows are computed on the device of the frames. All else are small tables in NumPy
+on the CPU, some scenes in each thread.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from rsvib_torch.core.chunking import runs
+from rsvib_torch.core.fourier import waves
+from rsvib_torch.core.parallel import allowed_threads, in_parallel
 from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 
 Array = NDArray[Any]
 
+_SCENES_AT_ONCE = 4  # tables of more do not stay in the cache: 64 scenes of 512 x 512 px take TODO s instead of TODO
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
 
 
@@ -76,8 +80,29 @@ class SampledRows:
             bands[d : self.count, width - d] = bands[: self.count - d, width + d].conj()
         return bands
 
+    def of_scenes(self, part: slice) -> "SampledRows":
+        """The rows of some of the scenes."""
+        slabs = slice(part.start * self.slabs, part.stop * self.slabs)
+        tables = (self.spectra, self.taps, self.base, self.weight)
+        spectra, taps, base, weight = (values[slabs] for values in tables)
+        return replace(self, spectra=spectra, taps=taps, base=base, weight=weight)
+
     def explain(self, precisions: list[Array]) -> Explained:
         """Fit the scenes with each of n priors, products (p + 1, p + 1, S, F) as from ``RowPrior.precision``."""
+        scenes = len(self.base) // self.slabs
+        parts = runs(scenes, min(_SCENES_AT_ONCE, -(-scenes // allowed_threads())))
+        explained = in_parallel(
+            lambda part: self.of_scenes(part)._explained([products[:, :, part] for products in precisions]),
+            parts,
+            torch.device("cpu"),
+        )
+        power, freedom = (
+            np.concatenate([getattr(part, name) for part in explained], 1) for name in ("power", "freedom")
+        )
+        return Explained(power, freedom, np.concatenate([part.count for part in explained]))
+
+    def _explained(self, precisions: list[Array]) -> Explained:
+        """``explain`` of all scenes together."""
         number, groups, frequencies = len(precisions), len(self.base), len(self.u)
         width = max(self.taps.shape[2] - 1, len(precisions[0]) - 1)
         # n - d log det A / d log s are the degrees of freedom, with the strength s of the prior: a difference quotient
@@ -183,11 +208,11 @@ def sample_rows(
     transformed = (images[..., : slabs * height, :] @ tapered - mean * tapered.sum(0)).cpu().numpy()
     spectra = transformed[..., : len(chosen)] + 1j * transformed[..., len(chosen) :]
     # kernels of the rows at these frequencies
-    tables = (kernels.first, kernels.taps, kernels.middle, kernels.along, kernels.weight)
-    first, taps, middle, along, weight = (table[:, : slabs * height].cpu().numpy() for table in tables)
     u = chosen / width
-    waves = np.exp(-2j * np.pi * along[..., None] * u)
-    kernel = (taps @ waves).astype(spectra.dtype)  # (S M, R, J, F)
+    frequencies = torch.from_numpy(u).to(images.device)
+    kernel_on_device = kernels.taps.to(torch.complex128) @ waves(kernels.along, frequencies)  # (S M, R, J, F)
+    tables = (kernel_on_device.to(images.dtype.to_complex()), kernels.first, kernels.middle, kernels.weight)
+    kernel, first, middle, weight = (table[:, : slabs * height].cpu().numpy() for table in tables)
     phase = np.exp(2j * np.pi * middle[..., None] * u).astype(spectra.dtype)
     spectra = spectra * phase.reshape(scenes, members, 1, -1, len(u))
 
