@@ -1,14 +1,17 @@
 """Where in a recorded frame each pixel of the restored frame was recorded."""
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 
 # Columns at which displacements that differ along a row are computed; a polynomial interpolates them. Without a camera,
@@ -16,6 +19,9 @@ from rsvib_torch.motion.timing import SensorTiming
 # strong distortion, the error is 1e-9 px with 5 px and 5 mrad of roll at 400 Hz, 1e-7 px with a random free motion of
 # 3 px and 2 mrad.
 _NODES, _NODES_WITH_CAMERA = 5, 17
+_PERIOD_STEP = 0.01  # periods of the fastest tone between knots of a spline; its error is 4e-8 of the amplitude
+_KNOT_STEP = 0.05  # of the time between the knots of a free motion; white noise at knots finer than rows: 5e-5 of it
+_BESIDE = 16  # rows beyond half of the frame on each side, for which the motion is known; the sensor has none there
 _CLOSE = 1e-6  # px, change of a position in the last round
 _ROUNDS = 60  # at most; 5 suffice for 5 px at 100 Hz and 20 us per row
 
@@ -37,20 +43,26 @@ def recorded_offsets(
     count, length = (height, width) if along == 1 else (width, height)
     nodes = 1 if motion.same_for_all_columns else _NODES if motion.camera is None else _NODES_WITH_CAMERA
     columns, weights = _interpolation(length, min(nodes, length))
-    pixels = torch.empty(2, count, len(columns), dtype=torch.float64, device=motion.device)
-    pixels[along] = torch.arange(count, device=motion.device)[:, None]
-    pixels[across] = torch.from_numpy(columns).to(motion.device)
-    still = pixels if shift is None else pixels - shift[:2, None, None]
+    pixels = torch.empty(2, count, len(columns), dtype=torch.float64)
+    pixels[along] = torch.arange(count)[:, None]
+    pixels[across] = torch.from_numpy(columns)
+    still = pixels if shift is None else pixels - shift[:2, None, None].cpu()
     x, y = still[0] - 0.5 * (width - 1), still[1] - 0.5 * (height - 1)
-    start = timing.frame_starts(frame + 1, motion.device)[frame]
+    # Mean displacements as a spline of the row, also beyond the frame.
+    start, fastest = timing.frame_starts(frame + 1)[frame].item(), float(motion.periods_within(timing.row_time).max())
+    knots = motion.spacing / timing.row_time if isinstance(motion, FreeMotion) else math.inf  # rows
+    step = min(0.5, _PERIOD_STEP / max(fastest, 1e-12), _KNOT_STEP * knots)
+    grid = np.arange(-0.5 * count - _BESIDE, 1.5 * count + _BESIDE, step)
+    of_grid = motion.mean_displacement(torch.from_numpy(start + grid * timing.row_time), timing.exposure_time)
+    of_rows = CubicSpline(grid, of_grid.detach().cpu().numpy())
     places = still
     for _ in range(_ROUNDS):  # the row of a place determines when it was recorded
         rows = places[along] if timing.readout_direction == "forward" else count - 1 - places[along]
-        moved = motion.mean_displacement(start + rows * timing.row_time, timing.exposure_time)
+        moved = torch.from_numpy(of_rows(rows.clamp(grid[0], grid[-1])))
         before, places = places, still + displacement_at(moved, x, y, motion.camera).movedim(-1, 0)
         if float((places[along] - before[along]).abs().max()) < _CLOSE:
             break
-    return (places - pixels).detach().cpu().numpy(), weights
+    return (places - pixels).numpy(), weights
 
 
 def _interpolation(length: int, count: int) -> tuple[Array, Array]:
