@@ -607,6 +607,12 @@ class ProcessVideoOptions(RunOptions, ResourceOptions):
         description="Largest displacement of a corner of a frame by ``steady``, in parts of the width or height; where "
         "the path would need more, it is smoothed less.",
     )
+    gyroscope: FilePath = Field(
+        default=None,
+        description='File with the rates of a gyroscope, as in ``read_gyroscope``, or ``"auto"``: the track of the '
+        "video itself. The path of the camera is its rotation by the gyroscope, instead of the path and the tones by "
+        "corners.",
+    )
     restoration: OptionTable = Field(
         default=None,
         description='``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames '

@@ -17,10 +17,14 @@ def entry(key, kind, size, count, content):
     return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
 
 
-def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None):
+def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None, turned=None):
     accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
     if first is not None:
         accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
+    if turned is not None:  # quaternions of the images against the camera
+        quaternions = np.round(32767 * np.asarray(turned)).astype(">i2")
+        accelerations = entry(b"SCAL", b"s", 2, 1, struct.pack(">h", 32767)) + accelerations
+        accelerations += entry(b"IORI", b"s", 8, len(quaternions), quaternions.tobytes())
     parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
     if stamp is not None:
         parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
@@ -35,13 +39,27 @@ def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None)
     return entry(b"DEVC", b"\0", 1, len(content), content)
 
 
-def mp4(path, packets, *, duration=300, timescale=1000, kind=b"gpmd", count=None, offsets=None):
+def mp4(path, packets, *, offsets=None, **options):
     """A video whose only track has the packets, each in a chunk of its own."""
     start = box(b"ftyp", b"mp41", b"\0\0\0\0")
-    places, place = [], len(start) + 8
-    for data in packets:
-        places.append(place)
-        place += len(data)
+    track = _track(packets, offsets or _places(packets, len(start) + 8), **options)
+    path.write_bytes(start + box(b"mdat", *packets) + box(b"moov", box(b"mvhd", b"\0" * 20), track))
+    return path
+
+
+def add_track(path, packets):
+    """Add a track with the packets to a video whose last box is moov."""
+    data = path.read_bytes()
+    place = data.rindex(b"moov") - 4
+    track = _track(packets, _places(packets, place + 8))
+    path.write_bytes(data[:place] + box(b"mdat", *packets) + box(b"moov", data[place + 8 :], track))
+
+
+def _places(packets, place):
+    return [place + sum(map(len, packets[:number])) for number in range(len(packets))]
+
+
+def _track(packets, places, *, duration=300, timescale=1000, kind=b"gpmd", count=None):
     number = len(packets) if count is None else count
     table = box(
         b"stbl",
@@ -49,12 +67,10 @@ def mp4(path, packets, *, duration=300, timescale=1000, kind=b"gpmd", count=None
         box(b"stts", struct.pack(">IIII", 0, 1, number, duration)),
         box(b"stsc", struct.pack(">IIIII", 0, 1, 1, 1, 1)),
         box(b"stsz", struct.pack(">III", 0, 0, number), *(struct.pack(">I", len(data)) for data in packets)),
-        box(b"stco", struct.pack(">II", 0, len(packets)), *(struct.pack(">I", at) for at in offsets or places)),
+        box(b"stco", struct.pack(">II", 0, len(packets)), *(struct.pack(">I", at) for at in places)),
     )
     header = box(b"mdhd", struct.pack(">IIIII", 0, 0, 0, timescale, 0), b"\0" * 4)
-    track = box(b"trak", box(b"mdia", header, box(b"minf", table)))
-    path.write_bytes(start + box(b"mdat", *packets) + box(b"moov", box(b"mvhd", b"\0" * 20), track))
-    return path
+    return box(b"trak", box(b"mdia", header, box(b"minf", table)))
 
 
 def packets_of(size=20, **options):

@@ -78,6 +78,11 @@ class RunOptions(RestorationCommand, PixelSizeOptions):
                 "crop_limit": {
                     "text": "With --steady, the largest shift of a corner, in parts of the width or height."
                 },
+                "gyroscope": {
+                    "text": "With --video, follow the rotation by a gyroscope instead of corners: a gyroflow "
+                    "log, a GoPro video or a CSV; auto: the track of the video itself.",
+                    "metavar": "FILE",
+                },
             },
         ),
     ]

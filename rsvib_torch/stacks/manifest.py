@@ -85,6 +85,8 @@ class StackManifest(Result, file_format="rsvib stack"):
         bad_frames: Index of each frame that could not be used, with the reason.
         not_kept: Metadata of the input that the output does not contain.
         margins: px that were cut off the sides of the frames of a video.
+        gyroscope: Of a video whose path is that of a gyroscope: its axes, clock and bias (rad/s), and the focal length
+            (px), as in ``RotationAlignment``.
         windows: Result of every window.
     """
 
@@ -96,6 +98,7 @@ class StackManifest(Result, file_format="rsvib stack"):
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()
     margins: dict[str, int] | None = None
+    gyroscope: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,6 +205,14 @@ class StackManifest(Result, file_format="rsvib stack"):
             text_table(*self.tone_table(pixel_size)),
             "median ± standard deviation over the windows",
         ]
+        if self.gyroscope is not None:
+            found = self.gyroscope
+            axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
+            vibration = [
+                f"rotation by the gyroscope, whose axes {axes} are x, y, z of the camera",
+                f"time 0 of the frames is {measured_text(found['offset'], found['offset_std'])} s of the gyroscope",
+                f"focal length {measured_text(found['focal_length'], found['focal_length_std'])} px",
+            ]
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
         followed = [record for record in self.windows if record.restored_frames is not None]
         if followed:

@@ -14,20 +14,24 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.validation import fields_of
+from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment
 from rsvib_torch.frames.entry_points import file_options
-from rsvib_torch.io.stack_format import FrameReader
+from rsvib_torch.io.gyroscope.read_gyroscope import read_gyroscope
+from rsvib_torch.io.stack_format import FrameReader, split_range
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS
 from rsvib_torch.io.video_parts import PartWriter, PlaneReader, join_parts, planes_of
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
-from rsvib_torch.stacks.manifest import manifest_header, rms_shaking
+from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
 from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
 from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
 from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, RestoredFrame, VideoRestorer
@@ -37,6 +41,9 @@ from rsvib_torch.tracking import Margins
 # A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible. Rows are
 # measured less well, because objects at other distances move beside them.
 _MORE_SHAKING, _VISIBLE_SHAKING = {"frame_to_frame": 1.1, "rows": 1.5}, 0.1  # -, px
+
+# What the manifest states of the alignment of a gyroscope.
+_OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
 Frame = NDArray[Any]
 Planes = list[Frame]
@@ -49,7 +56,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     The video is read twice. The first pass follows corners from frame to frame and fits, in overlapping windows of 96
     frames, the path of the camera (x, y, roll, zoom) and the tones of its vibration, each corner at the time of its
     row: hands, pans, parallax and moving objects do not disturb them. The second pass restores the frames: tones, and
-    with ``steady`` also the skew and wobble by the path, are undone, and the frames are moved to a smooth path. Frames
+    with ``steady`` also the skew and wobble by the path, are undone, and the frames are moved to a smooth path. With
+    ``gyroscope``, corners of 48 pairs of frames align its rates as in ``align_motion``; the path is the rotation of the
+    camera at the time of every row, with the vibration that the gyroscope resolves, and no tones are fitted. Frames
     of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
     ``"dewarp"``. Decoding, restoration and encoding run in threads.
 
@@ -75,26 +84,36 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         TypeError: If an option is unknown.
         ValueError: If a value is out of range, the source is not readable, margins leave nothing, an output would
             replace the input, input, settings or versions differ from those of the run to resume, frames have no motion
-            in common, or the result shakes more than the source.
+            in common, the alignment of the gyroscope is not reliable, or the result shakes more than the source.
 
     Example:
         >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
     """
     source, sink = Path(source), Path(sink)
     border = options.border
-    video, at_once = _planned(source, timing, options)
+    recording = None if options.gyroscope is None else Path(options.gyroscope)
+    if recording == Path("auto"):
+        recording = split_range(source)[0]
+    rates = None if recording is None else read_gyroscope(recording)
+    video, at_once = _planned(source, timing, options, rates)
     job = video.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     target = manifest_path(sink, options)
-    check_outputs([sink, work_folder(sink), target], stack_files(source))
+    inputs = [*stack_files(source), *([] if recording is None else [recording])]
+    check_outputs([sink, work_folder(sink), target], inputs)
     content = job.content(job.info, timing)
     if border != "crop":
         check_info_target(sink, content, check_folder=False)
     header = manifest_header(job, sink.name, None)
     header["settings"] |= {
         "window": None,  # for the commands that read manifests: parts are not windows of their own
-        "video": {"border": border, "steady": options.steady, "crop_limit": options.crop_limit},
+        "video": {
+            "border": border,
+            "steady": options.steady,
+            "crop_limit": options.crop_limit,
+            "gyroscope": None if recording is None else fingerprint(recording),
+        },
     }
 
     def compute(folder: RunFolder) -> dict[str, Any]:
@@ -109,7 +128,10 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             with closing(_Encoder(folder, sink, content, planes)) as encoder:
                 _restore_parts(video, motion, folder, encoder, border, margins, at_once, shown)
         _check_shaking(folder)
-        return {"margins": None if margins is None else asdict(margins)}
+        gyroscope = None
+        if isinstance(motion.path, RotationAlignment):
+            gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
+        return {"margins": None if margins is None else asdict(margins), "gyroscope": gyroscope}
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
@@ -203,7 +225,9 @@ class _Progress:
             self._show(self._done // 2, self._count)
 
 
-def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -> tuple[VideoPasses, int]:
+def _planned(
+    source: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
+) -> tuple[VideoPasses, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
     given = single_frame_options(options.restoration)
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
@@ -223,7 +247,7 @@ def _planned(source: Path, timing: SensorTiming, options: ProcessVideoOptions) -
     restorer = VideoRestorer(layout, job.timing, method, job.device, masks=options.border != "mirror")
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
-    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit), at_once
+    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit, rates), at_once
 
 
 def _restore_parts(

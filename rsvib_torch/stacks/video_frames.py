@@ -16,6 +16,7 @@ from torch import Tensor
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.motion.sampling import source_map
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
@@ -31,7 +32,7 @@ class FrameTrack:
 
     index: int  # number of the frame
     time: float  # s, exposure start of its first row, from the first frame
-    motion: Vibration  # the motion to remove, in image axes; its time origin is the middle of the frame
+    motion: Vibration | FreeMotion  # the motion to remove, in image axes; its time origin is the middle of the frame
     fault: str | None = None  # why the frame could not be used; None if it was used
 
 
@@ -135,7 +136,8 @@ class VideoRestorer:
         visible: list[NDArray[np.bool_]] = []
         for number, plane in enumerate(planes):
             motion, timing = (track.motion if number == 0 else _on_half_pixels(track.motion)), self.timing_of(number)
-            if number == 0 and self.options.method != "dewarp" and bool((motion.amplitude > 0).any()):
+            separately = number == 0 and self.options.method != "dewarp"
+            if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
                 # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
                 rowwise = motion.translation()
                 plane = self._without_vibration(plane, timing, replace(rowwise, image_shift=torch.zeros(2)))  # noqa: PLW2901
@@ -186,6 +188,10 @@ def moved_back(plane: Frame, source: NDArray[np.float32]) -> Frame:
     return moved.reshape(plane.shape).astype(plane.dtype)
 
 
-def _on_half_pixels(motion: Vibration) -> Vibration:
+def _on_half_pixels(motion: Vibration | FreeMotion) -> Vibration | FreeMotion:
     """The motion in pixels of chroma, which are twice as large; roll and zoom are the same."""
-    return motion.scaled(torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64))
+    factors = torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64)
+    if isinstance(motion, Vibration):
+        return motion.scaled(factors)
+    camera = motion.camera and replace(motion.camera, focal_length=0.5 * motion.camera.focal_length)
+    return FreeMotion(motion.coefficients * factors[:, None], motion.start, motion.spacing, camera=camera)

@@ -14,13 +14,17 @@ from numpy.typing import NDArray
 from rsvib_torch.core.prefetch import prefetched
 from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.tables import Array
+from rsvib_torch.core.tables import Array, tensor
+from rsvib_torch.detection.recorded.corner_tracks import followed_pair, tracks_of_pairs
+from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import FrameError
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import planes_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.sampling import recorded_offsets
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.restoration import RestorationVerdict
@@ -29,9 +33,11 @@ from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestor
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.tracking import Margins
 from rsvib_torch.tracking.camera_path import CameraPath, Tone, camera_path, shake
-from rsvib_torch.tracking.steadying import steady_places
+from rsvib_torch.tracking.recorded_rotation import RecordedRotation
+from rsvib_torch.tracking.steadying import steady_shifts
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
+_COMPARED_PAIRS = 48  # of frames, over the whole video, by which a gyroscope is aligned
 CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
@@ -45,12 +51,9 @@ Frame = NDArray[Any]
 class VideoMotion:
     """The motion of all frames of a video."""
 
-    path: CameraPath  # of the camera
+    path: CameraPath | RotationAlignment  # of the camera, from corners or by a gyroscope
     times: Array  # (N,) s, middle of every frame
-    places: Array  # (N, 4) path
-    steady: Array  # (N, 4) where the frames are moved to
-    velocity: Array  # (N, 4) per s
-    acceleration: Array  # (N, 4) per s^2
+    removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
     faults: dict[int, str]  # number of each frame that could not be used, with the reason
     shakes: dict[int, tuple[Array, float]]  # ``shake`` between the frame of this number and the next one
 
@@ -65,6 +68,7 @@ class VideoPasses:
     starts: list[float]  # s, exposure start of every frame, from the first one
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
+    rates: AngularRates | None  # of a gyroscope, whose rotation is the path
 
     @property
     def parts(self) -> int:
@@ -99,6 +103,8 @@ class VideoPasses:
         """The motion of all frames, from corners that are followed from each usable frame to the next one."""
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
+        chosen = np.linspace(0, len(self.starts) - 2, _COMPARED_PAIRS).astype(int) if self.rates is not None else ()
+        compared: dict[int, Corners] = {}  # with a gyroscope, corners between the chosen frames and the next ones
 
         def pairs() -> Iterator[Corners | None]:
             before: tuple[int, NDArray[np.uint8]] | None = None
@@ -117,39 +123,63 @@ class VideoPasses:
                     if before is not None:
                         if corners is not None and before[0] == index - 1:
                             shakes[index - 1] = shake(corners)
+                        if before[0] == index - 1 in chosen:
+                            starts = self.starts[index - 1 : index + 1]
+                            compared[index - 1] = followed_pair(before[1], grey, starts, self.job.timing)
                         yield corners
                     before = index, grey
 
         timing = self.job.timing
         rows = self.layout.size[0 if timing.scan_axis == -2 else 1]
-        path = camera_path(pairs(), timing, self.layout.size)
-        times = np.array(self.starts) + 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
-        places = path.places(times)
-        return VideoMotion(
-            path,
-            times,
-            places,
-            steady_places(times, places, self.steady, self.layout.size, self.crop_limit),
-            path.derivatives(times, 1),
-            path.derivatives(times, 2),
-            faults,
-            shakes,
-        )
+        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        times = np.array(self.starts) + half
+        if self.rates is None:
+            path = camera_path(pairs(), timing, self.layout.size)
+            places = path.places(times)
+            shift = self._to_steady(times, lambda number, others: places[others] - places[number])
+            polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
 
-    def track(self, motion: VideoMotion, index: int) -> FrameTrack:
-        """What is removed from a frame: the tones, skew and wobble by the path, and what the path is not smooth by."""
-        tones = motion.path.tones(float(motion.times[index]))
-        polynomial = [motion.velocity[index], motion.acceleration[index], motion.places[index] - motion.steady[index]]
+            def by_corners(index: int) -> Vibration:
+                return self._removed(path.tones(float(times[index])), polynomials[index])
+
+            return VideoMotion(path, times, by_corners, faults, shakes)
+        for _ in pairs():  # for ``compared``, and for the shaking
+            pass
+        found = self._alignment(self.rates, compared)
+        rotation = RecordedRotation.aligned(self.rates, found, times)
+        turned = self._to_steady(times, rotation.apart)
+        return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
+
+    def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
+        return steady_shifts(times, apart, self.steady, self.layout.size, self.crop_limit)
+
+    def _alignment(self, rates: AngularRates, pairs: dict[int, Corners]) -> RotationAlignment:
+        """The alignment of the gyroscope by the corners between some frames, by number, and the next ones."""
+        source = f"the gyroscope ({rates.source})"
+        if not pairs:
+            raise ValueError(f"{source} cannot be compared with the video: it has no two different frames in sequence")
+        timing, size = self.job.timing, self.layout.size
+        starts = np.array([self.starts[index : index + 2] for index in pairs])
+        tracks = tracks_of_pairs(list(pairs.values()), starts, timing, size)
+        found = align_rates(tracks, tensor(starts), size if timing.scan_axis == -2 else size[::-1], timing, rates)
+        if not found.reliable:
+            raise ValueError(f"{source} does not fit the video: {'; '.join(found.reasons)}")
+        return found
+
+    def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
+        """The tones, skew and wobble by the path, and what the path is not smooth by."""
         if self.steady == 0:  # axes without vibration stay as taken
-            vibrates = np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
-            polynomial = [values * vibrates for values in polynomial]
+            polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
         height, width = self.layout.size
         seconds = 0.5 * self.job.timing.row_time * max(height, width)
-        reach = np.abs(np.array(polynomial)) * np.array([[seconds], [seconds**2], [1.0]])
+        reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
         axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
         amplitude, frequency, phase = tone_tables(tones, axes)
-        motion_of = Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
-        return FrameTrack(index, self.starts[index], motion_of, motion.faults.get(index))
+        return Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
+
+    def track(self, motion: VideoMotion, index: int) -> FrameTrack:
+        """What is removed from a frame."""
+        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index))
 
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
@@ -187,6 +217,8 @@ class VideoPasses:
     def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
         (first, one), (_, other) = frames
+        if not isinstance(first.motion, Vibration):
+            return None
         pixels = np.stack([self.layout.luma(one), self.layout.luma(other)])
         images = counts_to_frames(pixels, self.layout.full_scale, str(self.job.source)).to(self.job.device)
         motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
@@ -202,12 +234,13 @@ class VideoPasses:
         first_frames: list[Frame],
     ) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
-        detection = self._detection(motion, tracks)
+        path = motion.path
+        detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
         faults = {str(track.index): track.fault for track in tracks if track.fault is not None}
         moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
         left = [
             Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
-            for name, why in zip(AXIS_NAMES, detection.reasons, strict=False)
+            for name, why in zip(AXIS_NAMES, detection.reasons if detection else (), strict=False)
             if why
         ]
         return {
@@ -217,7 +250,7 @@ class VideoPasses:
             "start_time": tracks[0].time,
             "written": len(tracks),
             "frames": "restored" if moved else "as taken",
-            "detection": plain_values(detection),
+            "detection": detection and plain_values(detection),
             "left_alone": plain_values(left),
             "outcome": None if verdict is None else verdict.overall,
             "summary": None if verdict is None else verdict.sentence,
@@ -227,9 +260,9 @@ class VideoPasses:
             "shaking": self.shaking(motion, tracks[0].index, first_frames),
         }
 
-    def _detection(self, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:
+    def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
         """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
-        window = motion.path.nearest(float(motion.times[tracks[len(tracks) // 2].index]))
+        window = path.nearest(float(times[tracks[len(tracks) // 2].index]))
         tones = [tone.at(tracks[0].time - window.origin) for tone in window.tones]
         amplitude, frequency, phase = tone_tables(tones, 2)
         size, rate = (np.full_like(amplitude, math.inf) for _ in range(2))
@@ -244,8 +277,9 @@ class VideoPasses:
             period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
         unknown = np.full(2, math.inf)
         values = (size, rate, period_std, phase_std, unknown, unknown)
-        index = tracks[0].index
-        vibration = Vibration(amplitude, frequency, phase, motion.velocity[index, :2], motion.acceleration[index, :2])
+        begin = times[[tracks[0].index]]
+        velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
+        vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = tuple(self._findings(axis, tones) for axis in (0, 1))
         return DetectedVibration(
             vibration=vibration,

@@ -1,15 +1,12 @@
 """Alignment of a gyroscope with frames of an independent camera: axes, bias, clock, focal length, row time."""
 
-import itertools
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import map_coordinates, spline_filter
-from scipy.spatial.transform import Rotation
-from truth import draw_scene
+from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, SIZE, TIMING, attitude, recorded, take
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import run_command
@@ -18,61 +15,7 @@ from rsvib_torch.detection.recorded.corner_tracks import CornerTracks, corner_tr
 from rsvib_torch.detection.recorded.rotation_alignment import align_rates
 from rsvib_torch.detection.recorded.rotation_search import ORIENTATIONS, search_orientations
 
-FOCAL_LENGTH, SIZE, COUNT = 380.0, (200, 216), 4
-BIAS, OFFSET = (0.012, -0.02, 0.008), 0.35
-TIMING = rsv.SensorTiming(row_time=8e-5, exposure_rows=10, frame_rows=420)
-
-
-def attitude(times, size=1.0):
-    """Attitude of the camera: rotations about its axes z, y, x one after another, each a sum of two tones."""
-    angles = [
-        size * a * np.sin(2 * np.pi * f * times + p) + size * b * np.sin(2 * np.pi * g * times + q)
-        for a, f, p, b, g, q in (
-            (4e-3, 7.1, 0.2, 2e-3, 17.3, 1.0),
-            (3e-3, 9.7, 1.2, 2e-3, 21.1, 0.1),
-            (4e-3, 6.3, 2.2, 3e-3, 14.9, 0.6),
-        )
-    ]
-    return Rotation.from_euler("ZYX", np.stack(angles, -1))
-
-
-def rates_of(times, size=1.0, step=1e-6):
-    """Angular rates (N, 3) about the axes of the camera, by the difference of two attitudes."""
-    return (attitude(times - step, size).inv() * attitude(times + step, size)).as_rotvec() / (2 * step)
-
-
-def take(timing, size=1.0, *, noise=0.003, dashboard=0, count=COUNT):
-    """Frames (T, H, W) of a distant scene, and of what is fixed to the camera in the last ``dashboard`` rows."""
-    height, width = SIZE
-    scene = draw_scene(height + 60, width + 60, 5)
-    coefficients = spline_filter(scene, 5)
-    row, column = np.mgrid[:height, :width].astype(float)
-    line, lines = (row, height) if timing.scan_axis == -2 else (column, width)
-    line = lines - 1 - line if timing.readout_direction == "reverse" else line
-    ray = np.stack([column - (width - 1) / 2, row - (height - 1) / 2, np.full_like(row, FOCAL_LENGTH)], -1)
-    frames = np.zeros((count, height, width))
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    for frame, (node, weight) in itertools.product(range(count), zip(nodes, weights, strict=True)):
-        times = frame * timing.frame_period + line * timing.row_time + (node + 1) / 2 * timing.exposure_time
-        seen = attitude(times.ravel(), size).apply(ray.reshape(-1, 3)).reshape(ray.shape)
-        seen = FOCAL_LENGTH * seen[..., :2] / seen[..., 2:] + (np.array(scene.shape[::-1]) - 1) / 2
-        frames[frame] += (
-            weight / 2 * map_coordinates(coefficients, [seen[..., 1], seen[..., 0]], order=5, prefilter=False)
-        )
-    if dashboard:
-        frames[:, -dashboard:] = draw_scene(dashboard, width, 9)
-    frames += noise * np.random.default_rng(1).standard_normal(frames.shape)
-    return torch.from_numpy(frames).float()
-
-
-def recorded(orientation="XYZ", size=1.0, mirrored=1.0):
-    """Rates about the axes of a gyroscope, for an assignment of the axes of the camera."""
-    times = np.arange(-0.04, 0.2, 1e-3)
-    of_camera, own = rates_of(times, size), np.zeros((len(times), 3))
-    for axis, letter in enumerate(orientation):
-        own[:, "xyz".index(letter.lower())] = of_camera[:, axis] * (1.0 if letter.isupper() else -1.0)
-    own[:, 0] *= mirrored
-    return rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
+STARTS = TIMING.frame_starts(COUNT).unfold(0, 2, 1)  # s, of both frames of each pair
 
 
 @pytest.fixture(scope="module", name="frames")
@@ -88,7 +31,7 @@ def make_tracks(frames):
 def aligned(tracks, rates, camera=None):
     """``align_motion`` of frames whose corners were followed before."""
     options = {"offsets": None, "fit_scale": True, "fit_focal_length": camera is None, "fit_row_time": False}
-    return align_rates(tracks, (COUNT, *SIZE), TIMING, rates, camera, **options)
+    return align_rates(tracks, STARTS, SIZE, TIMING, rates, camera, **options)
 
 
 def check(found, orientation, *, limit=4.0):
@@ -211,7 +154,7 @@ def test_recording_of_another_motion_is_refused(tracks):
 def test_offset_outside_the_given_ones_is_refused(tracks):
     options = {"fit_scale": True, "fit_focal_length": False, "fit_row_time": False}
     limits = (OFFSET + 0.004, OFFSET + 0.01)
-    found = align_rates(tracks, (COUNT, *SIZE), TIMING, recorded(), rsv.Camera(FOCAL_LENGTH), offsets=limits, **options)
+    found = align_rates(tracks, STARTS, SIZE, TIMING, recorded(), rsv.Camera(FOCAL_LENGTH), offsets=limits, **options)
     assert "offset_outside" in {reason.code for reason in found.findings}
 
 
@@ -297,7 +240,9 @@ def test_translation_of_the_camera_is_no_bias(axes, speed):
         own[:, "xyz".index(letter.lower())] = rates[:, axis] * (1.0 if letter.isupper() else -1.0)
     recording = rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
     options = {"offsets": None, "fit_scale": True, "fit_focal_length": True, "fit_row_time": True}
-    found = align_rates(tracks, (pairs + 1, 480, 640), replace(timing, row_time=4.5e-5), recording, None, **options)
+    wrong = replace(timing, row_time=4.5e-5)
+    every = torch.arange(pairs + 1, dtype=torch.float64).unfold(0, 2, 1) * timing.frame_period
+    found = align_rates(tracks, every, (480, 640), wrong, recording, None, **options)
     assert found.reliable, found.reasons
     assert found.orientation == axes
     assert abs(found.offset - OFFSET) < min(4 * found.offset_std, 3e-4)

@@ -170,3 +170,10 @@ def test_decimal_commas_and_repeated_columns_are_refused(tmp_path, columns, row,
     )
     with pytest.raises(ValueError, match=message.format("gcsv").replace("line 2", "line 8").replace("'x'", "'gx'")):
         rsv.read_gyroscope(log)
+
+
+@pytest.mark.parametrize(("turned", "stated"), [((1.0, 0.0, 0.0, 0.0), False), ((0.9998, 0.0, 0.02, 0.0), True)])
+def test_images_that_the_camera_has_stabilised_are_stated(tmp_path, turned, stated):
+    found = rsv.read_gyroscope(mp4(tmp_path / "clip.mp4", packets_of(turned=[turned] * 3)))
+    assert ("IORI" in found.source) == stated
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-9)

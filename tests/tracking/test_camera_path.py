@@ -8,7 +8,7 @@ from truth import draw_scene
 from rsvib_torch import SensorTiming
 from rsvib_torch.registration.corners import CornerFollower
 from rsvib_torch.tracking.camera_path import camera_path, shake
-from rsvib_torch.tracking.steadying import largest_displacement, steady_places
+from rsvib_torch.tracking.steadying import largest_displacement, steady_shifts
 
 HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 48, 30.0, 3
 TIMING = SensorTiming(row_time=90e-6, exposure_rows=20, frame_rows=1 / RATE / 90e-6)
@@ -101,14 +101,14 @@ def test_unrelated_frames_have_no_path():
 def test_the_smooth_path_keeps_slow_motion_and_the_limit():
     times = np.arange(150) / RATE
     places = hand(times).T
-    steady = steady_places(times, places, 0.5, (HEIGHT, WIDTH), 0.4)
+
+    def shifts(duration, limit):
+        return steady_shifts(times, lambda one, others: places[others] - places[one], duration, (HEIGHT, WIDTH), limit)
+
+    steady = places - shifts(0.5, 0.4)
     jitter = [np.abs(np.diff(path[:, :2], 3, axis=0)).mean() for path in (places, steady)]
     assert jitter[1] < 0.05 * jitter[0]
     assert np.abs(steady[:, 0].mean() - places[:, 0].mean()) < 1.0
-    limited = steady_places(times, places, 2.0, (HEIGHT, WIDTH), 0.02)
-    assert (
-        largest_displacement(places - steady_places(times, places, 2.0, (HEIGHT, WIDTH), 0.4), (HEIGHT, WIDTH)).max()
-        > 0.03
-    )
-    assert largest_displacement(places - limited, (HEIGHT, WIDTH)).max() <= 0.021
-    assert np.array_equal(steady_places(times, places, 0.0, (HEIGHT, WIDTH), 0.1), places)
+    assert largest_displacement(shifts(2.0, 0.4), (HEIGHT, WIDTH)).max() > 0.03
+    assert largest_displacement(shifts(2.0, 0.02), (HEIGHT, WIDTH)).max() <= 0.021
+    assert not shifts(0.0, 0.1).any()

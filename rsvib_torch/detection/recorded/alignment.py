@@ -246,9 +246,11 @@ def align_motion(
     grey = stack.images
     if isinstance(recorded, AngularRates):
         valid = None if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
+        starts = timing.in_row_order().frame_starts(grey.shape[1]).cpu()
         return align_rates(
             corner_tracks(frames_from_row_order(grey[0], timing), valid, timing),
-            grey.shape[1:],
+            torch.stack([starts[:-1], starts[1:]], -1),
+            grey.shape[2:],
             timing,
             recorded,
             options.camera,

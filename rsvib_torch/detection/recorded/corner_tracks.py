@@ -1,5 +1,6 @@
 """Corners that are followed between consecutive frames, with the times at which their rows were exposed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -8,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.tables import tensor
+from rsvib_torch.core.tables import Array, tensor
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.registration.corners import CornerFollower, Corners
+from rsvib_torch.registration.corners import CornerFollower, Corners, Grey
 
 CELL_ROWS, CELL_COLUMNS = 6, 8  # cells of a frame, in which residuals may be alike
 _MOST_CORNERS = 480  # of a pair of frames
@@ -65,17 +66,37 @@ def corner_tracks(frames: Tensor, valid: Tensor | None, timing: SensorTiming) ->
         grey = (255 * levels.clip(0, 1)).round().astype(np.uint8)
         followed = follower.next(grey, start, None if valid is None else _inner(valid[number]))
         pairs += [] if followed is None else [followed]
+    return tracks_of_pairs(pairs, np.stack([starts[:-1], starts[1:]], -1), timing, (frames.shape[1], frames.shape[2]))
+
+
+def followed_pair(first: Grey, second: Grey, starts: Sequence[float], timing: SensorTiming) -> Corners:
+    """Corners between two grey frames (H, W), whose exposures start at ``starts`` (2,) in s."""
+    follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
+    follower.next(first, starts[0])
+    followed = follower.next(second, starts[1])
+    assert followed is not None
+    return followed
+
+
+def tracks_of_pairs(
+    pairs: Sequence[Corners], starts: Array, timing: SensorTiming, size: tuple[int, int]
+) -> CornerTracks:
+    """The corners of pairs of frames (height, width) = ``size`` whose exposures start at ``starts`` (P, 2) in s.
+
+    Raises:
+        ValueError: If fewer than half of the pairs have enough corners.
+    """
     enough = np.array([len(pair.rows) >= _LEAST_CORNERS for pair in pairs])
     if enough.mean() < 0.5:
         raise ValueError(
             f"only {enough.sum()} of {len(pairs)} pairs of frames have {_LEAST_CORNERS} corners that can be followed: "
             "the frames have too little detail, or show different scenes"
         )
-    (height, width), corners = frames.shape[1:], Corners.joined(pairs)
+    (height, width), corners = size, Corners.joined(pairs)
     used = enough[corners.pairs]
     pair, offsets, times = corners.pairs[used], corners.offsets[used], corners.times[used]
     place = corners.places[used] - 0.5 * offsets
-    of_frames = np.stack([starts[:-1], starts[1:]], -1)[pair]
+    of_frames = starts[pair]
     cells = np.floor((place / [width, height] + 0.5) * [CELL_COLUMNS, CELL_ROWS]).astype(np.int64)
     return CornerTracks(
         pair=torch.from_numpy(pair),

@@ -151,24 +151,27 @@ class RotationAlignment(
 
 def align_rates(
     tracks: CornerTracks,
-    shape: Sequence[int],
+    starts: Tensor,
+    size: Sequence[int],
     timing: SensorTiming,
     rates: AngularRates,
-    camera: Camera | None,
+    camera: Camera | None = None,
     *,
-    offsets: tuple[float, float] | None,
-    fit_scale: bool,
-    fit_focal_length: bool,
-    fit_row_time: bool,
+    offsets: tuple[float, float] | None = None,
+    fit_scale: bool = True,
+    fit_focal_length: bool = True,
+    fit_row_time: bool = False,
 ) -> RotationAlignment:
-    """``align_motion`` for angular rates, from the ``corner_tracks`` of a stack of ``shape`` (T, H, W)."""
-    count, height, width = shape
+    """``align_motion`` for angular rates, from the corners of pairs of frames.
+
+    The frames have ``size`` (rows, pixels of a row); their exposures start at ``starts`` (P, 2) in s.
+    """
+    height, width = size
     if camera is not None:
         camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
-    starts = timing.in_row_order().frame_starts(count).cpu()
-    last = float(starts[-1]) + height * timing.row_time + timing.exposure_time
-    limits = offset_range(rates, float(starts[0]), last, offsets)
-    middle = 0.5 * (float(starts[0]) + last)
+    begin, last = float(starts[0, 0]), float(starts[-1, 1]) + height * timing.row_time + timing.exposure_time
+    limits = offset_range(rates, begin, last, offsets)
+    middle = 0.5 * (begin + last)
     known = None if fit_focal_length else camera
     free = [True, True, True, True, fit_scale, fit_focal_length, fit_row_time]
 
@@ -227,12 +230,10 @@ def _result(
     gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
     offset, offset_std = at - scale * model.middle, float(gradient @ fit.covariance @ gradient) ** 0.5
     middles = starts + 0.5 * (height - 1) * row_time + 0.5 * model.exposure_time
-    predicted = components_of(
-        model.rates, model.orientation, fit.parameters, torch.stack([middles[:-1], middles[1:]], -1), model.middle
-    )
+    predicted = components_of(model.rates, model.orientation, fit.parameters, middles, model.middle)
     units = torch.tensor([1.0, 1.0, 1 / radius], dtype=torch.float64)
     unexplained = fit.errors.effects[:3] * units
-    first, last = float(middles[0]) - 0.5 * height * row_time, float(middles[-1]) + 0.5 * height * row_time
+    first, last = float(middles[0, 0]) - 0.5 * height * row_time, float(middles[-1, 1]) + 0.5 * height * row_time
     clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
 
     moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
@@ -247,7 +248,7 @@ def _result(
     longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
     if longest > allowed:
         reasons.append(Reason("gap_in_recording", None, longest, allowed))
-    readout, shortest = row_time * height, float(starts.diff().amin())
+    readout, shortest = row_time * height, float(starts.diff(dim=1).amin())
     if readout > shortest:
         reasons.append(Reason("readout_too_long", None, readout, shortest, {"rows": height}))
     translation = fit.translation + fit.effects[:, 3:]
@@ -267,7 +268,7 @@ def _result(
         translation=translation / torch.tensor([-focal_length, -focal_length, radius], dtype=torch.float64),
         unexplained=unexplained,
         corner_std=fit.errors.sigma,
-        times=0.5 * (middles[:-1] + middles[1:]),
+        times=middles.mean(1),
         measured=predicted + fit.unshrunk() * units,
         predicted=predicted,
         reliable=not reasons,

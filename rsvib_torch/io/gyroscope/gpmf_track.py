@@ -7,7 +7,7 @@ one stream of each kind the samples (GYRO) after their scale (SCAL).
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 Array = NDArray[np.float64]
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
+_SMALLEST_TURN = 1e-3  # half of an angle in rad; 1 px with a focal length of 500 px
 
 _NUMBERS = {
     b"b": "i1", b"B": "u1", b"s": ">i2", b"S": ">u2", b"l": ">i4", b"L": ">u4", b"f": ">f4", b"d": ">f8", b"j": ">i8",
@@ -43,6 +44,8 @@ def read_gpmf(path: Path) -> AngularRates:
     rates = np.concatenate([part.rates for part in parts])
     orientation = parts[0].orientation
     source = f"{path.name}, GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
+    if any(part.stabilised for part in parts):
+        source += ", images that the camera has stabilised (IORI)"
     rates = oriented(rates, orientation) if orientation else rates
     return angular_rates(path, _sample_times(parts), rates, source)
 
@@ -94,6 +97,7 @@ class _Part:
         earliest: The earliest time that any stream of the packet states; None if none states one.
         total: Samples up to the end of the packet that it states; None if it states none.
         orientation: Axes in the order of the file; empty if they are not stated.
+        stabilised: Whether the images are turned against the camera.
     """
 
     rates: Array
@@ -103,6 +107,7 @@ class _Part:
     earliest: float | None
     total: int | None
     orientation: str
+    stabilised: bool = False
 
 
 def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
@@ -148,7 +153,7 @@ def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
             part = next(filter(None, (_part(stream, packet, earliest) for stream in streams)), None)
             if part is not None:
                 chosen = number
-                yield part
+                yield replace(part, stabilised=any(map(_turns_images, streams)))
                 break
 
 
@@ -156,6 +161,15 @@ def _stamp(stream: bytes) -> float | None:
     """Time of the first sample of a stream in s on the clock of the camera; None if it is not stated."""
     found = next(((kind, size, content) for key, kind, size, _, content in _entries(stream) if key == b"STMP"), None)
     return None if found is None else float(_values(*found)[0, 0]) * 1e-6
+
+
+def _turns_images(stream: bytes) -> bool:
+    """Whether a stream has orientations of the images against the camera (IORI, quaternions w, x, y, z) that differ."""
+    found = next(((kind, size, content) for key, kind, size, _, content in _entries(stream) if key == b"IORI"), None)
+    if found is None:
+        return False
+    quaternions = _values(*found)
+    return bool((np.abs(quaternions[:, 1:]) > _SMALLEST_TURN * np.abs(quaternions[:, :1])).any())
 
 
 def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | None:

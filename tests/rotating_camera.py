@@ -1,0 +1,73 @@
+"""A pinhole camera that turns, apart from the package: frames of a distant scene, and the rates of a gyroscope."""
+
+import itertools
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates, spline_filter
+from scipy.spatial.transform import Rotation
+from truth import draw_scene
+
+import rsvib_torch as rsv
+
+FOCAL_LENGTH, SIZE, COUNT = 380.0, (200, 216), 4
+BIAS, OFFSET = (0.012, -0.02, 0.008), 0.35
+TIMING = rsv.SensorTiming(row_time=8e-5, exposure_rows=10, frame_rows=420)
+
+
+def attitude(times, size=1.0):
+    """Attitude of the camera: rotations about its axes z, y, x one after another, each a sum of two tones."""
+    angles = [
+        size * a * np.sin(2 * np.pi * f * times + p) + size * b * np.sin(2 * np.pi * g * times + q)
+        for a, f, p, b, g, q in (
+            (4e-3, 7.1, 0.2, 2e-3, 17.3, 1.0),
+            (3e-3, 9.7, 1.2, 2e-3, 21.1, 0.1),
+            (4e-3, 6.3, 2.2, 3e-3, 14.9, 0.6),
+        )
+    ]
+    return Rotation.from_euler("ZYX", np.stack(angles, -1))
+
+
+def rates_of(times, size=1.0, step=1e-6):
+    """Angular rates (N, 3) about the axes of the camera, by the difference of two attitudes."""
+    return (attitude(times - step, size).inv() * attitude(times + step, size)).as_rotvec() / (2 * step)
+
+
+def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUNT):
+    """Frames (T, H, W) of a distant scene, and of what is fixed to the camera in the last ``dashboard`` rows.
+
+    A subject on 62 % of the frame moves before the scene by ``subject`` of the time, (N, 2) px.
+    """
+    height, width = SIZE
+    scene = draw_scene(height + 60, width + 60, 5)
+    coefficients = spline_filter(scene, 5)
+    row, column = np.mgrid[:height, :width].astype(float)
+    line, lines = (row, height) if timing.scan_axis == -2 else (column, width)
+    line = lines - 1 - line if timing.readout_direction == "reverse" else line
+    ray = np.stack([column - (width - 1) / 2, row - (height - 1) / 2, np.full_like(row, FOCAL_LENGTH)], -1)
+    frames = np.zeros((count, height, width))
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    for frame, (node, weight) in itertools.product(range(count), zip(nodes, weights, strict=True)):
+        times = frame * timing.frame_period + line * timing.row_time + (node + 1) / 2 * timing.exposure_time
+        seen = attitude(times.ravel(), size).apply(ray.reshape(-1, 3)).reshape(ray.shape)
+        seen = FOCAL_LENGTH * seen[..., :2] / seen[..., 2:] + (np.array(scene.shape[::-1]) - 1) / 2
+        image = map_coordinates(coefficients, [seen[..., 1], seen[..., 0]], order=5, prefilter=False)
+        if subject is not None:
+            place = seen - subject(times.ravel()).reshape(seen.shape)
+            inside = (np.abs(place - np.array(scene.shape[::-1]) / 2 - [0, 20]) < [95, 70]).all(-1)
+            image[inside] = map_coordinates(draw_scene(*scene.shape, 8), place[inside].T[::-1], order=3)
+        frames[frame] += weight / 2 * image
+    if dashboard:
+        frames[:, -dashboard:] = draw_scene(dashboard, width, 9)
+    frames += noise * np.random.default_rng(1).standard_normal(frames.shape)
+    return torch.from_numpy(frames).float()
+
+
+def recorded(orientation="XYZ", size=1.0, mirrored=1.0, count=COUNT):
+    """Rates about the axes of a gyroscope, for an assignment of the axes of the camera."""
+    times = np.arange(-0.04, 0.0656 + count * TIMING.frame_period, 1e-3)
+    of_camera, own = rates_of(times, size), np.zeros((len(times), 3))
+    for axis, letter in enumerate(orientation):
+        own[:, "xyz".index(letter.lower())] = of_camera[:, axis] * (1.0 if letter.isupper() else -1.0)
+    own[:, 0] *= mirrored
+    return rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
