@@ -46,6 +46,7 @@ from rsvib_torch.detection.tones.fit import (
     vibration_of_fit,
 )
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
+from rsvib_torch.detection.tones.uncertainty import with_unknown_amplitudes
 from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
@@ -325,6 +326,9 @@ class VibrationTracker:
         fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
         if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
             return state.without_track("the rows are far from where the motion places them")
+        fit = with_unknown_amplitudes(
+            fit, np.diff(starts), self._rows.exposure_time, aliasing=table(scene.gradients.aliasing)
+        )
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
         trusted = np.array([not against for against in tones.findings])
