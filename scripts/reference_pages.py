@@ -42,7 +42,8 @@ COMMANDS = f"""{NOTE}
 # Commands
 
 `rsvib COMMAND --help` prints the same. A time is in seconds, with a unit (`14.6us`, `2ms`) or as a fraction (`1/500`).
-Exit code 0: done; 2: an error of the input or the options, one line on standard error; 130: stopped by Ctrl-C.
+Exit code 0: done; 2: an error of the input or the options, one line on standard error; 3: done, but an axis of
+`--require-reliable` is not reliable; 130: stopped by Ctrl-C.
 """
 REASONS_PAGE = f"""{NOTE}
 

@@ -9,9 +9,11 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import typer
 from pydantic import Field
 
-from rsvib_torch.commands.terminal import Answer, output_of, show_answer
+from rsvib_torch.commands.terminal import Answer, error_line, output_of, show_answer
 from rsvib_torch.core.validation import fields_of, members_of, options
 from rsvib_torch.options import COMMAND_LINE
+
+_NOT_RELIABLE = 3  # exit code
 
 
 def argument(text: str, **form: Any) -> Any:
@@ -118,7 +120,13 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
                 is_given = value is not None and value is not False
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         with output_of(as_json=given["as_json"], quiet=given["quiet"]):
-            show_answer(name, command(group(**values)))
+            answer = command(group(**values))
+            show_answer(name, answer)
+            required = values.get("require_reliable") or ""
+            missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]
+            if missed:
+                error_line(f"--require-reliable: {' and '.join(missed)} not reliable; the files are complete")
+                raise typer.Exit(_NOT_RELIABLE)
 
     parameters = [parameter for _, parameter in (*fields, *_parameters(_OutputOptions))]
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import command_text, next_step, restoration_lines
+from rsvib_torch.commands.answers import command_text, next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.shared_options import (
@@ -19,6 +19,7 @@ from rsvib_torch.commands.shared_options import (
     TIME,
     RangeOptions,
     StackCommand,
+    VerdictOptions,
     check_new,
     restored_argument,
     restored_shape,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
 
 @options
-class MotionOptions(StackCommand):
+class MotionOptions(StackCommand, VerdictOptions):
     """Options of ``motion``."""
 
     out: Path = option(..., "CSV file to write: time in s, x and y in px, and their standard deviations (model free).")
@@ -96,6 +97,7 @@ def motion(given: MotionOptions) -> Answer:
         {"motion": _without_curve(result), "columns": list(columns)},
         [out],
         [next_step("restore the frames", restore_it)] * bool(result.reliable.any()),
+        verdicts([result]),
     )
 
 

@@ -15,7 +15,7 @@ from rsvib_torch.commands.answers import (
     windows_answer,
 )
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand
+from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.commands.written_results import (
@@ -45,7 +45,7 @@ _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
 @options
-class RunOptions(RestorationCommand, PixelSizeOptions):
+class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``run``."""
 
     out: Path = argument("Folder for the restored frames, the vibration and the figures.")

@@ -79,6 +79,13 @@ def _range_of_frames(text: str) -> str:
     return text
 
 
+def _axes(text: str) -> str:
+    """Names of axes with commas between them, as they were given."""
+    if not set(text.split(",")) <= {"x", "y", "roll", "zoom"}:
+        raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
+    return text
+
+
 TIME: dict[str, Any] = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
 SENSOR_FORMS: dict[str, dict[str, Any]] = {
@@ -271,6 +278,19 @@ class PixelSizeOptions:
         "Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s².",
         parser=metres,
         metavar="LENGTH",
+    )
+
+
+@options
+class VerdictOptions:
+    """What a script requires of the result."""
+
+    require_reliable: str | None = option(
+        None,
+        "For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results "
+        "are written all the same.",
+        parser=_axes,
+        metavar="AXES",
     )
 
 

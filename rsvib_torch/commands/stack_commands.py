@@ -29,6 +29,7 @@ from rsvib_torch.commands.shared_options import (
     PixelSizeOptions,
     RestorationCommand,
     StackCommand,
+    VerdictOptions,
     check_new,
     full_scale_of,
     restored_argument,
@@ -193,7 +194,7 @@ def simulate(given: SimulateOptions) -> Answer:
 
 
 @options
-class DetectOptions(StackCommand, PixelSizeOptions):
+class DetectOptions(StackCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``detect``."""
 
     out: Path = option(..., "Folder for vibration.json, tables (tones, offsets, spectrum) and figures.")
@@ -348,7 +349,7 @@ def _restore_windows(given: RestoreOptions) -> Answer:
 
 
 @options
-class ReportOptions(RestorationCommand):
+class ReportOptions(RestorationCommand, VerdictOptions):
     """Options of ``report``."""
 
     out: Path = argument("Folder for report.html and its figures.")

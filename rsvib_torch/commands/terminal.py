@@ -28,6 +28,7 @@ class Answer:
     data: dict[str, Any]  # the same for ``--json``, values that JSON can store
     files: list[Path] = field(default_factory=list)  # files that were written, the one to open first in front
     next_steps: list[str] = field(default_factory=list)  # what to do next: sentences and commands
+    reliable: dict[str, bool] = field(default_factory=dict)  # verdict on each axis, in all windows
 
 
 @dataclass
