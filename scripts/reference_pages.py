@@ -16,9 +16,10 @@ import typer
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import app
-from rsvib_torch.config import SensorSection, simulation_section
+from rsvib_torch.config import simulation_section
 from rsvib_torch.core.reason import GROUPS
 from rsvib_torch.core.validation import expected_text, fields_of
+from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,9 +16,10 @@ import typer
 from rsvib_torch import io
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
-from rsvib_torch.config import Config, SensorSection, read_config
+from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.validation import options
+from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
 
 if TYPE_CHECKING:
