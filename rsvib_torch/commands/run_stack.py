@@ -52,7 +52,8 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     output: str = option(
         "restored.tif",
         "Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video "
-        "with the time stamps and the sound of the input.",
+        "with the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a "
+        "folder of TIFF files, TIFF files of the same names, georeference, tiles and compression.",
     )
     video: bool = option(
         False,
@@ -98,7 +99,7 @@ def run(given: RunOptions) -> Answer:
     --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop
     makes a shaky video steady.
     """
-    settings, frames, out, output = given.settings, given.stack, given.out, given.output
+    settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
     if given.video:
