@@ -82,7 +82,7 @@ def warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     forced = "writes" if output == "frames" else "shows"
     if not result.moves:
-        error_line(f"no vibration to remove: {kept}", "warning")
+        error_line(f"no vibration was found that can be removed: {kept}", "warning")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
         error_line(result.verdict.sentence + unchanged, "warning")
@@ -101,7 +101,7 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     elif result.restored:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
-        lines.append("there is no vibration to remove")
+        lines.append("no vibration was found that can be removed")
     lines += [
         f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"  # printed before
         if reason.code == "axis_not_reliable"

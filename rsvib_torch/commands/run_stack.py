@@ -274,7 +274,7 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
         bad = number_of(result.bad_frames, "frame")
         error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
     if not result.restored:
-        error_line("no vibration to remove: the frames are written unchanged", "warning")
+        error_line("no vibration was found that can be removed: the frames are written unchanged", "warning")
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"

@@ -411,6 +411,9 @@ def report(given: ReportOptions) -> Answer:
         files = reports.write_report_page(folder, content, boxes or None)
         check_new([out / name for name in files], overwrite=True, inputs=inputs)
     answer = stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
+        answer.results["Restoration of the page, of one vibration in all frames"] = answer.results.pop("Restoration")
+        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
     answer.files += [out / name for name in files]
     answer.next_steps += steps
     return answer

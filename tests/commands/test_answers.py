@@ -199,7 +199,7 @@ def test_json_of_restore_known_and_simulate(place, config, tmp_path, capsys):
 def test_warnings_are_in_the_json(place, config, tmp_path, capsys):
     assert rsvib("run", place / "still.tif", tmp_path / "out", *config, "--json") == 0
     shown = capsys.readouterr()
-    warning = "no vibration to remove: the frames are written unchanged"
+    warning = "no vibration was found that can be removed: the frames are written unchanged"
     assert json.loads(shown.out)["warnings"] == [warning]
     assert shown.err == f"rsvib: warning: {warning}\n"
 
