@@ -307,16 +307,17 @@ def compare(given: CompareOptions) -> Answer:
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
     times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
-    result = detection.compare_accelerometer(
-        detection.DetectionResult.load(given.vibration),
-        times,
-        acceleration,
-        pixel_size=given.pixel_size,
-        offset=given.offset,
-        offsets=given.offsets,
-    )
-    if given.out is not None:
-        result.plot(given.out)
+    with working("comparing"):
+        result = detection.compare_accelerometer(
+            detection.DetectionResult.load(given.vibration),
+            times,
+            acceleration,
+            pixel_size=given.pixel_size,
+            offset=given.offset,
+            offsets=given.offsets,
+        )
+        if given.out is not None:
+            result.plot(given.out)
     files = [] if given.out is None else [given.out]
     title = f"{given.vibration} and {given.record}"
     return Answer({title: [result.summary()]}, {"comparison": _without_curve(result)}, files)

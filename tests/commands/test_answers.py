@@ -344,6 +344,22 @@ def test_progress_has_rate_and_remaining_time():
     assert "quietly" not in shown
 
 
+def test_progress_in_a_log_is_a_line_after_twice_the_time():
+    code = LOOPS.replace(
+        "with working", "from rsvib_torch.commands import terminal\nterminal.LOG_AFTER = 0.1\nwith working", 1
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    lines = done.stderr.splitlines()
+    assert done.stdout == ""
+    assert any(re.fullmatch(r"rsvib: progress: restoring: \d of 4 frames.*", line) for line in lines)
+    assert any(
+        re.fullmatch(r"rsvib: progress: restoring frames.tif: 20 of 100 frames  \S+/s  \S+ left", line)
+        for line in lines
+    )
+    assert 3 <= len(lines) <= 8
+    assert "quietly" not in done.stderr
+
+
 def test_long_operations_report_their_progress(place, tmp_path):
     """Each loop begins at 0 and ends at its number of steps."""
     reported = []
