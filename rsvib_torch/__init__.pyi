@@ -14,6 +14,7 @@ from . import tracking as tracking
 from .augmentation import RollingShutterVibration
 from .calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 from .detection import (
+    AccelerometerComparison,
     ClockAlignment,
     DetectionResult,
     DisplacementSpectrum,
@@ -26,6 +27,7 @@ from .detection import (
     align_motion,
     calibrate_row_time_by_motion,
     check_motion,
+    compare_accelerometer,
     detect_motion,
     detect_swept_tone,
     detect_vibration,
@@ -104,6 +106,7 @@ from .stacks import (
 from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
 
 __all__ = [
+    "AccelerometerComparison",
     "AngularRates",
     "Camera",
     "CameraMode",
@@ -149,6 +152,7 @@ __all__ = [
     "camera_isd",
     "camera_mode",
     "check_motion",
+    "compare_accelerometer",
     "comparison_figure",
     "detect_motion",
     "detect_swept_tone",

@@ -4,26 +4,19 @@ A file is checked without torch, whose import takes seconds, except for ``[simul
 """
 
 import functools
-import math
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 from pydantic import Field, create_model, model_validator
 
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.reading import read_text
+from rsvib_torch.core.reading import read_toml
 from rsvib_torch.core.validation import Count, Section, checked, validate
-from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
-
-_MAX_BYTES = 10**7  # start times of 500,000 frames
-_MAX_DEPTH = 100  # parts of a key; the deepest key of the format has 3
-_AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 
 
 @dataclass(frozen=True)
@@ -51,87 +44,6 @@ class Config:
     stack: dict[str, Any]
     arguments: tuple[str, ...] = ()
     path: Path | None = None
-
-
-class SensorSection(Section):
-    """``[sensor]``: the timing, and the full scale of integer frames.
-
-    Exposure and frame period are in seconds (``exposure_time``, ``frame_rate``) or in row times (``exposure_rows``,
-    ``frame_rows``).
-    """
-
-    row_time: float = Field(
-        description="Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row "
-        "period; 'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because "
-        "sensors have blanking rows."
-    )
-    exposure_time: float | None = Field(
-        default=None,
-        description="Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
-    )
-    exposure_rows: float | None = Field(default=None, description="Exposure time divided by row_time.")
-    frame_rate: float | None = Field(
-        default=None,
-        description="Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
-    )
-    frame_rows: float | None = Field(
-        default=None,
-        description="Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
-    )
-    scan_axis: Literal["y", "x"] = Field(
-        default="y",
-        description="'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
-    )
-    readout_direction: Literal["forward", "reverse"] = Field(
-        default="forward",
-        description="'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
-    )
-    frame_start_times: list[float] | None = Field(
-        default=None,
-        description="Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced "
-        "(dropped frames, irregular clocks); strictly increasing.",
-    )
-    full_scale: float | None = Field(
-        default=None, description="Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."
-    )
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        checked(self.to_timing)
-        if self.full_scale is not None:
-            check_number("full_scale", self.full_scale, above=0.0)
-        return self
-
-    def to_timing(self) -> SensorTiming:
-        """The timing, with exposure and frame period in row times."""
-        row_time = check_number("row_time", self.row_time, above=0.0)
-        rate = self.frame_rate
-        if rate is not None and check_number("frame_rate", rate, above=0.0) < 0.1:
-            raise ValueError(f"frame_rate={rate:g} is less than 0.1; it is in frames per second, 1 / (frame period)")
-        exposure = None if self.exposure_time is None else self.exposure_time / row_time
-        period = None if rate is None else 1.0 / (rate * row_time)
-        return SensorTiming(
-            row_time,
-            _in_rows("exposure_time", self.exposure_time, exposure, "exposure_rows", self.exposure_rows),
-            _in_rows("frame_rate", rate, period, "frame_rows", self.frame_rows),
-            self.scan_axis,
-            self.readout_direction,
-            self.frame_start_times,
-        )
-
-
-def _in_rows(name: str, value: float | None, converted: float | None, rows_name: str, rows: float | None) -> float:
-    """A time in row times that is stated by one of two keys, or by both if they agree."""
-    if rows is None:
-        if converted is None:
-            raise ValueError(f"{name} or {rows_name} is missing")
-        return converted
-    if converted is not None and not math.isclose(converted, rows, rel_tol=_AGREEMENT):
-        raise ValueError(
-            f"{name}={value:g} contradicts {rows_name}={rows:g}: with this row_time it is {rows_name}={converted:.6g}; "
-            "remove one of the two keys"
-        )
-    return rows
 
 
 @functools.cache
@@ -230,7 +142,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
         >>> read_config(None, sensor=camera).timing.frame_rows
         2000.0
     """
-    data = {} if path is None else _read_toml(Path(path))
+    data = {} if path is None else read_toml(Path(path))
     source = "the command line" if path is None else str(path)
     if sensor:
         stated = data.get("sensor", {})
@@ -254,14 +166,3 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
         stack=data.get("stack", {}),
         path=None if path is None else Path(path),
     )
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        text = read_text(path, at_most=_MAX_BYTES)
-        # the parser takes quadratic time for nested keys; lists of numbers have as many commas as points
-        if any(line.count(".") > line.count(",") + _MAX_DEPTH for line in text.splitlines() if line[:1] != "#"):
-            raise ValueError(f"a key has more than {_MAX_DEPTH} parts")
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not a TOML file: {error}") from error

@@ -56,6 +56,8 @@ FIRST_NAMES = (
         "RotationAlignment",
         "check_motion",
         "MotionCheck",
+        "compare_accelerometer",
+        "AccelerometerComparison",
     ),
     *("restore", "VibrationRestorer", "FixedDewarp", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
     *("simulate_frames", "SensorNoise", "Optics", "row_psf", "RowVaryingBlur"),

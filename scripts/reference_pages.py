@@ -16,9 +16,10 @@ import typer
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.main import app
-from rsvib_torch.config import SensorSection, simulation_section
+from rsvib_torch.config import simulation_section
 from rsvib_torch.core.reason import GROUPS
 from rsvib_torch.core.validation import expected_text, fields_of
+from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +43,8 @@ COMMANDS = f"""{NOTE}
 # Commands
 
 `rsvib COMMAND --help` prints the same. A time is in seconds, with a unit (`14.6us`, `2ms`) or as a fraction (`1/500`).
-Exit code 0: done; 2: an error of the input or the options, one line on standard error; 130: stopped by Ctrl-C.
+Exit code 0: done; 2: an error of the input or the options, one line on standard error; 3: done, but an axis of
+`--require-reliable` is not reliable; 130: stopped by Ctrl-C.
 """
 REASONS_PAGE = f"""{NOTE}
 

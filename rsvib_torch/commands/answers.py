@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,8 @@ from rsvib_torch.core.text import number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
-    from rsvib_torch.detection import DetectionResult
+    from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
+    from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.stacks import RestoredFrames, StackManifest, StackReport
 
 
@@ -38,6 +40,14 @@ def detection_data(result: DetectionResult) -> dict[str, Any]:
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
 
 
+def verdicts(found: Sequence[DetectedVibration | MotionDetection | SweptTone | None]) -> dict[str, bool]:
+    """Whether each axis is reliable in all detections; None is one that failed."""
+    from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415 - loads PyTorch
+
+    flags = [[] if one is None else one.reliable.tolist() for one in found]
+    return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXIS_NAMES)}
+
+
 def stack_answer(
     frames: Path,
     found: DetectionResult,
@@ -47,6 +57,7 @@ def stack_answer(
 ) -> Answer:
     """The vibration in a stack, also in units of length if the size of a pixel in m is given, and its restoration."""
     answer = Answer({f"Vibration in {frames.name}": [found.summary()]}, {"detection": detection_data(found)})
+    answer.reliable = verdicts([found])
     if pixel_size is not None:
         answer.results[f"For pixels of {1e6 * pixel_size:.6g} µm"] = [found.physical_summary(pixel_size)]
     if restored is not None:
@@ -60,7 +71,7 @@ def windows_answer(
 ) -> Answer:
     """The vibration in the windows of a stack, and what was restored."""
     vibration, restoration = manifest.lines(pixel_size)
-    answer = Answer({title: vibration}, {"windows": manifest.totals()})
+    answer = Answer({title: vibration}, {"windows": manifest.totals()}, reliable=verdicts(manifest.detections()))
     if report is not None:
         answer.results["Restoration"] = [report.summary(), *restoration[1:]]
     return answer
@@ -71,7 +82,7 @@ def warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     forced = "writes" if output == "frames" else "shows"
     if not result.moves:
-        error_line(f"no vibration to remove: {kept}", "warning")
+        error_line(f"no vibration was found that can be removed: {kept}", "warning")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
         error_line(result.verdict.sentence + unchanged, "warning")
@@ -90,7 +101,7 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     elif result.restored:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
-        lines.append("there is no vibration to remove")
+        lines.append("no vibration was found that can be removed")
     lines += [
         f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"  # printed before
         if reason.code == "axis_not_reliable"

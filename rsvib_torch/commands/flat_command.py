@@ -2,16 +2,19 @@
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
 from pydantic import Field
 
-from rsvib_torch.commands.terminal import Answer, output_of, show_answer
+from rsvib_torch.commands.terminal import Answer, error_line, output_of, show_answer
 from rsvib_torch.core.validation import fields_of, members_of, options
 from rsvib_torch.options import COMMAND_LINE
+
+_NOT_RELIABLE = 3  # exit code
 
 
 def argument(text: str, **form: Any) -> Any:
@@ -103,12 +106,31 @@ def _is_argument(stated: Any) -> bool:
     return bool(_form(stated).get("positional"))
 
 
+@contextmanager
+def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
+    """Errors name the arguments of Python functions: name the options that were given instead."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        found = re.match(r"(?:the command line: sensor: )?(\w+)[.\w]*( must .*?)(?: \((?:int|float)\))?$", str(error))
+        for parameter in parameters:
+            info = get_args(parameter.annotation)[1]
+            if found is not None and parameter.name == found[1] and isinstance(info, typer.models.OptionInfo):
+                option = info.default if isinstance(info.default, str) else f"--{parameter.name.replace('_', '-')}"
+                raise ValueError(f"{option}{found[2]}") from error
+        raise
+
+
 def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., None]:
     """A command as typer calls it: its options are flat, and its answer is printed."""
     (group,) = (parameter.annotation for parameter in inspect.signature(command, eval_str=True).parameters.values())
     fields = list(_parameters(group))
 
     def flat(**given: Any) -> None:
+        with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
+            run(given)
+
+    def run(given: dict[str, Any]) -> None:
         values: dict[str, Any] = {}
         for place, parameter in fields:
             value = given[parameter.name]
@@ -118,7 +140,13 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
                 is_given = value is not None and value is not False
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         with output_of(as_json=given["as_json"], quiet=given["quiet"]):
-            show_answer(name, command(group(**values)))
+            answer = command(group(**values))
+            show_answer(name, answer)
+            required = values.get("require_reliable") or ""
+            missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]
+            if missed:
+                error_line(f"--require-reliable: {' and '.join(missed)} not reliable; the files are complete")
+                raise typer.Exit(_NOT_RELIABLE)
 
     parameters = [parameter for _, parameter in (*fields, *_parameters(_OutputOptions))]
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

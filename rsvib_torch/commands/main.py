@@ -35,6 +35,7 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "report": stack_commands.report,
     "motion": motion_commands.motion,
     "known": motion_commands.known,
+    "compare": motion_commands.compare,
     "calibrate": motion_commands.calibrate,
     "live": live_session,
     "export": export,
@@ -61,6 +62,8 @@ _EXAMPLES = """
         --motion gyroscope.csv --unit rad/s --focal-length 1800
   rsvib known frames.tif restored.tif --config camera.toml \\
         --motion motion.csv --unit px --offset 0
+  rsvib compare found/vibration.json accelerometer.csv --unit g \\
+        --pixel-size 12.5um --out both.png
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
   rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025
@@ -120,7 +123,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
     Returns:
         Exit code: 0; 2 after an error, which is one line on standard error (``--debug`` prints the traceback before
-        it); 130 after Ctrl-C.
+        it); 3 if an axis of ``--require-reliable`` is not reliable; 130 after Ctrl-C.
     """
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import command_text, next_step, restoration_lines
+from rsvib_torch.commands.answers import command_text, next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.shared_options import (
     SENSOR_FORMS,
     TIME,
+    PixelSizeOptions,
     RangeOptions,
     StackCommand,
+    VerdictOptions,
     check_new,
     restored_argument,
     restored_shape,
@@ -28,7 +30,7 @@ from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import options
-from rsvib_torch.options import FreeMotionOptions, MotionUnit, TimeUnit
+from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 
 
 @options
-class MotionOptions(StackCommand):
+class MotionOptions(StackCommand, VerdictOptions):
     """Options of ``motion``."""
 
     out: Path = option(..., "CSV file to write: time in s, x and y in px, and their standard deviations (model free).")
@@ -96,6 +98,7 @@ def motion(given: MotionOptions) -> Answer:
         {"motion": _without_curve(result), "columns": list(columns)},
         [out],
         [next_step("restore the frames", restore_it)] * bool(result.reliable.any()),
+        verdicts([result]),
     )
 
 
@@ -267,6 +270,57 @@ def _check_motion(given: KnownOptions, frames: Tensor, timing: SensorTiming, mot
     else:
         _refuse(given, check.reasons)
     return check
+
+
+@options
+class CompareOptions(PixelSizeOptions):
+    """Options of ``compare``."""
+
+    vibration: Path = argument("The vibration.json written by detect or run.")
+    record: Path = argument("CSV file with the columns time, x (right) and y (down), evenly sampled.")
+    unit: AccelerationUnit = option(..., "Unit of x and y.")
+    out: Path | None = option(None, "Picture of both to write (PNG, SVG, PDF).")
+    offset: float | None = option(
+        None,
+        "Time of the accelerometer, in s, at the exposure start of the first row of frame 0.",
+        show_default="that at which both resemble each other most",
+    )
+    offsets: tuple[float, float] | None = option(
+        None, "Smallest and largest offset to try.", metavar="LOW HIGH", show_default="all that cover the frames"
+    )
+    time_unit: TimeUnit = option("s", "Unit of the times.")
+    flip_x: bool = option(False, "Positive x is to the left of the image, or the accelerometer is on the camera.")
+    flip_y: bool = option(False, "Positive y is upwards in the image, or the accelerometer is on the camera.")
+    overwrite: bool = option(False, "Replace results that exist already.")
+
+
+def compare(given: CompareOptions) -> Answer:
+    """Compare a detected vibration with an accelerometer.
+
+    Frequency, ratio of the amplitudes and phase of each tone, and the offset of the clocks. The ratio is the size of a
+    pixel on the object, which --pixel-size states for comparison.
+    """
+    from rsvib_torch.motion.recorded import read_acceleration  # noqa: PLC0415
+
+    if given.out is not None:
+        check_new([given.out], given.overwrite, [given.vibration, given.record])
+        check_writable(given.out)
+    signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
+    times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    with working("comparing"):
+        result = detection.compare_accelerometer(
+            detection.DetectionResult.load(given.vibration),
+            times,
+            acceleration,
+            pixel_size=given.pixel_size,
+            offset=given.offset,
+            offsets=given.offsets,
+        )
+        if given.out is not None:
+            result.plot(given.out)
+    files = [] if given.out is None else [given.out]
+    title = f"{given.vibration} and {given.record}"
+    return Answer({title: [result.summary()]}, {"comparison": _without_curve(result)}, files)
 
 
 @options

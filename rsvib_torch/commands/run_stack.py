@@ -15,7 +15,7 @@ from rsvib_torch.commands.answers import (
     windows_answer,
 )
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand
+from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.commands.written_results import (
@@ -45,14 +45,15 @@ _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
 @options
-class RunOptions(RestorationCommand, PixelSizeOptions):
+class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``run``."""
 
     out: Path = argument("Folder for the restored frames, the vibration and the figures.")
     output: str = option(
         "restored.tif",
         "Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video "
-        "with the time stamps and the sound of the input.",
+        "with the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a "
+        "folder of TIFF files, TIFF files of the same names, georeference, tiles and compression.",
     )
     video: bool = option(
         False,
@@ -98,7 +99,7 @@ def run(given: RunOptions) -> Answer:
     --resume continues. With --video, the vibration of a video is followed frame by frame: --steady 1 --border crop
     makes a shaky video steady.
     """
-    settings, frames, out, output = given.settings, given.stack, given.out, given.output
+    settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
     if given.video:
@@ -273,7 +274,7 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
         bad = number_of(result.bad_frames, "frame")
         error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
     if not result.restored:
-        error_line("no vibration to remove: the frames are written unchanged", "warning")
+        error_line("no vibration was found that can be removed: the frames are written unchanged", "warning")
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"

@@ -16,9 +16,10 @@ import typer
 from rsvib_torch import io
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
-from rsvib_torch.config import Config, SensorSection, read_config
+from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.validation import options
+from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
 
 if TYPE_CHECKING:
@@ -76,6 +77,13 @@ def _range_of_frames(text: str) -> str:
     """START:END, as it was given."""
     if re.fullmatch(r"\d*:\d*", text) is None:
         raise typer.BadParameter(f"expected START:END such as 100:200, 100: or :200, got {text!r}")
+    return text
+
+
+def _axes(text: str) -> str:
+    """Names of axes with commas between them, as they were given."""
+    if not set(text.split(",")) <= {"x", "y", "roll", "zoom"}:
+        raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
     return text
 
 
@@ -271,6 +279,19 @@ class PixelSizeOptions:
         "Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s².",
         parser=metres,
         metavar="LENGTH",
+    )
+
+
+@options
+class VerdictOptions:
+    """What a script requires of the result."""
+
+    require_reliable: str | None = option(
+        None,
+        "For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results "
+        "are written all the same.",
+        parser=_axes,
+        metavar="AXES",
     )
 
 

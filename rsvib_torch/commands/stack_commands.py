@@ -29,6 +29,7 @@ from rsvib_torch.commands.shared_options import (
     PixelSizeOptions,
     RestorationCommand,
     StackCommand,
+    VerdictOptions,
     check_new,
     full_scale_of,
     restored_argument,
@@ -193,7 +194,7 @@ def simulate(given: SimulateOptions) -> Answer:
 
 
 @options
-class DetectOptions(StackCommand, PixelSizeOptions):
+class DetectOptions(StackCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``detect``."""
 
     out: Path = option(..., "Folder for vibration.json, tables (tones, offsets, spectrum) and figures.")
@@ -348,7 +349,7 @@ def _restore_windows(given: RestoreOptions) -> Answer:
 
 
 @options
-class ReportOptions(RestorationCommand):
+class ReportOptions(RestorationCommand, VerdictOptions):
     """Options of ``report``."""
 
     out: Path = argument("Folder for report.html and its figures.")
@@ -410,6 +411,9 @@ def report(given: ReportOptions) -> Answer:
         files = reports.write_report_page(folder, content, boxes or None)
         check_new([out / name for name in files], overwrite=True, inputs=inputs)
     answer = stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
+        answer.results["Restoration of the page, of one vibration in all frames"] = answer.results.pop("Restoration")
+        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
     answer.files += [out / name for name in files]
     answer.next_steps += steps
     return answer

@@ -4,6 +4,8 @@ import os
 import shlex
 import sys
 import textwrap
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -28,6 +30,7 @@ class Answer:
     data: dict[str, Any]  # the same for ``--json``, values that JSON can store
     files: list[Path] = field(default_factory=list)  # files that were written, the one to open first in front
     next_steps: list[str] = field(default_factory=list)  # what to do next: sentences and commands
+    reliable: dict[str, bool] = field(default_factory=dict)  # verdict on each axis, in all windows
 
 
 @dataclass
@@ -39,6 +42,9 @@ class _Output:
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
+
+LOG_AFTER = 20.0  # s; commands that take less write no progress to files
+_SHOWN_AFTER = 2.0  # s, from which the elapsed time is shown beside that of a loop, which may be one of several
 
 _outputs: list[_Output] = [_Output()]  # of the running command, last
 _command_lines: list[str] = []  # the running one is the last
@@ -147,18 +153,20 @@ def warnings_in_one_line() -> Iterator[None]:
 
 
 class _StateColumn(ProgressColumn):
-    """Complete steps, rate and remaining time; the elapsed time while the number of steps is unknown."""
+    """Elapsed time, and of loops complete steps, rate and remaining time."""
 
     def render(self, task: Task) -> Text:
-        """The state of a loop, in at most 40 characters."""
+        """The state of a loop, in at most 50 characters."""
+        passed = time.monotonic() - task.fields["begun"]
+        elapsed = str(timedelta(seconds=int(passed)))
         if task.total is None:
-            return Text(str(timedelta(seconds=int(task.elapsed or 0))))
+            return Text(elapsed)
         state = f"{task.completed:.0f} of {task.total:.0f} {task.fields['unit']}"
         done, seconds = task.completed - task.fields["first"], task.elapsed or 0.0
         if done <= 0 or seconds <= 0:
             return Text(state)
         left = timedelta(seconds=round((task.total - task.completed) * seconds / done))
-        return Text(f"{state}  {done / seconds:.3g}/s  {left} left")
+        return Text(f"{state}  {done / seconds:.3g}/s  {left} left{f'  {elapsed} so far' * (passed >= _SHOWN_AFTER)}")
 
 
 def _progress() -> Progress:
@@ -179,6 +187,9 @@ def _progress() -> Progress:
 def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int, int], None]]:
     """Show the elapsed time, and progress, rate and remaining time of a loop.
 
+    In a log, which is not a terminal, they are lines: the first one after ``LOG_AFTER`` seconds, each of the others
+    after twice the time.
+
     Args:
         description: What is done.
         counts: Whether the block reports its frames itself; otherwise, the loops in it report their steps.
@@ -186,15 +197,29 @@ def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int
     Yields:
         A function to call with the number of processed frames and the number of all frames.
     """
+    begun = time.monotonic()
     with _progress() as progress:
-        task = progress.add_task(printable(description), total=None)
+        task = progress.add_task(printable(description), total=None, begun=begun)
 
         def show(done: int, total: int, unit: str = "frames") -> None:
             if (
                 done == 0 or progress.tasks[0].total is None
             ):  # another loop; frames of a resumed run are not in the rate
-                progress.reset(task, total=total, unit=unit, first=done)
+                progress.reset(task, total=total, unit=unit, first=done, begun=begun)
             progress.update(task, completed=done)
 
-        with nullcontext() if counts else listening(show):
-            yield show
+        ended = threading.Event()
+
+        def write_lines() -> None:
+            after = LOG_AFTER
+            while not ended.wait(after):  # twice the elapsed time
+                error_line(f"{description}: {_StateColumn().render(progress.tasks[0])}", "progress")
+                after = time.monotonic() - begun
+
+        if not Console(stderr=True).is_terminal and not _outputs[-1].quiet:
+            threading.Thread(target=write_lines, daemon=True).start()
+        try:
+            with nullcontext() if counts else listening(show):
+                yield show
+        finally:
+            ended.set()

@@ -1,10 +1,14 @@
 """Reading of files that a user names: only regular files, and only as many bytes as they state."""
 
 import stat
+import tomllib
 from pathlib import Path
+from typing import Any
 
 from rsvib_torch.core.free_memory import size_text
 
+_MAX_BYTES = 10**7  # of a TOML file; start times of 500,000 frames
+_MAX_DEPTH = 100  # parts of a key; the deepest key of a configuration file has 3
 _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device"}
 
 
@@ -31,3 +35,15 @@ def read_text(path: Path, *, at_most: int) -> str:
         if size > at_most:
             raise ValueError(f"{path}: {size_text(size)} are too large; expected at most {size_text(at_most)}")
         return file.read(size).decode("utf-8")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file."""
+    try:
+        text = read_text(path, at_most=_MAX_BYTES)
+        # the parser takes quadratic time for nested keys; lists of numbers have as many commas as points
+        if any(line.count(".") > line.count(",") + _MAX_DEPTH for line in text.splitlines() if line[:1] != "#"):
+            raise ValueError(f"a key has more than {_MAX_DEPTH} parts")
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a TOML file: {error}") from error

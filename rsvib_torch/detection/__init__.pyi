@@ -1,5 +1,6 @@
 from .detect import VibrationDetector, detect_vibration
 from .diagnosis import TimingDiagnosis, diagnose_timing
+from .recorded.accelerometer import AccelerometerComparison, compare_accelerometer
 from .recorded.alignment import ClockAlignment, align_motion
 from .recorded.motion_check import MotionCheck, check_motion
 from .recorded.rotation_alignment import RotationAlignment
@@ -10,6 +11,7 @@ from .shapes.swept import SweptTone, detect_swept_tone
 from .spectrum import DisplacementSpectrum
 
 __all__ = [
+    "AccelerometerComparison",
     "ClockAlignment",
     "DetectionResult",
     "DisplacementSpectrum",
@@ -22,6 +24,7 @@ __all__ = [
     "align_motion",
     "calibrate_row_time_by_motion",
     "check_motion",
+    "compare_accelerometer",
     "detect_motion",
     "detect_swept_tone",
     "detect_vibration",

@@ -290,7 +290,7 @@ def rotation_reasons(
     ``size`` px the rms offset along the axis, and ``remedy`` the value of roll and zoom with which they are measured.
     """
     apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
-    if apart <= allowed:
+    if not apart > allowed:  # nothing was measured: NaN
         return []
     if axes > 2:
         return [Reason("strips_apart", AXIS_NAMES[axis], apart, allowed)]

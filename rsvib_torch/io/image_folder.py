@@ -2,8 +2,9 @@
 
 import re
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.images import decode_image, encode_png, image_info
-from rsvib_torch.io.stack_info import FrameError, StackInfo, Tag
-from rsvib_torch.io.tiff import open_tiff, write_tiff
+from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag
+from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.io.time_metadata import merged_times
 
 _PNG, _TIFF, _JPEG = (".png",), (".tif", ".tiff"), (".jpg", ".jpeg")
@@ -88,7 +89,6 @@ def open_images(path: Path) -> BlockReader:
     files = _frame_files(path)
     damaged: dict[int, ValueError] = {}
     first: tuple[StackInfo, Path] | None = None
-    metadata: dict[str, Tag | None] = {}
     infos: list[StackInfo | None] = [None] * len(files)
     for index, file in enumerate(files):
         try:
@@ -97,17 +97,21 @@ def open_images(path: Path) -> BlockReader:
             damaged[index] = error
             continue
         if first is None:
-            first, metadata = (info, file), dict(info.metadata)
-        for name in metadata.keys() | info.metadata.keys():
-            if info.metadata.get(name) != metadata.get(name):
-                metadata[name] = None  # differs between the files
+            first = (info, file)
         if _without_position(info) != _without_position(first[0]):
             raise ValueError(
                 f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
             )
     if first is None or len(damaged) > len(files) // 2:
         raise next(iter(damaged.values()))
+    of_files = [info.metadata for info in infos if info is not None]
+    metadata: dict[str, Tag | None] = {}
+    for name in dict.fromkeys(chain.from_iterable(of_files)):
+        same = all(name in tags and tags[name] == of_files[0].get(name) for tags in of_files)
+        metadata |= {name: of_files[0][name]} if same else {f"{name}{DIFFERENT}": None}
     stack = replace(first[0], frame_times=None, metadata=metadata).with_frames(len(files))
+    if path.is_dir() and first[1].suffix.lower() in _TIFF:
+        stack = replace(stack, files=tuple(files))
 
     def read(index: int, _: int) -> NDArray[Any]:
         try:
@@ -122,21 +126,30 @@ def open_images(path: Path) -> BlockReader:
 
 
 def _ending(info: StackInfo) -> str:
-    return ".png" if info.dtype in _PNG_TYPES else ".tif"
+    return ".png" if info.dtype in _PNG_TYPES and info.files is None else ".tif"
 
 
 def _frame_names(info: StackInfo) -> list[str]:
+    if info.files is not None:
+        return [file.name for file in info.files]
     digits = max(4, len(str(info.shape[0] - 1)))
     return [f"frame_{index:0{digits}d}{_ending(info)}" for index in range(info.shape[0])]
 
 
-def _write_file(file: Path, info: StackInfo, frame: NDArray[Any]) -> None:
-    """Write one frame of a stack."""
+def _write_file(file: Path, info: StackInfo, frame: NDArray[Any], source: Path | None = None) -> None:
+    """Write one frame of a stack; a TIFF file keeps what that of the input, ``source``, states."""
     one = replace(info.with_frames(1), frame_times=None, frame_rate=None, metadata={})
     if file.suffix.lower() in _PNG:
         encode_png(file, np.asarray(frame, dtype=info.dtype), one)
-    else:
-        write_tiff(file, one, iter([frame]), None)
+        return
+    storage: dict[str, Any] = {}
+    with suppress(ValueError):  # a damaged file, whose frame is written as one without data
+        if source is not None:
+            like, storage = _read_info(source), storage_of(source)
+            times = None if like.time_error else like.frame_times
+            one = replace(one, frame_times=times, metadata=like.metadata_for(one.shape, one.dtype))
+            one = replace(one, resolution=like.resolution)
+    write_tiff(file, one, iter([frame]), None, storage)
 
 
 def write_image(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
@@ -147,8 +160,9 @@ def write_image(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], com
 def write_folder(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
     """Write a folder with one file per frame; arguments as in ``StackFormat.write``."""
     path.mkdir()
-    for name, frame in zip(_frame_names(info), frames, strict=True):
-        _write_file(path / name, info, frame)
+    sources = info.files or [None] * info.shape[0]
+    for name, source, frame in zip(_frame_names(info), sources, frames, strict=True):
+        _write_file(path / name, info, frame, source)
 
 
 def _check_channels(path: Path, info: StackInfo) -> None:

@@ -14,6 +14,8 @@ from rsvib_torch.core.arguments import check_fields, checked_methods
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
 
+DIFFERENT = " (differs between files)"  # ending of the names of metadata of a folder
+
 
 class FrameError(ValueError):
     """One frame of a stack cannot be read; the other frames may be readable."""
@@ -71,6 +73,8 @@ class StackInfo(Summarised):
         decoding_bytes: Memory that reading needs besides the frame that is returned: frames that are stored together
             are decoded together.
         camera: Make and model of the camera, if the file states them (EXIF of JPEG and PNG, tags of videos).
+        files: The file of each frame, of a folder of TIFF files. Frames that are restored to a folder get their names,
+            metadata, tiles and compression.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -96,6 +100,7 @@ class StackInfo(Summarised):
     metadata: Mapping[str, Tag | None] = field(default_factory=dict, compare=False, repr=False)
     decoding_bytes: int = field(default=0, compare=False)
     camera: str | None = field(default=None, compare=False)
+    files: tuple[Path, ...] | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -167,7 +172,13 @@ class StackInfo(Summarised):
             return self
         shape = (count, *self.shape[1:])
         return replace(
-            self, shape=shape, frame_times=None, frame_numbers=None, path=None, metadata=self.metadata_for(shape)
+            self,
+            shape=shape,
+            frame_times=None,
+            frame_numbers=None,
+            path=None,
+            files=None,
+            metadata=self.metadata_for(shape),
         )
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":

@@ -18,7 +18,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.io.formats import FORMATS, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_format import StackFormat, split_range
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo
 from rsvib_torch.io.stack_reading import PathLike
 
 
@@ -123,10 +123,15 @@ def metadata_not_kept(
         >>> metadata_not_kept(info, "restored.tif", (8, 1024, 1024))
         ()
     """
-    keeps = target_format(Path(path)).keeps
+    form = target_format(Path(path))
+    # TIFF files like those of the input
+    in_files = form.kind == "folder" and like.with_frames(shape[0]).files is not None
+    keeps = FORMATS[".tif"].keeps if in_files else form.keeps
     stated = like.full_scale not in (None, known_full_scale(np.dtype(like.dtype)))
     timed = like.frame_times is not None and not like.time_error
     lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
+    if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
+        lost = [name for name in lost if not name.endswith(DIFFERENT)]
     lost += ["full scale"] * (stated and "full_scale" not in keeps)
     lost += ["resolution"] * (like.resolution is not None and "resolution" not in keeps)
     lost += ["orientation"] * (like.orientation != 1 and "orientation" not in keeps)

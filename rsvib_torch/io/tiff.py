@@ -1,7 +1,7 @@
 """Stacks in TIFF and BigTIFF files, also compressed."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer
 from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 
 _PHOTOMETRIC = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
+_LOSSLESS = {1, 5, 8, 32946, 32773, 34925, 50000}  # none, LZW, Deflate (two codes), PackBits, LZMA, Zstandard
 _LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 
 
@@ -340,10 +341,28 @@ def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     return stored, {"shape": stored.stored_shape, "dtype": info.dtype, **options}
 
 
-def write_tiff(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
-    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``."""
+def storage_of(path: Path) -> dict[str, Any]:
+    """Tiles and compression of a TIFF file as options of ``write_tiff``; zlib replaces a compression with loss."""
+    with readable_stack(path, "TIFF"), tifffile.TiffFile(path) as tif:
+        page = tif.pages.first
+        tiles = {"tile": (page.tilelength, page.tilewidth)} if page.is_tiled else {}
+        if page.compression not in _LOSSLESS:
+            return {**tiles, "compression": "zlib"}
+        return {**tiles, "compression": page.compression, "predictor": page.predictor}
+
+
+def write_tiff(
+    path: Path,
+    info: StackInfo,
+    frames: Iterator[NDArray[Any]],
+    compression: str | None,
+    storage: Mapping[str, Any] = {},
+) -> None:
+    """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``, and from ``storage_of``."""
     stored, options = _layout(info)
     pages = (stored.to_stored(frame) for frame in frames)
     if stored.stored_axes == "TCHW":
         pages = (plane for frame in pages for plane in frame)
-    tifffile.imwrite(path, data=pages, compression=compression, maxworkers=1, **options)
+    # an iterator would have to yield the tiles
+    data = np.stack(list(pages)).reshape(stored.stored_shape) if "tile" in storage else pages
+    tifffile.imwrite(path, data=data, maxworkers=1, **{"compression": compression, **storage, **options})

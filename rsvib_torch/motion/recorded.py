@@ -15,7 +15,7 @@ from rsvib_torch.core.number_table import rows_of_numbers, text_lines
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import one_line
 from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.options import MotionUnit, TimeUnit
+from rsvib_torch.options import AccelerationUnit, MotionUnit, TimeUnit
 
 _RADIANS = {
     "rad": 1.0,
@@ -26,6 +26,7 @@ _RADIANS = {
     "rad/s": 1.0,
     "deg/s": math.pi / 180,
 }
+STANDARD_GRAVITY = 9.80665  # m/s^2
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _COLUMNS = ("time", "x", "y")
 
@@ -89,6 +90,16 @@ def read_motion(
     displacement = (displacement - displacement.mean(0)) * np.asarray(signs)
     spacing = float(np.median(np.diff(times)))
     return FreeMotion.from_samples(torch.from_numpy(times), torch.from_numpy(displacement), spacing=spacing)
+
+
+def read_acceleration(
+    path: Path, unit: AccelerationUnit, time_unit: TimeUnit = "s", signs: tuple[float, float] = (1.0, 1.0)
+) -> tuple[Array, Array]:
+    """Times (N,) in s and acceleration (N, 2) in m/s^2 from a CSV file with the columns ``time``, ``x`` and ``y``."""
+    times, values = _table(path)
+    times = times * SECONDS[time_unit]
+    check_times(path, times, time_unit)
+    return times, values * np.asarray(signs) * (STANDARD_GRAVITY if unit == "g" else 1.0)
 
 
 def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:

@@ -7,11 +7,18 @@ torch import it themselves.
 from __future__ import annotations
 
 import itertools
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+from pydantic import Field, model_validator
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
+from rsvib_torch.core.reading import read_toml
+from rsvib_torch.core.validation import Section, checked, validate
 
 if TYPE_CHECKING:
     import torch
@@ -24,6 +31,7 @@ MAX_SPAN = 2**19  # row times from the first to the last frame; the detection in
 _MIN_EXPOSURE = 0.01  # row times; the shortest exposure of sensors is about one row, so that this is one in seconds
 _MAX_BLANKING = 32  # row times per row; of more frames with so long a blanking time, 1 ms of 32 ms is read
 MAX_START_TIME = 1e10  # s; clocks that count from 1970 read 1.8e9 s, to 2e-7 s in float64
+_AGREEMENT = 1e-3  # relative; keys that state the same time twice are rounded by whoever wrote them
 _SCAN_AXES: dict[object, int] = {-2: -2, "y": -2, -1: -1, "x": -1}
 
 
@@ -153,6 +161,26 @@ class SensorTiming:
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
         return cls(row_time, exposure / row_time, period / row_time, scan_axis, readout_direction, frame_start_times)
 
+    @staticmethod
+    def from_file(path: str | os.PathLike[str]) -> SensorTiming:
+        """The timing in the table ``[sensor]`` of a configuration file, as ``rsvib init`` writes it.
+
+        Args:
+            path: The TOML file; other tables are not read.
+
+        Raises:
+            OSError: If the file cannot be opened.
+            ValueError: If it is not TOML, or a key of ``[sensor]`` is missing, unknown or has a wrong type or value.
+
+        Example:
+            >>> SensorTiming.from_file("camera.toml").frame_rate  # doctest: +SKIP
+            29.97
+        """
+        data = read_toml(Path(path))
+        stated = {name: table for name, table in data.items() if name == "sensor"}
+        section: SensorSection = validate(_SensorFile, stated, str(path)).sensor
+        return section.to_timing()
+
     @classmethod
     def line_sensors(
         cls, line_time: float, delays: Sequence[float], num_lines: int, exposure_lines: float = 1.0
@@ -280,6 +308,91 @@ class SensorTiming:
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
         return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
+
+
+class SensorSection(Section):
+    """``[sensor]``: the timing, and the full scale of integer frames.
+
+    Exposure and frame period are in seconds (``exposure_time``, ``frame_rate``) or in row times (``exposure_rows``,
+    ``frame_rows``).
+    """
+
+    row_time: float = Field(
+        description="Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row "
+        "period; 'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because "
+        "sensors have blanking rows."
+    )
+    exposure_time: float | None = Field(
+        default=None,
+        description="Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
+    )
+    exposure_rows: float | None = Field(default=None, description="Exposure time divided by row_time.")
+    frame_rate: float | None = Field(
+        default=None,
+        description="Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
+    )
+    frame_rows: float | None = Field(
+        default=None,
+        description="Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
+    )
+    scan_axis: Literal["y", "x"] = Field(
+        default="y",
+        description="'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
+    )
+    readout_direction: Literal["forward", "reverse"] = Field(
+        default="forward",
+        description="'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
+    )
+    frame_start_times: list[float] | None = Field(
+        default=None,
+        description="Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced "
+        "(dropped frames, irregular clocks); strictly increasing.",
+    )
+    full_scale: float | None = Field(
+        default=None, description="Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        checked(self.to_timing)
+        if self.full_scale is not None:
+            check_number("full_scale", self.full_scale, above=0.0)
+        return self
+
+    def to_timing(self) -> SensorTiming:
+        """The timing, with exposure and frame period in row times."""
+        row_time = check_number("row_time", self.row_time, above=0.0)
+        rate = self.frame_rate
+        if rate is not None and check_number("frame_rate", rate, above=0.0) < 0.1:
+            raise ValueError(f"frame_rate={rate:g} is less than 0.1; it is in frames per second, 1 / (frame period)")
+        exposure = None if self.exposure_time is None else self.exposure_time / row_time
+        period = None if rate is None else 1.0 / (rate * row_time)
+        return SensorTiming(
+            row_time,
+            _in_rows("exposure_time", self.exposure_time, exposure, "exposure_rows", self.exposure_rows),
+            _in_rows("frame_rate", rate, period, "frame_rows", self.frame_rows),
+            self.scan_axis,
+            self.readout_direction,
+            self.frame_start_times,
+        )
+
+
+def _in_rows(name: str, value: float | None, converted: float | None, rows_name: str, rows: float | None) -> float:
+    """A time in row times that is stated by one of two keys, or by both if they agree."""
+    if rows is None:
+        if converted is None:
+            raise ValueError(f"{name} or {rows_name} is missing")
+        return converted
+    if converted is not None and not math.isclose(converted, rows, rel_tol=_AGREEMENT):
+        raise ValueError(
+            f"{name}={value:g} contradicts {rows_name}={rows:g}: with this row_time it is {rows_name}={converted:.6g}; "
+            "remove one of the two keys"
+        )
+    return rows
+
+
+class _SensorFile(Section):
+    sensor: SensorSection
 
 
 @dataclass(frozen=True)

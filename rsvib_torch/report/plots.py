@@ -26,6 +26,7 @@ from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, Result
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import Count
 from rsvib_torch.detection import (
+    AccelerometerComparison,
     ClockAlignment,
     DetectionResult,
     DisplacementSpectrum,
@@ -765,6 +766,22 @@ def _check_figure(result: MotionCheck) -> Figure:
     return figure
 
 
+def _accelerometer_figure(result: AccelerometerComparison) -> Figure:
+    """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
+    shown = (times - middle).abs() < 4 / result.frequency.min()  # 8 periods of the slowest tone
+    for axis, (name, panel) in enumerate(zip("xy", panels, strict=True)):
+        for label, values, colour in (
+            ("accelerometer", result.measured, _GREY),
+            ("frames", result.predicted, _AXIS_COLOURS[name]),
+        ):
+            panel.plot(1e3 * times[shown], values[shown, axis], color=colour, label=label, linewidth=1.2)
+        panel.legend(ncols=2, **_LEGEND_ABOVE)
+        plain_axes(panel, "time on the clock of the frames (ms)", "acceleration (m/s²)", heading=f"Along {name}")
+    return figure
+
+
 def _rotation_figure(result: RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
@@ -793,6 +810,7 @@ FIGURES.update(
         (ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (RotationAlignment, 0): _rotation_figure,
         (MotionCheck, 0): _check_figure,
+        (AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): _curve_figure,

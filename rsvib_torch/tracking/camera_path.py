@@ -267,7 +267,8 @@ def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: f
         # Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
         # tone: they are compared by what remains of both axes.
         aliases = tone.frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
-        aliases = aliases[(aliases > frequencies[0]) & (aliases < frequencies[-1])]
+        inside = (aliases > frequencies[0]) & (aliases < frequencies[-1])
+        aliases = aliases[inside & fit.is_apart(tone.axis, aliases)]
         trials = [fit.with_tone(replace(tone, frequency=float(frequency))) for frequency in aliases]
         fit = min(trials, key=lambda trial: trial.sigma)
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]

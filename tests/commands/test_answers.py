@@ -199,7 +199,7 @@ def test_json_of_restore_known_and_simulate(place, config, tmp_path, capsys):
 def test_warnings_are_in_the_json(place, config, tmp_path, capsys):
     assert rsvib("run", place / "still.tif", tmp_path / "out", *config, "--json") == 0
     shown = capsys.readouterr()
-    warning = "no vibration to remove: the frames are written unchanged"
+    warning = "no vibration was found that can be removed: the frames are written unchanged"
     assert json.loads(shown.out)["warnings"] == [warning]
     assert shown.err == f"rsvib: warning: {warning}\n"
 
@@ -342,6 +342,22 @@ def test_progress_has_rate_and_remaining_time():
     assert re.search(r"restoring \S* 3 of 4 frames  \d[\d.]*/s  0:00:00 left", shown)
     assert re.search(r"restoring frames.tif \S* 20 of 100 frames  \d[\d.]*/s  0:00:0\d left", shown)
     assert "quietly" not in shown
+
+
+def test_progress_in_a_log_is_a_line_after_twice_the_time():
+    code = LOOPS.replace(
+        "with working", "from rsvib_torch.commands import terminal\nterminal.LOG_AFTER = 0.1\nwith working", 1
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    lines = done.stderr.splitlines()
+    assert done.stdout == ""
+    assert any(re.fullmatch(r"rsvib: progress: restoring: \d of 4 frames.*", line) for line in lines)
+    assert any(
+        re.fullmatch(r"rsvib: progress: restoring frames.tif: 20 of 100 frames  \S+/s  \S+ left", line)
+        for line in lines
+    )
+    assert 3 <= len(lines) <= 8
+    assert "quietly" not in done.stderr
 
 
 def test_long_operations_report_their_progress(place, tmp_path):

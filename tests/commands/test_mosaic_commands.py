@@ -69,7 +69,7 @@ def test_report_of_a_finer_grid(place, tmp_path):
     [
         (("--mosaic", "RGB"), "'RGB' is not one of 'RGGB', 'BGGR', 'GRBG', 'GBRG'"),
         (("--mosaic", "RGGB", "--method", "dewarp"), "method='dewarp' has no option 'mosaic'; its options are"),
-        (("--optics-sigma", -1), "sigma must be at least 0, got -1"),
+        (("--optics-sigma", -1), "error: --optics-sigma must be at least 0, got -1.0"),
         (("--optics-sigma", 50), "optics transmit"),
         (("--optics-sigma", 0.4, "--method", "dewarp"), "method='dewarp' has no option 'optics'; its options are"),
         (("--scale", 3), "scale must be one of 1, 2; got 3"),

@@ -86,6 +86,27 @@ def test_detect_in_windows_then_restore(place, tmp_path, capsys):
     assert not (tmp_path / "o.tif").exists()
 
 
+def test_a_required_axis_that_is_not_reliable_is_exit_code_3(place, tmp_path, capsys):
+    """In one window or in several; the results are those without the option. Other windows may be reliable."""
+    options, detect = ("--config", place / "camera.toml"), ("detect", place / "frames.tif")
+    for window in (4, 13):
+        found = (*detect, *options, "--window", window, "--overwrite", "--out", tmp_path / "found")
+        assert rsvib(*found, "--require-reliable", "x,y") == 0
+    counts = tifffile.imread(place / "frames.tif")
+    counts[6:] = np.random.default_rng(0).integers(0, 4095, counts[6:].shape)
+    tifffile.imwrite(tmp_path / "noise.tif", counts, photometric="minisblack", metadata=None)
+    for command in (("run", tmp_path / "noise.tif", tmp_path / "out"), ("report", tmp_path / "noise.tif", tmp_path)):
+        capsys.readouterr()
+        assert rsvib(*command, *options, "--require-reliable", "y") == 3
+        shown = capsys.readouterr()
+        assert "--require-reliable: y not reliable" in shown.err
+        assert "Files" in shown.out
+    assert rsvib(*found, "--require-reliable", "x,roll") == 3
+    motion = ("motion", tmp_path / "noise.tif", *options, "--search", 6, "--frames", "6:10", "--model", "swept")
+    assert rsvib(*motion, "--out", tmp_path / "motion.csv", "--require-reliable", "x") == 3
+    assert "expected axes such as x,y" in refused(capsys, *found, "--require-reliable", "z")
+
+
 def test_interrupted_run_can_be_continued(place, tmp_path):
     counts = np.concatenate([tifffile.imread(place / "frames.tif")] * 8)
     np.save(tmp_path / "long.npy", counts)

@@ -1,7 +1,6 @@
 """Metadata of TIFF files: copied to TIFF files, and listed where they cannot be."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -228,13 +227,50 @@ def test_folders_keep_what_all_files_have(tmp_path):
         tifffile.imwrite(tmp_path / "in" / f"{index}.tif", frame, extratags=tags_of(entries), metadata=None)
     info = read_stack_info(tmp_path / "in")
     frames = read_stack(tmp_path / "in", full_scale=4095)
-    assert metadata_not_kept(info, "out.tif", info.shape) == ("DateTime",)
+    assert metadata_not_kept(info, "out.tif", info.shape) == ("DateTime (differs between files)",)
     write_stack(tmp_path / "out.tif", frames, dtype="uint16", full_scale=4095, like=info)
     found = values(tmp_path / "out.tif")
     assert all(found[code] == value for code, _, _, value in GEOREFERENCE.values())
     assert 306 not in found
-    write_stack(tmp_path / "out", frames, like=replace(info, dtype="float32"))
-    assert read_stack_info(tmp_path / "out").metadata == {}
+
+
+@pytest.mark.parametrize(
+    "layout", [{"tile": (16, 32), "compression": "zlib", "predictor": 2}, {"compression": "lzma"}, {}]
+)
+def test_a_folder_of_tiff_files_becomes_one_with_the_same_names_tags_and_tiles(tmp_path, layout):
+    (tmp_path / "in").mkdir()
+    for index, frame in enumerate(draw_counts()):
+        moved = {"ModelTiepointTag": (33922, "d", 6, (0.0, 0.0, 0.0, 440720.0 + index, 3751320.0, 0.0))}
+        date = {"DateTime": (306, "s", 0, f"2024:01:01 00:00:{index:02d}")}
+        name, tags = f"S2_{index + 8}_B4.TIF", tags_of(GEOREFERENCE | moved | date)
+        tifffile.imwrite(tmp_path / "in" / name, frame, extratags=tags, metadata=None, **layout)
+    report = process_small(tmp_path / "in", tmp_path / "out")
+    assert (report.not_kept, report.restored) == ((), report.windows)
+    info = read_stack_info(f"{tmp_path / 'in'}[2:4]")
+    write_stack(
+        tmp_path / "part",
+        read_stack(f"{tmp_path / 'in'}[2:4]", full_scale=4095),
+        dtype="uint16",
+        full_scale=4095,
+        like=info,
+    )
+    assert sorted(path.name for path in (tmp_path / "part").iterdir()) == ["S2_10_B4.TIF", "S2_11_B4.TIF"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in (tmp_path / "in").iterdir()}
+    for path in [*(tmp_path / "out").iterdir(), *(tmp_path / "part").iterdir()]:
+        with tifffile.TiffFile(tmp_path / "in" / path.name) as before, tifffile.TiffFile(path) as after:
+            taken, kept = before.pages.first, after.pages.first
+            assert (kept.compression, kept.predictor, kept.dtype) == (taken.compression, taken.predictor, taken.dtype)
+            assert (kept.is_tiled, kept.chunks if kept.is_tiled else None) == (
+                taken.is_tiled,
+                taken.chunks if taken.is_tiled else None,
+            )
+            for code in (306, *(entry[0] for entry in GEOREFERENCE.values())):
+                assert kept.tags[code].value == taken.tags[code].value
+    assert not np.array_equal(
+        tifffile.imread(tmp_path / "out" / "S2_9_B4.TIF"), tifffile.imread(tmp_path / "in" / "S2_9_B4.TIF")
+    )
+    lost = metadata_not_kept(read_stack_info(tmp_path / "in"), tmp_path / "big", (FRAMES, 192, 128))
+    assert "ModelTiepointTag (differs between files)" in lost
 
 
 def test_thumbnails_and_other_images_are_listed(tmp_path):

@@ -465,10 +465,16 @@ def test_command_without_vibration_names_no_written_frames(place, capsys):
     arguments = ["report", str(place / "still.npy"), str(place / "still"), "--config", str(place / "camera.toml")]
     assert run_command(arguments) == 0
     printed = capsys.readouterr()
-    assert "no vibration to remove: the page has the input frames only" in printed.err
+    assert "no vibration was found that can be removed: the page has the input frames only" in printed.err
     assert "written" not in printed.err
     assert printed.out.count("no significant tone") == 2
     assert "displacement of the rows is uncertain" not in printed.out  # there is none
+    frames, out = str(place / "chart & <co>.tif"), place / "run"
+    assert run_command(["run", frames, str(out), "--config", str(place / "camera.toml")]) == 0
+    capsys.readouterr()
+    assert run_command([*arguments, "--overwrite", "--manifest", str(out / "manifest.json")]) == 0
+    assert f"Restoration according to {out / 'manifest.json'}\n  1 of 1 window restored\n" in capsys.readouterr().out
+    assert "Windows of the stack were restored before" in "".join(read(place / "still" / "report.html").text)
 
 
 @pytest.mark.parametrize(

@@ -23,15 +23,15 @@ def hand(t):
     return np.stack([x, y, roll, 0.01 * np.sin(2 * np.pi * 0.5 * t)])
 
 
-def vibration(t, tones):
-    """(2, ...) px."""
+def vibration(t, tones, decay):
+    """(2, ...) px; the tones decay with a time in s."""
     parts = np.zeros((2, *t.shape))
     for axis, (size, frequency, phase) in tones.items():
-        parts[axis] = size * np.sin(2 * np.pi * frequency * t + phase)
+        parts[axis] = size * np.exp(-t / decay) * np.sin(2 * np.pi * frequency * t + phase)
     return parts
 
 
-def recorded(tones, subject=True):
+def recorded(tones, subject=True, decay=np.inf):
     """(T, H, W) counts: a scene whose left part is nearer, with a subject that walks through, as a hand records it."""
     scene, patch = (
         draw_scene(side[0] + 160, side[1] + 160, seed) for side, seed in (((HEIGHT, WIDTH), 3), ((40, 10), 9))
@@ -44,7 +44,7 @@ def recorded(tones, subject=True):
         total = np.zeros((HEIGHT, WIDTH))
         for sample in range(SAMPLES):
             t = number / RATE + y * TIMING.row_time + (sample + 0.5) / SAMPLES * TIMING.exposure_time
-            (dx, dy, roll, zoom), moved = hand(t), vibration(t, tones)
+            (dx, dy, roll, zoom), moved = hand(t), vibration(t, tones, decay)
             near = np.where(x < 0.3 * WIDTH, 3.0 * np.sin(2 * np.pi * 0.7 * t), 0.0)
             # content at p appears at p + D(p): to first order, as the displacement is defined
             at_x = from_x - (dx + moved[0] + near - roll * from_y + zoom * from_x)
@@ -90,6 +90,12 @@ def test_tones_and_path_of_a_hand_with_parallax_and_a_subject():
 
 def test_a_hand_without_vibration_has_no_tones():
     assert fitted(recorded({}, subject=False))[1].tones(0.5) == []
+
+
+def test_a_vibration_that_decays_has_no_tones_that_cancel():
+    tones = fitted(recorded({0: (1.5, 37.0, 0.3), 1: (1.0, 53.0, 1.0)}, subject=False, decay=0.8))[1].tones(0.5)
+    assert tones
+    assert max(abs(tone.coefficient) for tone in tones) < 1.5
 
 
 def test_unrelated_frames_have_no_path():

@@ -352,6 +352,8 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         left_alone=report.left_alone,
         verdict=report.verdict,
     )
+    if not restored and report.windows is not None and report.windows.totals()["restored"]:
+        sentences[0] = words.WINDOWS_RESTORED
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
     windows = None if report.windows is None else _windows(report.windows)
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]

@@ -49,6 +49,12 @@ TERMS = {
 }
 
 
+WINDOWS_RESTORED = (
+    "Windows of the stack were restored before, see below; all frames together have no steady vibration that can be "
+    "removed, and are unchanged on this page."
+)
+
+
 def mark_of(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> Mark:
     """Overall result, which selects the colour of the verdict."""
     if not restored and verdict is None:
