@@ -38,7 +38,13 @@ from rsvib_torch.detection.tones.fit import (
     with_tone_parameters,
     with_tones,
 )
-from rsvib_torch.detection.tones.selection import find_tones, robust_fit, significant_only, typical_size
+from rsvib_torch.detection.tones.selection import (
+    find_tones,
+    robust_fit,
+    significant_only,
+    typical_size,
+    with_best_aliases,
+)
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration.gradients import RowGradients
 
@@ -360,7 +366,7 @@ class Refinement:
     def _searched(self, measurements: Measurements, residual: Array) -> ToneFit:
         """Fit with further tones. The noise of rows is nearly white: a tone that explains 2 % is significant."""
         independent = replace(measurements, independent=measurements.independent_fraction(residual))
-        start = strongest_only(self.fit)
+        start = with_best_aliases(independent, strongest_only(self.fit))
         return find_tones(independent, self._sample_interval, self._tones, start.model, 0.02, start, self._blind)
 
     def _bounded(self, fit: ToneFit, previous: ToneFit) -> ToneFit:

@@ -7,8 +7,8 @@ import torch
 from scipy import ndimage
 from truth import Curve, Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration, detect_vibration, simulate_frames
-from rsvib_torch.evaluation import resolution_chart
+from rsvib_torch import SensorNoise, SensorTiming, Vibration, detect_vibration, simulate_frames
+from rsvib_torch.evaluation import city_and_fields, resolution_chart
 
 MARGIN = 40
 
@@ -513,3 +513,15 @@ def test_narrow_frames_of_a_rotating_camera_are_refused():
     found = detect_vibration(torch.from_numpy(np.stack(frames) + noise).float(), timing, tones=1)
     assert not found.reliable.any()
     assert found.vibration.num_axes == 2
+
+
+def test_a_tone_is_not_taken_for_one_that_is_a_multiple_of_the_frame_rate_away():
+    """Bands explain the tone of 90.5 Hz by 30.2 Hz as well, and rows by 30.2, 150.9 and 271.4 Hz."""
+    timing = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=416.6667)  # 60 frames per second
+    vibration = Vibration([[1.2, 0.4], [0.7, 0.0]], [[137.0, 411.0], [90.5, 0.0]])
+    noise, seed = SensorNoise(read_noise=0.005), torch.Generator().manual_seed(0)
+    scene = city_and_fields(200, 200, seed=3)
+    frames = simulate_frames(scene, timing, vibration, num_frames=30, noise=noise, generator=seed)
+    found = detect_vibration(frames[12:20], timing)
+    assert found.reliable.all(), found.reasons
+    assert found.vibration.frequency[1].tolist() == [pytest.approx(90.5, abs=0.1), 0.0]
