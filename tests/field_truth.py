@@ -69,7 +69,7 @@ class LensMotion(FieldMotion):
 
 
 def take_field_frames(
-    scene: Array, timing: SensorTiming, motion: FieldMotion, size: tuple[int, int], num_frames: int = 2, nodes: int = 12
+    scene: Array, timing: SensorTiming, motion: FieldMotion, size: tuple[int, int], num_frames: int = 2, nodes: int = 6
 ) -> Array:
     """Frames (T, H, W) in image orientation, centred on the scene."""
     height, width = size

@@ -52,7 +52,7 @@ def test_libraries_fit_tones():
 @pytest.fixture(scope="module")
 def scene_and_frames():
     scene = draw_scene(160 + 2 * MARGIN, 144 + 2 * MARGIN, seed=61)
-    return crop(scene), take_frames(scene, TIMING, Motion(), 2, samples=64)
+    return crop(scene), take_frames(scene, TIMING, Motion(), 2)
 
 
 def with_noise(frames):

@@ -1,7 +1,7 @@
 """Ground truth for tests, independent of the package: scenes, motion and frames in NumPy float64.
 
 Displacement along rows is a Fourier shift of a scene larger than the frame, displacement across rows a quintic spline
-with the prefilter of SciPy, and the exposure a midpoint sum.
+with the prefilter of SciPy, and the exposure a sum over Gauss-Legendre nodes.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
 from scipy.interpolate import BSpline
 
 from rsvib_torch import SensorTiming, Vibration
@@ -73,29 +73,33 @@ def take_frames(
     *,
     seed: int = 0,
     margin: int = MARGIN,
-    samples: int | None = None,
 ) -> Array:
     """Frames (T, H, W) of the centred part of the scene, ``margin`` px smaller on every side."""
     height, width = (size - 2 * margin for size in scene.shape)
-    coefficients = ndimage.spline_filter1d(scene, order=5, axis=0, mode="mirror")
-    spectra = np.fft.rfft(coefficients, axis=1)
-    u = np.fft.rfftfreq(scene.shape[1])
+    spectra = np.fft.rfft(ndimage.spline_filter1d(scene, order=5, axis=0, mode="mirror"), axis=1)
+    fine, coarse = (np.arange(*steps) / scene.shape[1] for steps in ((16,), (0, spectra.shape[1], 16)))
     basis = BSpline.basis_element(np.arange(7) - 3.0, extrapolate=False)
-    count = max(int(np.ceil(timing.exposure_rows)), 8) if samples is None else samples
+    rows = np.arange(height)
     frames = np.zeros((num_frames, height, width))
     for p in range(num_frames):
-        total = np.zeros((height, len(u)), dtype=complex)
-        for n in range(count):
-            times = (p * timing.frame_rows + np.arange(height)) * timing.row_time
-            x, y = motion.displacement(times + (n + 0.5) / count * timing.exposure_time).T
-            place = np.arange(height) + margin - y
-            first = np.floor(place).astype(int) - 2
-            rows = np.zeros_like(total)
-            for tap in range(6):
-                weight = np.nan_to_num(basis(place - first - tap))
-                rows += weight[:, None] * spectra[np.clip(first + tap, 0, scene.shape[0] - 1)]
-            total += rows * np.exp(-2j * np.pi * x[:, None] * u)
-        frames[p] = np.fft.irfft(total / count, n=scene.shape[1], axis=1)[:, margin : margin + width]
+        starts = (p * timing.frame_rows + rows) * timing.row_time
+        # the longest path of a row: detail of half a cycle per px turns by pi per px of it
+        path = motion.displacement((starts + np.linspace(0, timing.exposure_time, 9)[:, None]).ravel())
+        length = np.abs(np.diff(path.reshape(9, height, 2), axis=0)).sum((0, 2)).max()
+        total = np.zeros((height, spectra.shape[1]), dtype=complex)
+        for node, share in zip(*np.polynomial.legendre.leggauss(6 + int(2 * length)), strict=True):
+            x, y = motion.displacement(starts + 0.5 * (1 + node) * timing.exposure_time).T
+            # across the rows: six taps of the spline
+            place = (rows + margin - y)[:, None]
+            taps = np.floor(place).astype(int) - 2 + np.arange(6)
+            weights = 0.5 * share * np.nan_to_num(basis(place - taps))
+            taps = np.clip(taps, 0, scene.shape[0] - 1)
+            moved = sparse.csr_array((weights.ravel(), taps.ravel(), 6 * np.arange(height + 1)), (height, len(scene)))
+            # along the rows: phase factors of all frequencies as products of those of two short lists
+            turn = -2j * np.pi * x[:, None]
+            factors = np.exp(turn * coarse)[..., None] * np.exp(turn * fine)[:, None]
+            total += (moved @ spectra) * factors.reshape(height, -1)[:, : spectra.shape[1]]
+        frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, margin : margin + width]
     return frames + noise * np.random.default_rng(seed).standard_normal(frames.shape)
 
 

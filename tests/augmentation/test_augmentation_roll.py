@@ -52,7 +52,7 @@ def still(scene):
 
 
 def test_images_equal_those_of_the_independent_camera(scene, still):
-    truth = take_field_frames(scene, TIMING, MOTION, SIZE, 1, nodes=8)[0]
+    truth = take_field_frames(scene, TIMING, MOTION, SIZE, 1)[0]
     image = fixed()(still)[0, 0].numpy()
     without = fixed(axes=2)(still)[0, 0].numpy()
     assert decibel(without[INNER], truth[INNER]) < 44

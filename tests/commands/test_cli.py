@@ -151,7 +151,7 @@ def test_pixels_without_data_are_neither_used_nor_changed(tmp_path, capsys):
     timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
     scene = draw_scene(200 + 2 * MARGIN, 160 + 2 * MARGIN, 3)
     motion = Motion(AMPLITUDE, FREQUENCY, PHASE)
-    frames = np.clip(4095 * take_frames(scene, timing, motion, 5, 0.003, samples=8), 1, 4095).astype(np.uint16)
+    frames = np.clip(4095 * take_frames(scene, timing, motion, 5, 0.003), 1, 4095).astype(np.uint16)
     border = np.arange(160) < 50 - 0.2 * np.arange(200)[:, None]
     frames[:, border] = 65535
     tags = [(42113, "s", 0, "65535", False)]
@@ -219,7 +219,7 @@ def test_known_motion_that_makes_frames_worse_leaves_them_unchanged_unless_force
     transient = Curve(lambda times: np.stack([12 * np.exp(-times / 0.006) * np.cos(400 * times), 0 * times], -1))
     timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=210)
     scene = draw_scene(200 + 2 * MARGIN, 128 + 2 * MARGIN, 3)
-    frames = np.clip(4095 * take_frames(scene, timing, transient, 5, 0.003, samples=8), 0, 4095).astype(np.uint16)
+    frames = np.clip(4095 * take_frames(scene, timing, transient, 5, 0.003), 0, 4095).astype(np.uint16)
     tags = [(33550, "d", 3, (0.5, 0.5, 0.0), False), (42113, "s", 0, "0", False)]
     options = {"photometric": "minisblack", "metadata": None, "extratags": tags}
     tifffile.imwrite(tmp_path / "frames.tif", frames, **options)

@@ -19,7 +19,7 @@ SCENE = draw_scene(SIZE + 80, SIZE + 80, seed=3)
 @pytest.fixture(scope="module", name="clip")
 def make_clip(tmp_path_factory):
     folder = tmp_path_factory.mktemp("live")
-    taken = take_frames(SCENE, TIMING, Motion((2.1, 1.6), (52.0, 71.0), (0.5, 1.0)), COUNT, 0.005, samples=4)
+    taken = take_frames(SCENE, TIMING, Motion((2.1, 1.6), (52.0, 71.0), (0.5, 1.0)), COUNT, 0.005)
     counts = np.clip(np.round(taken * 255), 0, 255).astype(np.uint8)
     info = StackInfo(counts.shape, "uint8", 255.0, frame_rate=30.0)
     write_stack(folder / "clip.mkv", counts, dtype="uint8", full_scale=255, like=info)

@@ -32,7 +32,7 @@ method = "dewarp"
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("roll")
     truth = FieldMotion((1.4, 1.9, 2.5e-3, 0.0), (38.0, 31.0, 26.0, 0.0), (0.3, 1.1, 2.0, 0.0))
-    frames = take_field_frames(draw_scene(256, 304, 11, blur=1.2), TIMING, truth, (192, 240), 4, nodes=5)
+    frames = take_field_frames(draw_scene(256, 304, 11, blur=1.2), TIMING, truth, (192, 240), 4)
     frames += 0.004 * np.random.default_rng(5).standard_normal(frames.shape)
     rsv.write_stack(folder / "frames.tif", torch.from_numpy(frames).clamp(0, 1), dtype="uint16", full_scale=4095)
     (folder / "camera.toml").write_text(CONFIG)

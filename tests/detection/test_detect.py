@@ -26,7 +26,7 @@ def random_phase(seed):
 def noisy_frames(timing, motion, seed, num_frames=2, *, rows=2048, columns=384, noise=NOISE, margin=40):
     """Noisy float32 frames of a scene generated from the seed."""
     scene = draw_scene(rows + 2 * margin, columns + 2 * margin, seed)
-    frames = take_frames(scene, timing, motion, num_frames, noise, seed=seed, margin=margin, samples=6)
+    frames = take_frames(scene, timing, motion, num_frames, noise, seed=seed, margin=margin)
     return torch.from_numpy(frames).float()
 
 

@@ -28,7 +28,7 @@ class Walk(Motion):
 
 def frames_of(motion, num_frames=4):
     scene = draw_scene(HEIGHT + 80, WIDTH + 80, 8)
-    return torch.from_numpy(take_frames(scene, TIMING, motion, num_frames, 0.005, samples=4)).float()
+    return torch.from_numpy(take_frames(scene, TIMING, motion, num_frames, 0.005)).float()
 
 
 @pytest.fixture(scope="module")

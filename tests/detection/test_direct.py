@@ -13,10 +13,10 @@ from rsvib_torch.evaluation import city_and_fields, resolution_chart
 MARGIN = 40
 
 
-def noisy_frames(camera, motion, seed, noise, rows=2048, columns=512, num_frames=2, samples=8):
+def noisy_frames(camera, motion, seed, noise, rows=2048, columns=512, num_frames=2):
     """Noisy frames of a scene generated from the seed."""
     scene = draw_scene(rows + 2 * MARGIN, columns + 2 * MARGIN, seed)
-    frames = take_frames(scene, camera, motion, num_frames, noise, seed=seed, samples=samples)
+    frames = take_frames(scene, camera, motion, num_frames, noise, seed=seed)
     return torch.from_numpy(frames).float()
 
 
@@ -124,8 +124,7 @@ def test_outliers_among_the_measured_offsets_have_quality_0():
 def test_long_exposures(paper_camera, exposure_rows, size, seed, phase, noise):
     """Blur adds no tone; 0.01 px of kernels that differ between rows change the amplitude by 0.04 px."""
     camera, motion = replace(paper_camera, exposure_rows=exposure_rows), Motion(phase=phase)
-    samples = 64 if size[0] == size[1] else 24
-    found = detect_vibration(noisy_frames(camera, motion, seed, noise, *size, samples=samples), camera)
+    found = detect_vibration(noisy_frames(camera, motion, seed, noise, *size), camera)
     amplitude, std = found.vibration.amplitude[:, 0].numpy(), found.std.amplitude[:, 0].numpy()
     wrong = np.abs(amplitude - np.array(motion.amplitude))
     assert found.vibration.amplitude.shape == (2, 1)
@@ -139,7 +138,7 @@ def test_long_exposures(paper_camera, exposure_rows, size, seed, phase, noise):
 def tall_frames(camera, exposure_rows, motion, seed, columns, num_frames):
     """Frames of 768 rows with noise 0.001, and their camera."""
     exposed = replace(camera, exposure_rows=exposure_rows)
-    return noisy_frames(exposed, motion, seed, 0.001, 768, columns, num_frames, samples=16), exposed
+    return noisy_frames(exposed, motion, seed, 0.001, 768, columns, num_frames), exposed
 
 
 def test_fast_vibration_with_different_blur_in_each_frame(paper_camera):
@@ -173,7 +172,7 @@ def test_alias_on_the_other_side_of_a_blind_frequency_is_corrected(paper_camera)
     camera = replace(paper_camera, exposure_rows=400)
     motion = Motion((3.1, 5.2), (50.0, 30.0), (-1.386, -1.422))
     chart = resolution_chart(1104, 1104, seed=7).double().numpy()
-    frames = take_frames(chart, camera, motion, 2, 0.005, seed=7, samples=64)
+    frames = take_frames(chart, camera, motion, 2, 0.005, seed=7)
     found = detect_vibration(torch.from_numpy(frames).float(), camera)
     assert found.reliable[1]  # the displacement along x is uncertain by 4 %, which is the limit
     np.testing.assert_allclose(found.vibration.amplitude[:, 0], motion.amplitude, rtol=0.03)
@@ -309,7 +308,7 @@ DISTURBANCES = (
 @pytest.fixture(scope="module")
 def clean_pairs(paper_camera):
     return {
-        motion: take_frames(draw_scene(2128, 400, seed), paper_camera, motion, 2, samples=8)
+        motion: take_frames(draw_scene(2128, 400, seed), paper_camera, motion, 2)
         for motion, seed in ((MIDDLING, 51), (SMALL, 52))
     }
 
@@ -350,7 +349,7 @@ def test_weak_tone_at_the_frequency_of_a_side_tone_is_detected(paper_camera):
 def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
     """Slow tones are measured on the other rows, for every position and motion of the cloud."""
     motion = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1))
-    frames = take_frames(draw_scene(2128, 336, 61), paper_camera, motion, 2, samples=8)
+    frames = take_frames(draw_scene(2128, 336, 61), paper_camera, motion, 2)
     tall, wide = frames.shape[-2] // 5, frames.shape[-1]
     cloud = draw_scene(tall + 20, wide + 20, 62)
     frames[0, top : top + tall] = cloud[10 : 10 + tall, 10 : 10 + wide]
@@ -369,7 +368,7 @@ def test_image_motion_of_almost_half_a_frame():
         motion = Motion((1.2, 0.9), (330.0, 260.0), (0.4, -1.0), move)
         margin = 640
         scene = draw_scene(1000 + 2 * margin, 700 + 2 * margin, 53)
-        frames = torch.from_numpy(take_frames(scene, camera, motion, 2, 0.003, seed=3, margin=margin, samples=6))
+        frames = torch.from_numpy(take_frames(scene, camera, motion, 2, 0.003, seed=3, margin=margin))
         result = detect_vibration(frames.float(), camera)
         check(result, motion, 0.1, 2.0, 0.01)
         torch.testing.assert_close(result.vibration.image_motion, torch.tensor(move).double(), rtol=0, atol=0.5)
@@ -417,7 +416,7 @@ def test_harmonics_share_a_frequency(paper_camera):
 def test_accelerated_image_motion(paper_camera):
     motion = Tones(((3.1,), (5.2,)), ((50.0,), (30.0,)), ((0.7,), (2.1,)), (200.0, -300.0), (900.0, -1500.0))
     scene = draw_scene(2048 + 200, 256 + 200, 56)
-    frames = take_frames(scene, paper_camera, motion, 4, 0.005, seed=6, margin=100, samples=6)
+    frames = take_frames(scene, paper_camera, motion, 4, 0.005, seed=6, margin=100)
     frames = torch.from_numpy(frames).float()
     result = detect_vibration(frames, paper_camera, image_acceleration=True)
     assert result.reliable.all(), result.reasons

@@ -22,7 +22,7 @@ def codes(found):
 
 @pytest.fixture(scope="module")
 def frames():
-    taken = take_frames(draw_scene(HEIGHT + 80, WIDTH + 80, 3), TIMING, MOTION, 8, 0.004, samples=16)
+    taken = take_frames(draw_scene(HEIGHT + 80, WIDTH + 80, 3), TIMING, MOTION, 8, 0.004)
     return torch.from_numpy(taken).float()
 
 
@@ -48,7 +48,7 @@ def test_the_exposures_that_the_blur_agrees_with_are_stated(frames):
 def beside(motions, num_frames):
     """Frames whose halves show scenes that move by motions of their own."""
     parts = [
-        take_frames(draw_scene(HEIGHT + 80, WIDTH + 80, seed), TIMING, motion, num_frames, 0.004, samples=6)
+        take_frames(draw_scene(HEIGHT + 80, WIDTH + 80, seed), TIMING, motion, num_frames, 0.004)
         for seed, motion in enumerate(motions)
     ]
     return torch.from_numpy(np.concatenate(parts, -1)).float()

@@ -30,7 +30,7 @@ SIZE = (224, 288)
 def rolling():
     """Scene at rest and four frames with noise."""
     scene = draw_scene(304, 368, 11, blur=1.2)
-    frames = take_field_frames(scene, TIMING, TRUTH, SIZE, 4, nodes=6)
+    frames = take_field_frames(scene, TIMING, TRUTH, SIZE, 4)
     still = take_field_frames(scene, TIMING, FieldMotion((0.0,) * 4), SIZE, 1, nodes=1)[0]
     noise = 0.004 * np.random.default_rng(5).standard_normal(frames.shape)
     return still, torch.from_numpy(frames + noise).float()
@@ -56,7 +56,7 @@ def test_roll_is_detected(detection):
 def test_roll_that_displaces_rows_by_pixels():
     """By 2 px rms, more than the parts of a pixel that gradients reach: the frames must be warped by the roll."""
     truth = FieldMotion((1.1, 0.8, 0.02, 0.0), (38.0, 31.0, 26.0, 0.0), (0.3, 1.1, 2.0, 0.0))
-    frames = take_field_frames(draw_scene(304, 368, 11, blur=1.2), TIMING, truth, SIZE, 4, nodes=6)
+    frames = take_field_frames(draw_scene(304, 368, 11, blur=1.2), TIMING, truth, SIZE, 4)
     frames = frames + 0.004 * np.random.default_rng(5).standard_normal(frames.shape)
     found = detect_vibration(torch.from_numpy(frames).float(), TIMING, roll=True)
     assert found.reliable.tolist() == [True, True, True]
@@ -74,7 +74,7 @@ def test_roll_is_measured_by_default(rolling, detection):
 def test_without_roll_the_result_is_the_same():
     """Bit for bit: roll is measured only if the halves of the rows move apart."""
     scene = draw_scene(224, 224, 11, blur=1.2)
-    frames = take_field_frames(scene, TIMING, FieldMotion((1.4, 1.9, 0.0, 0.0)), (160, 160), 2, nodes=4)
+    frames = take_field_frames(scene, TIMING, FieldMotion((1.4, 1.9, 0.0, 0.0)), (160, 160), 2)
     frames = torch.from_numpy(frames + 0.004 * np.random.default_rng(5).standard_normal(frames.shape)).float()
     found, without = detect_vibration(frames, TIMING), detect_vibration(frames, TIMING, roll=False, zoom=False)
     assert found.vibration.num_axes == 2
@@ -209,7 +209,7 @@ def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
     lens = (-0.12, 0.05, 1e-3, -2e-3, 0.01)
     truth = LensMotion((3.0, 4.0, 0.0, 0.0), (38.0, 31.0, 0.0, 0.0), (0.3, 1.1, 0.0, 0.0), 300.0, (6.0, -4.0), lens)
     scene = draw_scene(304, 368, 11, blur=1.2)
-    frames = torch.from_numpy(take_field_frames(scene, TIMING, truth, SIZE, 4, nodes=4)).float()
+    frames = torch.from_numpy(take_field_frames(scene, TIMING, truth, SIZE, 4)).float()
     frames = frames + 0.004 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(1))
     options = {"focal_length": 300.0, "principal_point": (143.5 + 6.0, 111.5 - 4.0), "distortion": lens}
     detection = detect_vibration(frames, TIMING, **options)

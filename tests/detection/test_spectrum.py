@@ -102,7 +102,7 @@ def test_blind_bands_are_around_multiples_of_the_frame_rate():
 def test_spectrum_of_frames_has_a_tone_that_the_detection_left_out():
     """The detection of a single tone along x does not explain the second one, which the spectrum has."""
     motion = Curve(lambda t: np.stack([0.8 * np.sin(880 * t) + 0.1 * np.sin(2530 * t), 0.3 * np.sin(600 * t + 1)], -1))
-    frames = take_frames(draw_scene(240, 220, seed=4), TIMING, motion, 24, noise=0.005, seed=3, samples=25)
+    frames = take_frames(draw_scene(240, 220, seed=4), TIMING, motion, 24, noise=0.005, seed=3)
     found = rsv.detect_vibration(torch.as_tensor(frames, dtype=torch.float32), TIMING, tones=1)
     spectrum = found.spectrum()
     assert spectrum.lines.amplitude[0, :2].tolist() == pytest.approx([0.8, 0.1], rel=0.15)  # errors of up to 13 %

@@ -78,7 +78,7 @@ NEAR_BLIND = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=220)
 def test_two_frames_are_refused(scene):
     steady = tone(1.6, 90.0, phase=1.0)
     timing = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=300)  # blind at 83.3 Hz
-    frames = torch.from_numpy(take_frames(scene, timing, steady, 3, 0.002, samples=8)).float()
+    frames = torch.from_numpy(take_frames(scene, timing, steady, 3, 0.002)).float()
     two = rsv.detect_swept_tone(frames[:2], timing)
     assert not two.reliable.any()
     assert all(of_axis[0].code == "too_few_frames_for_sweep" for of_axis in two.findings)
@@ -93,7 +93,7 @@ def test_other_minima_are_left(scene):
     # from one start, the fit ended at 6.8 ± 0.3 Hz, 11.2 ± 0.6 px with a decay of 112 ± 3 /s
     swept = tone(1.7, 29.3, decay=16.9, chirp=461.0, phase=-0.4)
     small = scene[: 192 + 2 * MARGIN, : 96 + 2 * MARGIN]
-    frames = torch.from_numpy(take_frames(small, NEAR_BLIND, swept, 4, 0.004, samples=8)).float()
+    frames = torch.from_numpy(take_frames(small, NEAR_BLIND, swept, 4, 0.004)).float()
     found = rsv.detect_swept_tone(frames, NEAR_BLIND)
     assert found.reliable.all()
     for name, true in (("amplitude", 1.7), ("frequency", 29.3), ("decay", 16.9), ("chirp", 461.0)):
@@ -103,7 +103,7 @@ def test_other_minima_are_left(scene):
 
 @pytest.mark.parametrize("contrast", [0.0, 0.02, 0.3])  # of the scene; without the check 4.20 ± 0.08 px for 0.02
 def test_noise_that_hides_the_scene_is_refused(scene, contrast):
-    flat = 0.5 + contrast * (torch.from_numpy(take_frames(scene, TIMING, tone(0.5, 60.0), 3, 0.0, samples=8)) - 0.5)
+    flat = 0.5 + contrast * (torch.from_numpy(take_frames(scene, TIMING, tone(0.5, 60.0), 3, 0.0)) - 0.5)
     noisy = flat.float() + 0.02 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(2))
     assert not rsv.detect_swept_tone(noisy, TIMING).reliable.any()
     if contrast < 0.1:
@@ -125,7 +125,7 @@ def test_long_record_is_followed_from_the_part_with_the_largest_offsets(scene):
     timing = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=110)
     swept = tone(2.5, 83.0, decay=8.0, chirp=20.0, phase=0.4)
     small = scene[: 100 + 2 * MARGIN, : 128 + 2 * MARGIN]
-    frames = torch.from_numpy(take_frames(small, timing, swept, 90, 0.004, samples=8)).float()
+    frames = torch.from_numpy(take_frames(small, timing, swept, 90, 0.004)).float()
     found = rsv.detect_swept_tone(frames, timing)
     assert found.reliable.all()
     for name, true in (("amplitude", 2.5), ("frequency", 83.0), ("decay", 8.0), ("chirp", 20.0)):

@@ -58,7 +58,7 @@ def test_cubic_kernels_are_more_accurate_than_linear_kernels(waves):
 
 def test_against_independent_simulator():
     scene = draw_scene(260, 240, 4)
-    truth = take_frames(scene, TIMING, MOTION, 2, samples=64)
+    truth = take_frames(scene, TIMING, MOTION, 2)
     frames = simulate_frames(
         torch.from_numpy(scene), TIMING, MOTION.vibration(), frame_size=(260 - 2 * MARGIN, 240 - 2 * MARGIN)
     ).numpy()

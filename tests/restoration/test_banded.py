@@ -40,7 +40,7 @@ def test_blur_of_long_exposures_is_removed(short):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
     motion = Motion(amplitude=(3.0, 3.0), frequency=(60.0, 60.0))
     scene = draw_scene(512, 256, seed=21)
-    frames = take_frames(scene, timing, motion, 1, 0.002, samples=100)
+    frames = take_frames(scene, timing, motion, 1, 0.002)
     middle = timing.row_starts(1, frames.shape[1])
     moved = torch.from_numpy(motion.displacement((middle + timing.exposure_time / 2).numpy()))
     sharpened = decibel(restore(as_tensor(frames), timing, motion.vibration(), method="banded")[0], crop(scene))

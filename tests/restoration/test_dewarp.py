@@ -47,7 +47,7 @@ def test_blur_of_long_exposures_is_not_removed():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=400, frame_rows=2048)
     motion = Motion()
     scene = draw_scene(336, 288, seed=15)
-    frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.005, samples=48))
+    frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.005))
     exact = decibel(restore(frames, timing, motion.vibration(), method="exact"), crop(scene))
     assert exact > decibel(dewarp(frames, timing, motion.vibration()), crop(scene)) + 4
 

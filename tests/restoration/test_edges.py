@@ -43,7 +43,7 @@ def step(request):
     scene[:, 128:] = 0.75
     scene = ndimage.gaussian_filter(scene if request.param == "upright" else scene.T, 0.8)
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=100, frame_rows=2048)
-    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02, samples=32)).float()
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02)).float()
     return crop(scene), frames, timing, 0 if request.param == "upright" else 1
 
 
@@ -60,7 +60,7 @@ def test_psnr_exceeds_that_of_the_gaussian_prior(buildings, joint):
 def test_psnr_exceeds_that_of_the_gaussian_prior_under_blur(joint, exposure_rows):
     scene = draw_scene(272, 240, seed=5)
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=exposure_rows, frame_rows=2048)
-    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02, samples=32)).float()
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 2, 0.02)).float()
     plain, kept = (
         restore(frames, timing, Motion().vibration(), joint=joint, prior=prior) for prior in ("gaussian", "edges")
     )

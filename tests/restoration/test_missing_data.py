@@ -21,7 +21,7 @@ def camera(rows=20):
 
 
 def noisy_frames(count=3, rows=20):
-    clean = take_frames(SCENE, camera(rows), MOTION, count, samples=24 if rows > 50 else 10)
+    clean = take_frames(SCENE, camera(rows), MOTION, count)
     return torch.from_numpy(clean + NOISE * np.random.default_rng(1).standard_normal(clean.shape)).float()
 
 

@@ -198,7 +198,7 @@ def texture(size, blur, seed=1):
 
 def blurred_frames(scene, rows, noise, count=1, motion=DEFAULT_MOTION):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
-    clean = take_frames(scene, timing, motion, count, samples=24)
+    clean = take_frames(scene, timing, motion, count)
     frames = clean + noise * np.random.default_rng(3).standard_normal(clean.shape)
     moved = frame_motion(motion.vibration().expanded(1), timing, count, frames.shape[-2])
     return torch.from_numpy(frames).float()[:, None], moved

@@ -210,7 +210,7 @@ def frames_with_lamps(timing):
     rows, columns = np.mgrid[: scene.shape[0], : scene.shape[1]]
     for row, column in ((120, 100), (220, 180)):
         scene += 0.7 * np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * 2.0**2))
-    frames = torch.from_numpy(take_frames(scene, timing, MOTION, 2, 0.002, samples=32)).float()
+    frames = torch.from_numpy(take_frames(scene, timing, MOTION, 2, 0.002)).float()
     counts = (frames.clamp(max=0.8) * (4095 / 0.8)).round().clamp(0, 4095).to(torch.int32)
     assert 20 < int((counts == 4095).sum()) < 400
     return crop(scene), counts
@@ -237,7 +237,7 @@ def test_saturated_pixels_do_not_lower_the_noise_level(share):
     """They have no noise: with a quarter of the frame, the level was 0, and the others lost 4 dB."""
     scene = draw_scene(256 + 80, 192 + 80, seed=53, blur=1.0)
     scene[: int(share * len(scene))] = 1.5
-    frames = torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, 0.01, samples=16)).float().clamp(max=1.0)
+    frames = torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, 0.01)).float().clamp(max=1.0)
     truth, options = crop(scene), {"saturation": 1.0, "check": False}
     first = int(share * len(scene))
     estimated, given = (

@@ -98,7 +98,7 @@ def test_blur_of_long_exposures_is_removed_better_than_by_dewarping():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
     motion = Motion()
     scene = draw_scene(272, 240, seed=21)
-    frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.002, samples=32)).float()
+    frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.002)).float()
     warped = decibel(restore(frames, timing, motion.vibration(), method="dewarp", check=False), crop(scene))
     assert decibel(lucy(frames, timing, motion.vibration()), crop(scene)) > warped + 3
 
@@ -107,7 +107,7 @@ def test_blur_of_long_exposures_is_removed_better_than_by_dewarping():
 def test_two_frames_are_more_accurate_than_one(rows):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     motion, scene = Motion(), draw_scene(272, 240, seed=31)
-    frames = torch.from_numpy(take_frames(scene, timing, motion, 3, 0.02, samples=24)).float()
+    frames = torch.from_numpy(take_frames(scene, timing, motion, 3, 0.02)).float()
     alone = [decibel(frame, crop(scene)) for frame in lucy(frames, timing, motion.vibration())]
     pairs = lucy(frames, timing, motion.vibration(), joint=2)
     assert pairs.shape == frames.shape
@@ -136,7 +136,7 @@ def test_numbers_of_frames_restored_together():
 def test_displaced_frames_are_joined_where_they_overlap():
     motion = Motion(image_motion=(1500.0, -700.0))  # (63, -29) px from frame to frame
     scene = draw_scene(420, 420, seed=8)
-    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.02, samples=16, margin=110)).float()
+    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.02, margin=110)).float()
     _, shift = visible_pixels(TIMING, motion.vibration(), (200, 200), 2)
     columns, rows = (int(step) for step in shift[1] - shift[0])
     assert (columns, rows) == (63, -29)
@@ -158,7 +158,7 @@ def test_frames_without_overlap_are_not_joined():
 
 def test_masked_pixels_are_restored_from_the_other_frame():
     motion, scene = Motion(), draw_scene(240, 240, seed=12)
-    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005, samples=16)).float()
+    frames = torch.from_numpy(take_frames(scene, TIMING, motion, 2, 0.005)).float()
     ignore = torch.zeros(frames.shape, dtype=torch.bool)
     ignore[1, 60:90, 60:90] = True
     part = (slice(60, 90), slice(60, 90))

@@ -18,7 +18,7 @@ NUM_ROWS, WIDTH, NOISE = 264, 240, 0.005
 def slab_data(request):
     """Two frames (2, 1, R, W), their kernels, the frequencies, and the precision of the prior at these frequencies."""
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=request.param, frame_rows=2048)
-    clean = take_frames(draw_scene(NUM_ROWS + 80, WIDTH + 80, 3), timing, Motion(), 2, samples=16)
+    clean = take_frames(draw_scene(NUM_ROWS + 80, WIDTH + 80, 3), timing, Motion(), 2)
     noise = NOISE * np.random.default_rng(2).standard_normal(clean.shape)
     frames = torch.from_numpy(clean + noise).float()[:, None]
     motion = frame_motion(Motion().vibration().expanded(1), timing, 2, NUM_ROWS)

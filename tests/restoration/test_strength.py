@@ -48,7 +48,7 @@ SCENES = {
 def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint, least, within):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     scene = SCENES[name]()
-    clean = take_frames(scene, timing, MOTION, 2, samples=64)
+    clean = take_frames(scene, timing, MOTION, 2)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()[:given]
     found = decibel(restore(frames, timing, MOTION.vibration(), joint=joint)[0], crop(scene))
     stack = model_of(frames, timing, MOTION.vibration())
@@ -63,7 +63,7 @@ def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint
 
 def test_interpolation_error_depends_on_the_blur_of_each_frame():
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
-    frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001, samples=100)).float()[:, None]
+    frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001)).float()[:, None]
     height = frames.shape[-2]
     motion = frame_motion(MOTION.vibration().expanded(1), timing, 2, height)
     prior = fit_prior(frames[None], motion, torch.full((1, 2), 0.001), 256)
@@ -82,7 +82,7 @@ def test_interpolation_error_depends_on_the_blur_of_each_frame():
 )
 def test_frames_of_the_same_noise_share_a_strength(name, rows, noise, choices, monkeypatch):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
-    clean = take_frames(SCENES[name](), timing, MOTION, 2, samples=48)
+    clean = take_frames(SCENES[name](), timing, MOTION, 2)
     frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
     model = model_of(frames, timing, MOTION.vibration())
     numbers = []

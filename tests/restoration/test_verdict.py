@@ -59,8 +59,7 @@ def frames_of(scene, timing, motion, noise, count=2):
     """Frames of a scene, simulated once for each case; noise is added afterwards."""
     key = (id(scene), timing, motion, count)
     if key not in TAKEN:
-        samples = 24 if timing.exposure_rows > 50 else 10
-        TAKEN[key] = scene, torch.from_numpy(take_frames(scene, timing, motion, count, samples=samples)).float()
+        TAKEN[key] = scene, torch.from_numpy(take_frames(scene, timing, motion, count)).float()
     still = TAKEN[key][1]
     return still + noise * torch.randn(still.shape, generator=torch.Generator().manual_seed(0))
 

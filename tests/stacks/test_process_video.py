@@ -44,7 +44,7 @@ STILL = np.stack([crop(channel) for channel in SCENE])
 
 
 def counts_of(motion, count=COUNT):
-    taken = [take_frames(channel, TIMING, motion, count, 0.004, seed=3, samples=4) for channel in SCENE]
+    taken = [take_frames(channel, TIMING, motion, count, 0.004, seed=3) for channel in SCENE]
     return np.clip(np.round(255 * np.stack(taken, -1)), 0, 255).astype(np.uint8)
 
 

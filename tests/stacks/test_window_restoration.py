@@ -14,7 +14,7 @@ def test_trusted_restoration_equals_the_public_functions(scan_axis):
     timing = SensorTiming(2e-5, 20, 256, scan_axis=scan_axis)
     motion = Motion(amplitude=(2.0, 3.0), frequency=(120.0, 90.0))
     upright = SensorTiming(2e-5, 20, 256)
-    frames = torch.from_numpy(take_frames(draw_scene(208, 208, 3), upright, motion, 2, samples=4)).float()
+    frames = torch.from_numpy(take_frames(draw_scene(208, 208, 3), upright, motion, 2)).float()
     vibration = motion.vibration()
     if scan_axis == -1:
         frames, vibration = frames.transpose(-2, -1), vibration.from_row_order(timing)
@@ -30,7 +30,7 @@ def test_trusted_restoration_equals_the_public_functions(scan_axis):
 def test_motions_are_undone_and_unchanged_frames_have_the_shape_of_restored_ones(joint):
     """The frames as taken replace restored ones if nothing moves, or if these are worse; joint: the middle frame."""
     timing, motion = SensorTiming(2e-5, 20, 256), Motion(amplitude=(2.0, 3.0), frequency=(120.0, 90.0))
-    frames = torch.from_numpy(take_frames(draw_scene(208, 208, 3), timing, motion, 3, samples=4)).float()
+    frames = torch.from_numpy(take_frames(draw_scene(208, 208, 3), timing, motion, 3)).float()
     frames[:, 20, 30] = torch.nan
     vibration, options = motion.vibration(), {"joint": joint}
     opposite = Vibration(vibration.amplitude, vibration.frequency, vibration.phase + torch.pi)

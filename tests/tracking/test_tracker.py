@@ -35,7 +35,7 @@ STEADY = Sines()
 
 
 def taken(motion, count, noise=0.005):
-    return torch.as_tensor(take_frames(SCENE, TIMING, motion, count, noise, seed=1, samples=4), dtype=torch.float32)
+    return torch.as_tensor(take_frames(SCENE, TIMING, motion, count, noise, seed=1), dtype=torch.float32)
 
 
 def track(frames, times=None, **options):

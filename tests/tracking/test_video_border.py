@@ -23,7 +23,7 @@ class Shaken:
 @pytest.fixture(scope="module", name="tracked")
 def make_tracked():
     scene = draw_scene(SIZE + 80, SIZE + 80, seed=3)
-    frames = torch.as_tensor(take_frames(scene, TIMING, Shaken(), 30, 0.005, samples=4), dtype=torch.float32)
+    frames = torch.as_tensor(take_frames(scene, TIMING, Shaken(), 30, 0.005), dtype=torch.float32)
     tracker = rsv.VibrationTracker(TIMING, columns=None)
     return [tracker.update(frame) for frame in frames]
 
