@@ -63,11 +63,17 @@ def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUN
     return torch.from_numpy(frames).float()
 
 
+def in_axes(orientation, of_camera):
+    """Rates (N, 3) about the axes of a gyroscope, from those about the axes of the camera."""
+    own = np.zeros_like(of_camera)
+    for axis, letter in enumerate(orientation):
+        own[:, "xyz".index(letter.lower())] = of_camera[:, axis] * (1.0 if letter.isupper() else -1.0)
+    return own
+
+
 def recorded(orientation="XYZ", size=1.0, mirrored=1.0, count=COUNT):
     """Rates about the axes of a gyroscope, for an assignment of the axes of the camera."""
     times = np.arange(-0.04, 0.0656 + count * TIMING.frame_period, 1e-3)
-    of_camera, own = rates_of(times, size), np.zeros((len(times), 3))
-    for axis, letter in enumerate(orientation):
-        own[:, "xyz".index(letter.lower())] = of_camera[:, axis] * (1.0 if letter.isupper() else -1.0)
+    own = in_axes(orientation, rates_of(times, size))
     own[:, 0] *= mirrored
     return rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))

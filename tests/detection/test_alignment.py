@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 import torch
+from program import refused, rsvib
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 
 HEIGHT, WIDTH, FRAMES = 224, 160, 4
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=300)
@@ -132,15 +132,9 @@ def test_clock_offsets_beyond_the_recording_are_reported(frames, tmp_path):
 def test_command(frames, gyroscope, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text(CONFIG)
     rsv.write_stack(tmp_path / "frames.tif", frames)
-    arguments = [
-        "known",
-        str(tmp_path / "frames.tif"),
-        str(tmp_path / "out.tif"),
-        "--config",
-        str(tmp_path / "camera.toml"),
-    ]
-    arguments += ["--motion", str(gyroscope), "--unit", "rad/s"]
-    assert run_command([*arguments, "--focal-length", "900", "--device", "cpu"]) == 0
+    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    arguments, focal = (*known, "--motion", gyroscope, "--unit", "rad/s"), ("--focal-length", 900)
+    assert rsvib(*arguments, *focal, "--device", "cpu") == 0
     printed = capsys.readouterr().out
     assert "time 0 of the frames is 812.34" in printed
     before, after = (float(value) for value in re.search(r"\n +x +([\d.]+) +([\d.]+)\n", printed).groups())
@@ -149,24 +143,19 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     first = rsv.read_stack(tmp_path / "out.tif")
     assert first.shape == frames.shape
     assert re.search(r"restored frames agree; estimated improvement \+\d", printed)
-    assert run_command([*arguments, "--focal-length", "900", "--offset", str(CLOCK), "--overwrite"]) == 0
+    assert rsvib(*arguments, *focal, "--offset", CLOCK, "--overwrite") == 0
     assert (rsv.read_stack(tmp_path / "out.tif") - first).square().mean() < 0.01
     (tmp_path / "out.tif").unlink()
     for more, message in (
-        (["--focal-length", "900", "--offset", "813.35"], "the frames need"),
-        (["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y"], "x: rows are further apart"),
-        (["--focal-length", "900", "--flip-x"], "does not explain"),
-        ([], "needs a focal_length"),
-        (["--focal-length", "900", "--time-unit", "us"], "check time_unit='us'"),
+        ((*focal, "--offset", 813.35), "the frames need"),
+        ((*focal, "--offset", CLOCK, "--flip-x", "--flip-y"), "x: rows are further apart"),
+        ((*focal, "--flip-x"), "does not explain"),
+        ((), "needs a focal_length"),
+        ((*focal, "--time-unit", "us"), "check time_unit='us'"),
     ):
-        capsys.readouterr()
-        assert run_command([*arguments, *more]) == 2
-        errors = capsys.readouterr().err.strip().splitlines()
-        assert len(errors) == 1
-        assert message in errors[0]
+        assert message in refused(capsys, *arguments, *more)
         assert not (tmp_path / "out.tif").exists()
-    forced = ["--focal-length", "900", "--offset", str(CLOCK), "--flip-x", "--flip-y", "--force"]
-    assert run_command([*arguments, *forced]) == 0
+    assert rsvib(*arguments, *focal, "--offset", CLOCK, "--flip-x", "--flip-y", "--force") == 0
     assert "y: rows are further apart" in capsys.readouterr().err
     assert (tmp_path / "out.tif").exists()
 

@@ -101,15 +101,6 @@ def test_a_motion_that_is_no_sum_of_tones_names_no_timing():
     assert causes(found) == []
 
 
-def test_two_frames_state_the_timing_as_an_assumption(frames):
-    """Two frames cannot contradict frame_rows: the printed result contains what is assumed."""
-    found = detect_vibration(frames[:2], replace(TIMING, frame_rows=HEIGHT))
-    shown = " ".join(str(found).split())
-    assert "assumed: frame_rows=200 is the number of rows of the frames: there are no blanking rows" in shown
-    assert "assumed: frame_rows, readout direction, scan axis and order of the frames: two frames cannot" in shown
-    assert "assumed: row_time=" in shown
-
-
 def test_a_batch_names_the_cause_of_its_own_stack(frames):
     both = torch.stack([frames, frames.flip(-2)])[:, :, None]
     found = detect_vibration(both, TIMING)

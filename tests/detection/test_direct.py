@@ -1,5 +1,5 @@
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -195,7 +195,6 @@ def test_amplitude_of_a_blind_tone_caused_by_blur_does_not_diverge():
 def test_two_tones_over_four_frames_are_detected(paper_camera):
     first = Motion((1.5, 1.2), (41.0, 97.0), (0.7, 0.3))
     second = Motion((0.6, 0.4), (180.0, 66.0), (2.1, -2.0))
-
     both = Curve(lambda times: first.displacement(times) + second.displacement(times))
     frames = noisy_frames(paper_camera, both, 43, 0.005, columns=384, num_frames=4)
     found = detect_vibration(frames, paper_camera, method="direct").vibration
@@ -228,29 +227,6 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     result = detect_vibration(frames, paper_camera, method="direct")
     assert result.reliable.tolist() == [False, True]
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
-
-
-@dataclass(frozen=True)
-class Tones:
-    """Tones of both axes (2, K) with a drift that may be accelerated."""
-
-    amplitude: tuple
-    frequency: tuple
-    phase: tuple
-    image_motion: tuple = (0.0, 0.0)
-    image_acceleration: tuple = (0.0, 0.0)
-
-    def displacement(self, times):
-        rows = zip(self.amplitude, self.frequency, self.phase, self.image_motion, self.image_acceleration, strict=True)
-        return np.stack(
-            [
-                sum(a * np.sin(2 * np.pi * f * times + p) for a, f, p in zip(*tones, strict=True))
-                + v * times
-                + b * times**2 / 2
-                for *tones, v, b in rows
-            ],
-            axis=-1,
-        )
 
 
 MIDDLING = Motion((1.2, 0.8), (83.0, 110.0), (2.7, 0.2))
@@ -393,20 +369,17 @@ def test_uneven_frame_times_measure_a_blind_frequency(paper_camera):
 
 
 def test_harmonics_share_a_frequency(paper_camera):
-    base = 37.0
-    motion = Tones(
-        ((2.0, 0.5, 0.2), (1.0, 0.3, 0.1)),
-        ((base, 2 * base, 3 * base), (61.0, 122.0, 183.0)),
-        ((0.1, 0.2, 0.3), (1.0, 2.0, 3.0)),
-    )
+    amplitude, frequency = np.array([[2.0, 0.5, 0.2], [1.0, 0.3, 0.1]]), np.array([[37.0], [61.0]]) * [1, 2, 3]
+    phase = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
+    motion = Curve(lambda t: (amplitude * np.sin(2 * np.pi * frequency * t[..., None, None] + phase)).sum(-1))
     frames = noisy_frames(paper_camera, motion, 55, 0.005, columns=256, num_frames=3)
     tied = detect_vibration(frames, paper_camera, harmonics=3)
     free = detect_vibration(frames, paper_camera)
     for result in (tied, free):
         found = result.vibration
         assert found.amplitude.shape == (2, 3)
-        assert (found.frequency / torch.tensor(motion.frequency) - 1).abs().max() < 5e-4
-        assert (found.amplitude / torch.tensor(motion.amplitude) - 1).abs().max() < 0.02
+        assert (found.frequency / torch.from_numpy(frequency) - 1).abs().max() < 5e-4
+        assert (found.amplitude / torch.from_numpy(amplitude) - 1).abs().max() < 0.02
     multiples = tied.vibration.frequency / tied.vibration.frequency[:, :1]
     torch.testing.assert_close(multiples, torch.tensor([[1.0, 2.0, 3.0]] * 2).double(), rtol=1e-12, atol=0)
     # the constraint reduces the standard deviation
@@ -414,7 +387,8 @@ def test_harmonics_share_a_frequency(paper_camera):
 
 
 def test_accelerated_image_motion(paper_camera):
-    motion = Tones(((3.1,), (5.2,)), ((50.0,), (30.0,)), ((0.7,), (2.1,)), (200.0, -300.0), (900.0, -1500.0))
+    steady = Motion(phase=(0.7, 2.1), image_motion=(200.0, -300.0))
+    motion = Curve(lambda t: steady.displacement(t) + np.array([450.0, -750.0]) * t[..., None] ** 2)
     scene = draw_scene(2048 + 200, 256 + 200, 56)
     frames = take_frames(scene, paper_camera, motion, 4, 0.005, seed=6, margin=100)
     frames = torch.from_numpy(frames).float()
@@ -458,14 +432,6 @@ def test_windows_measure_a_changing_vibration(paper_camera):
     )
 
 
-def test_drift_without_vibration_is_not_reliable(paper_camera):
-    motion = Motion((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (300.0, -200.0))
-    frames = noisy_frames(paper_camera, motion, 58, 0.02, columns=256)
-    result = detect_vibration(frames, paper_camera)
-    assert not bool(result.reliable.any())
-    torch.testing.assert_close(result.vibration.image_motion, torch.tensor([300.0, -200.0]).double(), rtol=0, atol=1.0)
-
-
 def test_rotation_is_not_detected_as_vibration(paper_camera):
     """A camera that rotates between the frames moves the two halves of each row along y, and the rows along x."""
     scene = draw_scene(2128, 336, 59)
@@ -482,18 +448,15 @@ def test_rotation_is_not_detected_as_vibration(paper_camera):
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "message"),
+    ("options", "message"),
     [
-        ({"window": 1}, ValueError, "window must be at least 2, got 1"),
-        ({"window": 5}, ValueError, "window of 5 frames is longer than the stack of 3"),
-        ({"window": 2, "window_step": 0}, ValueError, "window_step must be at least 1, got 0"),
-        ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit"),
-        ({"ignore": torch.zeros(256, 256)}, TypeError, "ignore must be a bool tensor"),
-        ({"ignore": torch.ones(256, 256, dtype=torch.bool)}, ValueError, "frames have no pixel with data"),
+        ({"window": 1}, "window must be at least 2, got 1"),
+        ({"window": 5}, "window of 5 frames is longer than the stack of 3"),
+        ({"window": 2, "window_step": 0}, "window_step must be at least 1, got 0"),
     ],
 )
-def test_bad_options(paper_camera, options, error, message):
-    with pytest.raises(error, match=message):
+def test_bad_options(paper_camera, options, message):
+    with pytest.raises(ValueError, match=message):
         detect_vibration(torch.rand(3, 256, 256), paper_camera, **options)
 
 

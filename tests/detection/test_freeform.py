@@ -7,7 +7,6 @@ from motion_truth import common_warp, offset_error, rms
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.motion.spline import FreeMotion
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 9
@@ -170,22 +169,6 @@ def test_options_of_tones_are_refused_by_other_models(first_frames):
         rsv.detect_vibration(first_frames, TIMING, model="spline")
     with pytest.raises(ValueError, match="model must be one of 'tones'; got 'free'"):
         rsv.VibrationDetector(TIMING, model="free")
-
-
-def test_command(scene, frames, tmp_path, capsys):
-    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
-    rsv.write_stack(tmp_path / "frames.tif", frames)
-    config = ["--config", str(tmp_path / "camera.toml")]
-    assert run_command(["motion", str(tmp_path / "frames.tif"), *config, "--out", str(tmp_path / "motion.csv")]) == 0
-    assert capsys.readouterr().out.count("reliable") == 2
-    table = np.loadtxt(tmp_path / "motion.csv", delimiter=",", skiprows=1)
-    error = table[:, 1:3] - Jitter().displacement(table[:, 0])
-    assert (error - error.mean(0)).std(0).max() < 0.4
-    known = ["known", str(tmp_path / "frames.tif"), str(tmp_path / "out.tif"), *config, "--unit", "px", "--offset", "0"]
-    assert run_command([*known, "--motion", str(tmp_path / "motion.csv")]) == 0
-    restored = rsv.read_stack(tmp_path / "out.tif")
-    difference = (restored[1:] - restored[:-1])[:, 32:-32, 32:-32].std()
-    assert difference < 0.3 * (frames[1:] - frames[:-1])[:, 32:-32, 32:-32].std()
 
 
 @pytest.mark.parametrize(

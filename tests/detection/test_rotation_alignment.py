@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, SIZE, TIMING, attitude, recorded, take
+from program import refused, rsvib
+from rotating_camera import BIAS, COUNT, FOCAL_LENGTH, OFFSET, SIZE, TIMING, attitude, in_axes, rates_of, recorded, take
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.recorded.corner_tracks import CornerTracks, corner_tracks
 from rsvib_torch.detection.recorded.rotation_alignment import align_rates
@@ -112,28 +112,18 @@ def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
         ",".join(f"{v:.12g}" for v in (t, *w)) for t, w in zip(rates.times.tolist(), rates.rates.tolist(), strict=True)
     ]
     (tmp_path / "rates.csv").write_text("time,gx_rad_s,gy_rad_s,gz_rad_s\n" + "\n".join(rows))
-    arguments = [
-        "known",
-        "frames.tif",
-        "out.tif",
-        "--config",
-        "camera.toml",
-        "--motion",
-        "rates.csv",
-        "--focal-length",
-        "380",
-    ]
-    arguments = [str(tmp_path / one) if "." in one else one for one in arguments] + ["--device", "cpu"]
-    assert run_command([*arguments, "--fit-row-time", "--offsets", "0.3", "0.4"]) == 0
+    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    arguments = (*known, "--motion", tmp_path / "rates.csv", "--focal-length", 380, "--device", "cpu")
+    assert rsvib(*arguments, "--fit-row-time", "--offsets", 0.3, 0.4) == 0
     printed = capsys.readouterr().out
     assert float(re.search(r"time 0 of the frames is ([\d.]+)", printed).group(1)) == pytest.approx(0.35, abs=3e-4)
     assert 78 < float(re.search(r"row time ([\d.]+)", printed).group(1)) < 82
     restored = rsv.read_stack(tmp_path / "out.tif")
     before, after = (float((one[1:] - one[:-1])[..., 20:-20, 20:-20].square().mean()) for one in (frames, restored))
     assert after < 0.1 * before
-    assert run_command([*arguments, "--offsets", "0.36", "0.4", "--overwrite"]) == 2
-    assert run_command([*arguments, "--offsets", "0.3", "0.4", "--offset", "0.35", "--overwrite"]) == 2
-    assert "give one of them" in capsys.readouterr().err
+    assert rsvib(*arguments, "--offsets", 0.36, 0.4, "--overwrite") == 2
+    both = ("--offsets", 0.3, 0.4, "--offset", 0.35, "--overwrite")
+    assert "give one of them" in refused(capsys, *arguments, *both)
 
 
 def test_mirrored_axes_are_refused(tracks):
@@ -196,11 +186,6 @@ def test_arguments(frames):
         rsv.AngularRates(rates.times.flip(0), rates.rates)
 
 
-def shaken(times):
-    """Attitude that is larger than that of ``attitude``, of a vehicle on a rough road."""
-    return attitude(times, 3.0)
-
-
 @pytest.mark.parametrize(
     ("axes", "speed"), [("zxY", (0.0, 0.0, 0.0)), ("XYZ", (0.1, -0.05, 0.6)), ("yZx", (0.4, 0.1, 0.0))]
 )
@@ -221,7 +206,7 @@ def test_translation_of_the_camera_is_no_bias(axes, speed):
         t = np.stack(
             [start + (place[:, 1] + 239.5) * row_time, start + timing.frame_period + (moved[:, 1] + 239.5) * row_time]
         )
-        first, last = (shaken(one + 0.5 * timing.exposure_time) for one in t)
+        first, last = (attitude(one + 0.5 * timing.exposure_time, 3.0) for one in t)  # of a vehicle on a rough road
         point = first.apply(ray * distance[:, None]) - (t[1] - t[0])[:, None] * first.apply(np.array(speed))
         seen = last.inv().apply(point)
         moved = 500.0 * seen[:, :2] / seen[:, 2:]
@@ -233,11 +218,8 @@ def test_translation_of_the_camera_is_no_bias(axes, speed):
     cell = ((place[:, 1] + 240) // 80 * 8 + (place[:, 0] + 320) // 80).astype(int)
     tables = (torch.from_numpy(values) for values in (pair, cell, starts, rows, place, offsets))
     tracks = CornerTracks(*tables, num_pairs=pairs, radius=230.0)
-    times, step = np.arange(-0.04, 0.8, 1e-3), 1e-6
-    rates = (shaken(times - step).inv() * shaken(times + step)).as_rotvec() / (2 * step)
-    own = np.zeros_like(rates)
-    for axis, letter in enumerate(axes):
-        own[:, "xyz".index(letter.lower())] = rates[:, axis] * (1.0 if letter.isupper() else -1.0)
+    times = np.arange(-0.04, 0.8, 1e-3)
+    own = in_axes(axes, rates_of(times, 3.0))
     recording = rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))
     options = {"offsets": None, "fit_scale": True, "fit_focal_length": True, "fit_row_time": True}
     wrong = replace(timing, row_time=4.5e-5)

@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 import torch
+from program import refused, rsvib
 from simulated_gpu import SIMULATED_GPU, simulated_gpu
 from truth import MARGIN, Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.config import read_config
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.row_time.by_free_motion import row_time_of_splines
@@ -180,16 +180,13 @@ def test_command(two_tones, one_tone, tmp_path, capsys):
     moving, ambiguous, out = tmp_path / "moving.tif", tmp_path / "one_tone.tif", tmp_path / "sensor.toml"
     rsv.write_stack(moving, two_tones, dtype="float32")
     rsv.write_stack(ambiguous, one_tone, dtype="float32")
-    options = ["--by-motion", "--frame-rate", str(RATE), "--exposure", "480us"]
-    assert run_command(["calibrate", str(moving), *options, "--out", str(out)]) == 0
+    options = ("--by-motion", "--frame-rate", RATE, "--exposure", "480us")
+    assert rsvib("calibrate", moving, *options, "--out", out) == 0
     sensor = read_config(out)
     assert abs(sensor.timing.row_time / ROW_TIME - 1) < 2e-3
     assert sensor.timing.exposure_time == pytest.approx(4.8e-4)
-    capsys.readouterr()
-    assert run_command(["calibrate", str(ambiguous), *options, "--out", str(tmp_path / "none.toml")]) == 2
-    assert re.search(r"error: the row time is not certain: \d+ row times explain", capsys.readouterr().err)
+    error = refused(capsys, "calibrate", ambiguous, *options, "--out", tmp_path / "none.toml")
+    assert re.search(r"error: the row time is not certain: \d+ row times explain", error)
     assert not (tmp_path / "none.toml").exists()
-    assert run_command(["calibrate", str(moving), "--by-motion"]) == 2
-    assert "--frame-rate" in capsys.readouterr().err
-    assert run_command(["calibrate", str(moving), "--frequency", "100", "--row-time", "1us"]) == 2
-    assert "--by-motion" in capsys.readouterr().err
+    assert "--frame-rate" in refused(capsys, "calibrate", moving, "--by-motion")
+    assert "--by-motion" in refused(capsys, "calibrate", moving, "--frequency", 100, "--row-time", "1us")

@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 import torch
+from program import rsvib
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.reason import Reason
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 5
@@ -179,8 +179,8 @@ def test_batch_equals_single_stacks(frames, found):
 def test_command(frames, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 6e-5\nexposure_rows = 20\nframe_rows = 270\n")
     rsv.write_stack(tmp_path / "frames.tif", frames)
-    config = ["--config", str(tmp_path / "camera.toml"), "--model", "swept", "--out", str(tmp_path / "motion.csv")]
-    assert run_command(["motion", str(tmp_path / "frames.tif"), *config]) == 0
+    options = ("--config", tmp_path / "camera.toml", "--model", "swept", "--out", tmp_path / "motion.csv")
+    assert rsvib("motion", tmp_path / "frames.tif", *options) == 0
     printed = capsys.readouterr().out
     assert float(re.search(r"chirp \(Hz/s\) +(\S+) ± ", printed).group(1)) == pytest.approx(0, abs=12)
     assert printed.count(": reliable") == 2
