@@ -21,11 +21,10 @@ def short():
     return crop(scene), take_frames(scene, TIMING, motion, 2, NOISE), motion
 
 
-@pytest.mark.parametrize("seed", [101])
-def test_gain_exceeds_12_db_in_both_frames_of_the_paper_camera(seed):
-    motion = Motion(phase=(0.9 * seed, 0.3 * seed))
-    scene = draw_scene(2048, 336, seed)
-    frames = take_frames(scene, TIMING, motion, 2, NOISE, seed=seed)
+def test_gain_exceeds_12_db_in_both_frames_of_the_paper_camera():
+    motion = Motion(phase=(90.9, 30.3))
+    scene = draw_scene(2048, 336, 101)
+    frames = take_frames(scene, TIMING, motion, 2, NOISE, seed=101)
     truth = crop(scene)
     restored = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded").numpy()
     halfway = restore(as_tensor(frames), TIMING, motion.scaled(0.5).vibration(), method="banded").numpy()

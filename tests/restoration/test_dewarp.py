@@ -5,7 +5,7 @@ import pytest
 import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration
+from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore
 
 dewarp = partial(restore, method="dewarp")
@@ -50,15 +50,3 @@ def test_blur_of_long_exposures_is_not_removed():
     frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.005))
     exact = decibel(restore(frames, timing, motion.vibration(), method="exact"), crop(scene))
     assert exact > decibel(dewarp(frames, timing, motion.vibration()), crop(scene)) + 4
-
-
-def test_gradients_to_frames_and_vibration():
-    timing = SensorTiming(row_time=1e-3, exposure_rows=2, frame_rows=8)
-    frames = torch.rand(1, 6, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def run(images, amplitude, frequency, phase, image_motion):
-        return dewarp(images, timing, Vibration(amplitude, frequency, phase, image_motion))
-
-    vibration = Vibration([0.8, 0.6], [20.0, 30.0], [0.3, 1.0], [3.0, -2.0])
-    inputs = (frames, vibration.amplitude, vibration.frequency, vibration.phase, vibration.image_motion)
-    assert torch.autograd.gradcheck(run, tuple(value.clone().requires_grad_() for value in inputs))

@@ -88,8 +88,3 @@ def test_gradients_to_frames_and_flat_scenes():
     restore(frames, TIMING, Vibration(1.0, 50.0), prior="edges", noise=0.05).square().sum().backward()
     assert torch.isfinite(frames.grad).all()
     assert frames.grad.abs().min() > 0
-
-
-def test_bad_input():
-    with pytest.raises(ValueError, match="prior must be one of"):
-        restore(torch.zeros(1, 16, 16), TIMING, Vibration(1.0, 50.0), prior="tv")

@@ -61,23 +61,6 @@ def test_long_exposures(rows, one, two):
     assert decibel(joint, crop(scene)) > two
 
 
-@pytest.mark.parametrize("noise", [0.001, 0.02])
-def test_estimated_regularisation_is_close_to_the_best(short, noise):
-    truth, frames, motion = short
-    frames = with_noise(frames, noise)[:1]
-    found = decibel(restore(frames, TIMING, motion.vibration()), truth)
-    for factor in (0.3, 3.0):
-        by_hand = restore(frames, TIMING, motion.vibration(), regularisation=factor)
-        assert decibel(by_hand, truth) < found + 0.3
-
-
-def test_psnr_exceeds_that_of_the_banded_method(short):
-    truth, frames, motion = short
-    frames = with_noise(frames, 0.005)
-    slabs = restore_by_any_method(frames, TIMING, motion.vibration(), method="banded")
-    assert decibel(restore(frames, TIMING, motion.vibration()), truth) > decibel(slabs, truth) + 1
-
-
 def test_noisier_frames_have_less_weight(short):
     truth, frames, motion = short
     frames = torch.cat([with_noise(frames[:1], 0.003), with_noise(frames[1:], 0.01, seed=6)])

@@ -221,33 +221,6 @@ def test_inaccurate_vibration_is_reported_and_no_worse_than_on_pixels(frames, tr
         restored(taken)
 
 
-def test_stacks_in_windows(frames, tmp_path):
-    rsv.write_stack(tmp_path / "frames.tif", frames.clamp(0, 1), dtype="uint16", full_scale=65535)
-    options = {"joint": True, "scale": 2}
-    rsv.process_stack(tmp_path / "frames.tif", tmp_path / "out.tif", TIMING, restoration=options, force=True)
-    written = rsv.read_stack(tmp_path / "out.tif")
-    assert written.shape == (1, 2 * SIZE, 2 * SIZE)
-    assert written[0].isfinite().all()
-    # nothing moves: the middle frame is interpolated
-    still = frames[:1].repeat(4, 1, 1) + NOISE * torch.randn(4, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
-    rsv.write_stack(tmp_path / "still.tif", still.clamp(0, 1), dtype="uint16", full_scale=65535)
-    rsv.process_stack(tmp_path / "still.tif", tmp_path / "same.tif", TIMING, restoration=options)
-    same = rsv.read_stack(tmp_path / "same.tif")
-    assert torch.allclose(same[0, ::2, ::2], rsv.read_stack(tmp_path / "still.tif")[2], atol=1e-4)
-    assert same.shape == (1, 2 * SIZE, 2 * SIZE)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scale": 2, "prior": "edges"}, "scale=2 has prior='gaussian' only"),
-    ],
-)
-def test_errors(frames, options, message):
-    with pytest.raises((ValueError, TypeError), match=message):
-        rsv.restore(frames, TIMING, VIBRATION, **options)
-
-
 @pytest.mark.parametrize("error", [0.0, 0.1])
 def test_strips_of_frames_with_roll_do_not_contradict_the_vibration(error):
     timing = rsv.SensorTiming(row_time=5e-5, exposure_rows=10, frame_rows=150)

@@ -11,7 +11,6 @@ from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.noise import (
     ESTIMATORS,
     estimate_noise,
-    fit_noise,
     noise_floor,
     noise_levels,
     noise_of_blurred_frames,
@@ -262,17 +261,3 @@ def test_kernel_between_rows():
         assert seen.mean() == pytest.approx(response.item(), abs=1e-5)
         # the kernel of a scene row is the mean of the kernels of the two neighbouring frame rows
         assert np.array(scene_weights()) @ wave[35:46] == pytest.approx(response.item(), rel=4e-3)
-
-
-def test_fisher_scoring_recovers_the_parameters_of_exact_powers():
-    """Exact powers are a fixed point of the iterations, which twelve of them reach."""
-    generator = torch.Generator().manual_seed(7)
-    transfer = torch.rand(2, 12, 40, dtype=torch.float64, generator=generator)
-    scene = 5 * torch.rand(2, 1, 40, dtype=torch.float64, generator=generator) + 0.5
-    texture = torch.rand(2, 12, 1, dtype=torch.float64, generator=generator) + 0.5
-    noise = torch.tensor([0.3, 0.02], dtype=torch.float64)
-    power = texture * transfer * scene + noise[:, None, None]
-    power[:, 3] = 100.0  # not usable
-    usable = torch.ones(2, 12, dtype=torch.bool)
-    usable[:, 3] = False
-    torch.testing.assert_close(fit_noise(power, transfer, usable), noise, rtol=1e-7, atol=0)

@@ -256,21 +256,6 @@ def test_noise_gain_is_that_of_the_operator(scene):
         predict_noise_gain(frames, timing, Vibration.still(), columns=8)
 
 
-@pytest.mark.parametrize(
-    ("frames", "restored", "motion", "message"),
-    [
-        (torch.zeros(1, 16, 16), torch.zeros(1, 16, 16), Motion(), "at least 2 frames are needed, got 1"),
-        (torch.zeros(2, 16, 16), torch.zeros(1, 16, 16), Motion(), r"restored must have the shape \(2, 16, 16\)"),
-        (torch.zeros(1, 2, 1, 16, 16), torch.zeros(1, 2, 1, 16, 16), Motion(), "frames must be one stack"),
-        (torch.zeros(2, 16, 16), torch.zeros(2, 16, 16), Motion(image_motion=(900.0, 0.0)), "nothing in common"),
-    ],
-)
-def test_bad_input(frames, restored, motion, message):
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-    with pytest.raises(ValueError, match=message):
-        judge_restoration(frames, restored, timing, motion.vibration())
-
-
 @pytest.mark.parametrize(("joint", "gain", "offset"), [(False, 1.0, 0.05), (True, 1.1, 0.0), (False, 0.8, 0.1)])
 def test_frames_may_differ_in_brightness(scene, joint, gain, offset):
     timing, motion = camera(), scaled_motion()
@@ -316,14 +301,16 @@ def test_dtypes_and_detections_of_restore_are_accepted(scene):
     restored = restore(frames, timing, vibration)
     for raw, clear in ((frames.half(), restored.half()), (frames.double(), restored), (frames, restored.double())):
         assert judge_restoration(raw, clear, timing, vibration).overall == "helps"
-    counts = [(images.clamp(0, 1) * 4095).round().to(torch.int32) for images in (frames, restored)]
-    assert judge_restoration(*counts, timing, vibration, full_scale=4095).overall == "helps"
     assert judge_restoration(frames, restored, timing, detection_of(vibration)).overall == "helps"
 
 
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
+        ({"frames": torch.zeros(1, 96, 96)}, ValueError, "at least 2 frames are needed, got 1"),
+        ({"frames": torch.zeros(2, 16, 16)}, ValueError, r"restored must have the shape \(2, 16, 16\)"),
+        ({"frames": torch.zeros(1, 2, 1, 96, 96)}, ValueError, "frames must be one stack"),
+        ({"vibration": Vibration(1.0, 50.0, image_motion=(9e3, 0.0))}, ValueError, "nothing in common"),
         ({"most_pairs": 0}, ValueError, "most_pairs must be at least 1, got 0"),
         ({"most_pairs": 1.5}, TypeError, "most_pairs must be a whole number or None, got 1.5"),
         ({"joint": 2.7}, TypeError, "joint must be True or False or a whole number, got 2.7"),
@@ -445,7 +432,7 @@ def test_pairs_to_judge():
 def test_finer_grids_and_mosaics_are_judged_at_the_pixels(options, direction):
     timing = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=200, readout_direction=direction)
     motion = scaled_motion()
-    frames = torch.from_numpy(take_frames(draw_scene(240, 200, seed=3), timing, motion, 2)).float()
+    frames = torch.from_numpy(take_frames(draw_scene(184, 176, seed=3), timing, motion, 2)).float()
     frames = frames if direction == "forward" else frames.flip(-2)  # grey, so that it is a mosaic as well
     frames = frames + 0.003 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
     right = motion.vibration()
