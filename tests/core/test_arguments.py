@@ -17,6 +17,7 @@ from rsvib_torch.evaluation.scenes import city_and_fields
 
 TIMING = rsv.SensorTiming(1e-4, 6, 104)
 LONG = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 2.0])
+BANDS = {"band_rows": 16, "band_step": 8, "search": 6}
 CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
 VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
@@ -52,7 +53,7 @@ def nested():
         (FRAMES.to_sparse, r"frames must be a dense tensor.*to_dense"),
         (lambda: torch.quantize_per_tensor(FRAMES, 0.1, 0, torch.quint8), "frames must not be quantised"),
         (lambda: FRAMES.to(torch.complex64), "frames must be real numbers"),
-        (lambda: FRAMES > 0.5, "frames must be real numbers"),
+        (lambda: FRAMES > 0.5, r"frames must be real numbers, got torch.bool; pass frames.float\(\)"),
         (lambda: FRAMES.to(torch.float8_e4m3fn), "frames must have at least 16 bits"),
         (lambda: FRAMES.numpy().astype(object), "frames must be a tensor or array of numbers"),
         (lambda: np.ma.masked_invalid(FRAMES.numpy()), "frames must not be a masked array"),
@@ -99,10 +100,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: VIBRATION.with_axes([0, 5], [1.0, 1.0]), "order must be a permutation"),
         (lambda: rsv.FreeMotion(torch.zeros(2, 9), 0.0, 1e-3).mean_displacement(torch.zeros(3), 1e9), "exposure_time"),
         (lambda: rsv.restore(FRAMES, "timing", VIBRATION), "timing must be a SensorTiming"),
-        (
-            lambda: rsv.restore(FRAMES, TIMING, 3),
-            r"vibration must be a Motion or a DetectedVibration \(from .*\), got 3",
-        ),
+        (lambda: rsv.restore(FRAMES, TIMING, 3), r"vibration must be a Motion or a DetectedVibration \(from .*\),"),
         (lambda: rsv.row_psf(VIBRATION, TIMING.row_starts(1, 4)[0], TIMING, num_nodes=10**9), "num_nodes must be at"),
         (lambda: rsv.row_psf(VIBRATION, torch.tensor([math.inf]), TIMING), "starts must be finite times"),
         (lambda: rsv.psnr(FRAMES, FRAMES, 10**400), "data_range must be a number, got a very large int"),
@@ -116,7 +114,7 @@ def test_pixels_beyond_all_scales(value):
         ),
         (lambda: rsv.psf_figure(rsv.Vibration(1e6, 50.0), TIMING, 96), "point spread functions of 24 rows"),
         (
-            lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, band_rows=16, band_step=8, search=6),
+            lambda: rsv.detect_swept_tone(FRAMES[:1].expand(2, 96, 64), LONG, **BANDS),
             "frames cover 2.01 s; starts of the swept model .* at most .* s: pass larger band_rows",
         ),
         (lambda: rsv.restore(FRAMES, TIMING, VIBRATION, method="banded", half_rows=10**9), "half_rows must be at most"),
@@ -146,29 +144,33 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration"),
         (lambda: rsv.MotionCheck("x", torch.zeros(2), True, (), *CURVES), "before must be a tensor"),
         (lambda: rsv.MotionCheck(torch.zeros(3), torch.zeros(2), True, (), *CURVES), r"before must have shape \(2,\)"),
+        (lambda: rsv.restore_block(nested(), TIMING), "frames must be a NumPy array, got a nested tensor"),
+        (lambda: replace(STD, displacement=nested()), "displacement must be a dense tensor, got a nested"),
+        (lambda: rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9, **BANDS), "knot_rows must be at most"),
+        (
+            lambda: rsv.FreeMotion.from_samples(torch.arange(11.0), torch.zeros(11, 2, requires_grad=True)),
+            r"from_samples has no gradient: pass displacement\.detach\(\)",
+        ),
+        *(
+            (lambda motions=motions: rsv.FreeMotion.stacked(motions), "motions must be a sequence, got")
+            for motions in (torch.tensor(1.0), torch.zeros(0), np.zeros(3))
+        ),
+        *(
+            (lambda starts=starts: VIBRATION.path(starts, torch.zeros(2)), "starts must be a tensor")
+            for starts in (None, "0.1", 0, TIMING, [None])
+        ),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # PyTorch states that nested tensors may change
 def test_values_beyond_the_limits_of_an_argument(build, message):
     with pytest.raises((ValueError, TypeError), match=message):
         build()
 
 
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # PyTorch states that nested tensors may change
-def test_nested_tensors_are_described():
-    with pytest.raises(TypeError, match="frames must be a NumPy array, got a nested tensor"):
-        rsv.restore_block(nested(), TIMING)
-    with pytest.raises(TypeError, match="displacement must be a dense tensor, got a nested"):
-        replace(STD, displacement=nested())
-
-
 @pytest.mark.parametrize(
     ("result", "changes", "message"),
     [
-        (
-            "std",
-            {"amplitude": torch.zeros(4, 2, 1)},
-            r"frequency must have shape .* with \.\.\. = \(4,\), A = 2, K = 1",
-        ),
+        ("std", {"amplitude": torch.zeros(4, 2, 1)}, r"frequency must have shape .* with \.\.\. = \(4,\), A = 2, K ="),
         ("std", {"displacement": torch.zeros(1, 2)}, r"displacement must have shape \(\.\.\., A\) with \.\.\. = \(\)"),
         ("curve", {"offsets": torch.zeros(1, 3, 1)}, r"offsets must have shape .* A = 2 to 4, got \(1, 3, 1\)"),
         ("curve", {"times": torch.zeros(4, 1, 3)}, r"times must have shape .* with \.\.\. = \(\), P = 1, N = 3"),
@@ -241,18 +243,6 @@ def test_tensors_are_freed_without_garbage_collection():
         gc.enable()
 
 
-@pytest.mark.parametrize("motions", [torch.tensor(1.0), torch.zeros(0), np.zeros(3)])
-def test_arrays_are_no_sequences_of_objects(motions):
-    with pytest.raises(TypeError, match="motions must be a sequence, got"):
-        rsv.FreeMotion.stacked(motions)
-
-
-@pytest.mark.parametrize("starts", [None, "0.1", 0, TIMING, [None]])
-def test_path_of_starts_that_are_no_tensor(starts):
-    with pytest.raises(TypeError, match="starts must be a tensor"):
-        VIBRATION.path(starts, torch.zeros(2))
-
-
 @pytest.mark.parametrize(("name", "value"), [("misfit_after", torch.zeros(2)), ("findings", ())])
 def test_verdicts_of_contradicting_sizes(name, value):
     pair, axes = torch.ones(1), torch.ones(1, 2)
@@ -264,22 +254,11 @@ def test_verdicts_of_contradicting_sizes(name, value):
         rsv.RestorationVerdict(**values | {name: value})
 
 
-def test_knots_further_apart_than_the_stack_is_long():
-    with pytest.raises(ValueError, match="knot_rows must be at most"):
-        rsv.detect_motion(FRAMES, TIMING, knot_rows=10**9, band_rows=16, band_step=8, search=6)
-
-
 def test_optics_of_frames_of_16_bits():
     optics = rsv.Optics(0.5, 0.4, 1.0)
     image = optics.apply(FRAMES.to(torch.bfloat16))
     assert image.dtype == torch.bfloat16
     torch.testing.assert_close(image.float(), optics.apply(FRAMES), atol=0.01, rtol=0)
-
-
-def test_samples_with_gradient_are_refused():
-    times = torch.linspace(0, 0.1, 11, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"from_samples has no gradient: pass displacement\.detach\(\)"):
-        rsv.FreeMotion.from_samples(times, torch.zeros(11, 2, requires_grad=True))
 
 
 def test_arrays_of_numpy_with_a_type_alias_are_known():

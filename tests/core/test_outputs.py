@@ -62,7 +62,13 @@ def test_outputs_that_change_an_input_are_refused(place, output, source, reason)
 
 @pytest.mark.parametrize(
     ("output", "source"),
-    [("other.tif", "frames.tif"), ("new.tif", "pngs"), ("pngs2", "pngs"), ("pngs/x.tif", "pngs/a.png")],
+    [
+        ("other.tif", "frames.tif"),
+        ("new.tif", "pngs"),
+        ("frames.tif", "pngs"),
+        ("pngs2", "pngs"),
+        ("pngs/x.tif", "pngs/a.png"),
+    ],
 )
 def test_other_outputs_are_accepted(place, output, source):
     check_outputs([output], [source])

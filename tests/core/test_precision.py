@@ -6,7 +6,6 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.core.precision import outside_inference
 from rsvib_torch.evaluation.scenes import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
@@ -58,18 +57,3 @@ def test_restoration_with_a_detected_motion_is_differentiable(frames):
     rsv.restore(given, TIMING, found).square().mean().backward()
     assert float(given.grad.abs().max()) > 0
     assert float(found.amplitude.grad.abs().max()) > 0
-
-
-def test_all_tensors_of_a_value_are_copied():
-    @dataclasses.dataclass(frozen=True)
-    class Pair:
-        one: torch.Tensor
-        others: tuple
-
-    with torch.inference_mode():
-        value = Pair(torch.ones(1), ({"a": torch.zeros(1)}, [torch.ones(2)], "text"))
-    assert len(inference_tensors(value, "")) == 3
-    copied = outside_inference(value)
-    assert inference_tensors(copied, "") == []
-    assert copied.others[0]["a"].tolist() == [0.0]
-    assert copied.others[2] == "text"

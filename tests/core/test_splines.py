@@ -41,16 +41,6 @@ def test_coefficients_equal_those_of_scipy(degree, length, dim):
     assert np.abs(found - samples.numpy()).max() > 0.05
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-def test_splines_interpolate(degree):
-    samples = noise(50)
-    coefficients = bspline_coefficients(samples, degree, 0)
-    weights = bspline_weights(torch.zeros((), dtype=torch.float64), degree)
-    for place in (10, 25, 39):
-        taps = torch.arange(degree + 1) - degree // 2 + place
-        assert (weights * coefficients[taps]).sum().item() == pytest.approx(samples[place].item(), abs=1e-7)
-
-
 def test_accuracy_grows_with_the_degree():
     """A sine of a fifth of a cycle per sample, between the samples."""
     places = torch.arange(200, dtype=torch.float64)
