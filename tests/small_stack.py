@@ -1,5 +1,7 @@
 """A small vibrating stack, simulated by the independent camera of tests/truth.py, and its processing."""
 
+import json
+
 import numpy as np
 import tifffile
 from scipy import ndimage
@@ -35,6 +37,16 @@ def draw_counts(frames=FRAMES):
 def write_small(path, frames=FRAMES):
     """Write the stack as a TIFF file without metadata, like another program."""
     tifffile.imwrite(path, draw_counts(frames), photometric="minisblack", metadata=None)
+
+
+def write_with_gaps(folder, kept, start=0.0):
+    """Write the kept frames of the stack as big-endian raw counts that state their times and a resolution."""
+    (folder / "frames.raw").write_bytes(draw_counts(max(kept) + 1)[list(kept)].astype(">u2").tobytes())
+    sidecar = {"format": "rsvib raw", "version": 1, "shape": [len(kept), HEIGHT, WIDTH], "axes": "THW"}
+    sidecar |= {"dtype": "uint16", "byte_order": "big", "full_scale": 4095, "resolution": [120.0, 60.0, "centimeter"]}
+    times = [start + index * TIMING.frame_period for index in kept]
+    (folder / "frames.raw.json").write_text(json.dumps(sidecar | {"frame_times": times}))
+    return times
 
 
 def process_small(source, sink, **options):

@@ -22,6 +22,12 @@ def make_place(tmp_path_factory):
     return folder
 
 
+def cluster_of(workers):
+    """A cluster of Dask in this process."""
+    options = {"processes": False, "dashboard_address": None, "protocol": "inproc"}
+    return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, **options)
+
+
 def check_same(place, folder):
     assert (folder / "out.tif").read_bytes() == (place / "out.tif").read_bytes()
     ours, theirs = (read_manifest(path / "out.tif.manifest.json") for path in (place, folder))
@@ -29,9 +35,7 @@ def check_same(place, folder):
 
 
 def test_dask_workers_give_the_same_bytes(place, tmp_path):
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, protocol="inproc"
-    ) as cluster:
+    with cluster_of(2) as cluster:
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
     check_same(place, tmp_path)
 
@@ -43,9 +47,7 @@ def test_run_with_threads_is_resumed_with_dask(place, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         process_small(place / "frames.tif", tmp_path / "out.tif", progress=stop)
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="inproc"
-    ) as cluster:
+    with cluster_of(1) as cluster:
         report = process_small(
             place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address, resume=True
         )
@@ -56,7 +58,7 @@ def test_run_with_threads_is_resumed_with_dask(place, tmp_path):
 def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "NO_WORKERS_SECONDS", 0.5)
     with (
-        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="inproc") as cluster,
+        cluster_of(0) as cluster,
         pytest.raises(OSError, match=r"no Dask workers for 0.5 s; start workers, and resume the run"),
     ):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)

@@ -1,7 +1,6 @@
 """Interrupted runs: no frame is missing, repeated or incomplete after they are resumed."""
 
 import errno
-import json
 import os
 import resource
 import shutil
@@ -23,7 +22,7 @@ def process_whole(tmp_path_factory):
     """A stack and the output of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("whole")
     write_small(folder / "frames.tif")
-    for name in ("out.tif", "out.npy", "out.zarr"):
+    for name in ("out.tif", "out.npy"):
         process_small(folder / "frames.tif", folder / name)
     return folder
 
@@ -38,20 +37,6 @@ def stop_after(frames):
     return stop
 
 
-def content(path):
-    """All files below a path."""
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    return {str(file.relative_to(path.parent)): file.read_bytes() for file in files}
-
-
-def check_whole(whole, folder, name):
-    """The result is identical to that of the uninterrupted run, and there are no other files."""
-    assert content(folder / name) == content(whole / name)
-    manifest = f"{name}.manifest.json"
-    assert json.loads((folder / manifest).read_text()) == json.loads((whole / manifest).read_text())
-    assert {path.name for path in folder.iterdir()} == {name, manifest}
-
-
 def process_with_limit(source, sink, limit, **options):
     """Process the stack where files have at most ``limit`` bytes."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -59,9 +44,9 @@ def process_with_limit(source, sink, limit, **options):
 
 
 @pytest.fixture(name="interrupted")
-def interrupt_a_run(tmp_path):
+def interrupt_a_run(whole, tmp_path):
     """A folder with a run that was interrupted."""
-    write_small(tmp_path / "frames.tif")
+    shutil.copy(whole / "frames.tif", tmp_path)
     with pytest.raises(KeyboardInterrupt):
         process_small(tmp_path / "frames.tif", tmp_path / "out.tif", progress=stop_after(8))
     assert work_folder(tmp_path / "out.tif").is_dir()
@@ -121,7 +106,9 @@ def test_keyboard_interrupt_keeps_complete_windows(whole, tmp_path):
     assert not (tmp_path / "out.tif").exists()
     report = process_small(whole / "frames.tif", tmp_path / "out.tif", resume=True)
     assert 2 < report.resumed < WINDOWS
-    check_whole(whole, tmp_path, "out.tif")
+    assert {path.name for path in tmp_path.iterdir()} == {"out.tif", "out.tif.manifest.json"}
+    for name in ("out.tif", "out.tif.manifest.json"):
+        assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
 
 
 def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):
@@ -145,13 +132,12 @@ def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
-def test_file_systems_without_locks_are_written_to_with_a_warning(tmp_path, monkeypatch, number):
+def test_file_systems_without_locks_are_written_to_with_a_warning(whole, tmp_path, monkeypatch, number):
     def refuse(file, operation):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("fcntl.flock", refuse)
-    write_small(tmp_path / "in.tif")
     with pytest.warns(UserWarning, match="the file system has no locks .*: start no other run with this output"):
-        report = process_small(tmp_path / "in.tif", tmp_path / "out.tif")
+        report = process_small(whole / "frames.tif", tmp_path / "out.tif")
     assert report.restored == report.windows
-    assert {path.name for path in tmp_path.iterdir()} >= {"in.tif", "out.tif"}
+    assert (tmp_path / "out.tif").exists()

@@ -16,7 +16,7 @@ CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
 FRAMES, DECAY = 40, 1.2  # s
 AMPLITUDE, FREQUENCY = np.array([2.3, 1.7]), np.array([66.3, 47.0])  # px, Hz
 PHASE = np.array([0.5, 1.2])
-SCENE = draw_scene(240, 240, seed=2)
+SCENE = draw_scene(208, 208, seed=2)
 STILL = crop(SCENE)
 
 
@@ -58,7 +58,7 @@ def test_each_window_states_the_vibration_at_its_middle_frame(place, tmp_path, w
     errors = []
     for record in manifest.windows:
         found, std = record.detection.vibration, record.detection.std
-        middle = record.middle * TIMING.frame_period + 0.5 * (159 * TIMING.row_time + TIMING.exposure_time)
+        middle = record.middle * TIMING.frame_period + 0.5 * (127 * TIMING.row_time + TIMING.exposure_time)
         size = AMPLITUDE * np.exp(-middle / DECAY)
         for axis in np.flatnonzero(record.detection.reliable.numpy()):
             amplitude, frequency, phase = (
