@@ -53,14 +53,6 @@ def test_every_block_is_read_once(tmp_path, name, monkeypatch):
     assert block < reader.info.decoding_bytes < 5 * COUNTS.nbytes
 
 
-def test_frames_in_any_order(tmp_path):
-    WRITERS["parts.h5"](tmp_path / "a.h5")
-    reader = open_stack(tmp_path / "a.h5")
-    for index in (19, 0, 6, 7, 6, 13, 0):
-        np.testing.assert_array_equal(reader.frame(index), COUNTS[index])
-    reader.close()
-
-
 @pytest.mark.parametrize("chunks", [(1, H, W), None])
 def test_frames_that_are_stored_alone_need_no_block(tmp_path, chunks):
     write_hdf5(tmp_path / "a.h5", chunks=chunks)

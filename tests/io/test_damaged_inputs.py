@@ -8,9 +8,9 @@ import pytest
 from attacks import api, mutated
 from attacks.mutated import CONFIG, ORIGINALS, damage, write_originals
 from attacks.trial import FAILURES
+from program import refused
 from small_stack import process_small
 
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.io import read_stack_info
 
 
@@ -58,13 +58,8 @@ def test_processing_a_damaged_stack_writes_all_or_nothing(tmp_path, kind):
 def test_command_prints_one_line_about_damaged_input(tmp_path, capfd):
     folder = tmp_path / "files"
     write_originals(folder)
-    good = CONFIG
-    stacks, configs = ["pages.tif", "packed.h5", "frames.zarr"], [good.replace("104", "'104'"), good[:77], "\0"]
-    for stack, config in zip(stacks, configs, strict=True):
+    damaged = {"pages.tif": CONFIG.replace("104", "'104'"), "packed.h5": CONFIG[:77], "frames.zarr": "\0"}
+    for stack, config in damaged.items():
         (tmp_path / "camera.toml").write_text(config)
-        arguments = ["run", str(folder / stack), str(tmp_path / "out"), "--config", str(tmp_path / "camera.toml")]
-        assert run_command(arguments) == 2
-        shown = capfd.readouterr().err
-        assert shown.startswith("rsvib: error: ")
-        assert shown.count("\n") == 1
+        refused(capfd, "run", folder / stack, tmp_path / "out", "--config", tmp_path / "camera.toml")
         assert not (tmp_path / "out").exists()

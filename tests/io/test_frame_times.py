@@ -10,7 +10,7 @@ import pytest
 import torch
 from program import rsvib
 from small_config import CAMERA
-from small_stack import HEIGHT, MOTION, STILL, TIMING, WIDTH, draw_counts
+from small_stack import MOTION, STILL, TIMING, write_with_gaps
 from truth import decibel
 
 import rsvib_torch as rsv
@@ -25,19 +25,7 @@ START = 100.25  # s
 @pytest.fixture(name="place")
 def write_stack_with_gaps(tmp_path):
     """Frames with gaps in a file that states their times, and a config without frame times."""
-    counts = draw_counts(max(KEPT) + 1)[KEPT]
-    (tmp_path / "frames.raw").write_bytes(counts.tobytes())
-    sidecar = {
-        "format": "rsvib raw",
-        "version": 1,
-        "shape": [len(KEPT), HEIGHT, WIDTH],
-        "axes": "THW",
-        "dtype": "uint16",
-        "full_scale": 4095,
-        "frame_times": [START + index * TIMING.frame_period for index in KEPT],
-        "resolution": [120.0, 60.0, "centimeter"],
-    }
-    (tmp_path / "frames.raw.json").write_text(json.dumps(sidecar))
+    write_with_gaps(tmp_path, KEPT, START)
     (tmp_path / "camera.toml").write_text(CAMERA)
     return tmp_path
 
@@ -57,17 +45,8 @@ def test_commands_use_and_keep_the_times_of_the_file(place):
     vibration = ("--vibration", place / "found" / "vibration.json")
     assert rsvib("restore", place / "frames.raw", place / "restored.h5", *config, *vibration) == 0
     assert rsvib("run", place / "frames.raw", place / "out", *config, "--output", "restored.h5") == 0
-    assert (
-        rsvib(
-            "restore",
-            place / "frames.raw",
-            place / "again.tif",
-            *config,
-            "--vibration",
-            place / "out" / "vibration.json",
-        )
-        == 0
-    )
+    vibration = ("--vibration", place / "out" / "vibration.json")
+    assert rsvib("restore", place / "frames.raw", place / "again.tif", *config, *vibration) == 0
     for path in (place / "restored.h5", place / "out" / "restored.h5", place / "again.tif"):
         check_restored(path)
         info = read_stack_info(path)

@@ -12,9 +12,8 @@ import zarr
 from PIL import ExifTags, Image
 from program import rsvib
 from small_config import CAMERA
-from small_stack import OPTIONS, STILL, TIMING
+from small_stack import OPTIONS, TIMING
 from small_video import PERIOD, draw_frames
-from truth import decibel
 
 import rsvib_torch as rsv
 from rsvib_torch.io import TimingWarning, read_stack, read_stack_info, timing_from_first_frame, write_stack
@@ -167,25 +166,18 @@ def write_images(folder, ending, frames, orientation, times=None):
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png", "tif"])
-def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, capsys, ending):
-    frames = draw_frames(np.arange(6) * PERIOD)
+def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, ending):
+    frames = draw_frames(np.arange(3) * PERIOD)
     write_images(tmp_path / "frames", ending, frames, 6)
-    assert read_stack_info(tmp_path / "frames").orientation == 6
-    np.testing.assert_allclose(read_stack(tmp_path / "frames") * 255, frames, atol=9)
-    (tmp_path / "camera.toml").write_text(CAMERA.replace("full_scale = 4095\n", ""))
-    config = ("--config", tmp_path / "camera.toml")
-    outputs = {"jpg": ("images", "restored.mp4"), "png": ("restored.h5", "restored.zarr", "restored.raw")}
-    for output in outputs.get(ending, ("images", "restored.tif")):
-        name = tmp_path / "out" / output
-        assert rsvib("run", tmp_path / "frames", tmp_path / "out", *config, "--output", output, "--overwrite") == 0
-        assert "displayed rotated by 90 degrees clockwise" in capsys.readouterr().out
-        assert read_stack_info(name).orientation == 6
-        restored = read_stack(name)
-        restored = restored.mean(1) if restored.ndim == 4 else restored
-        assert min(decibel(frame, STILL, 12) for frame in restored.numpy()) > 34
-    if ending == "jpg":
-        with Image.open(tmp_path / "out" / "images" / "frame_0000.png") as image:
-            assert image.getexif()[ExifTags.Base.Orientation] == 6
+    info, read = read_stack_info(tmp_path / "frames"), read_stack(tmp_path / "frames")
+    assert info.orientation == 6
+    np.testing.assert_allclose(read * 255, frames, atol=9)
+    for output in ("images", "a.mp4", "a.h5", "a.zarr", "a.raw", "a.tif"):
+        write_stack(tmp_path / output, read, dtype="uint8", like=info)
+        assert read_stack_info(tmp_path / output).orientation == 6
+        assert read_stack(tmp_path / output).shape[-2:] == frames.shape[-2:]
+    with Image.open(tmp_path / "images" / "frame_0000.png") as image:
+        assert image.getexif()[ExifTags.Base.Orientation] == 6
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png"])
