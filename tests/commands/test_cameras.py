@@ -1,7 +1,6 @@
 """rsvib cameras, rsvib init --camera, and the camera that a file names: row times of the table of camera models."""
 
 import csv
-import io
 import json
 import tomllib
 from fractions import Fraction
@@ -11,10 +10,9 @@ import av
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from program import refused
+from program import Terminal, refused, rsvib
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 
 # Name as a user writes it, size and rate of a clip, readout time in ms that the profiles of the model state
 MODELS = (
@@ -31,13 +29,6 @@ MODELS = (
     ("Panasonic G9", 3840, 2160, 60, 11.0),
     ("Sigma fp", 3840, 2160, 24, 20.8),
 )
-
-
-class Terminal(io.StringIO):
-    """Standard input or error that is a terminal."""
-
-    def isatty(self):
-        return True
 
 
 @pytest.fixture(name="place", autouse=True)
@@ -114,12 +105,12 @@ def test_what_the_table_does_not_state_is_refused(name, size, message):
 
 
 def test_command_lists_models_and_modes(capsys):
-    assert run_command(["cameras", "iphone", "12"]) == 0
+    assert rsvib("cameras", "iphone", "12") == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split()[:2] == ["brand", "model"]
     assert len([line for line in lines if "iPhone 12" in line]) == 5
     assert "Apple  iPhone 12              3840 x 2160     60   4.98 ± 0.15   2.306 ± 0.069  1" in lines[2]
-    assert run_command(["cameras", "HERO7", "--json"]) == 0
+    assert rsvib("cameras", "HERO7", "--json") == 0
     listed = json.loads(capsys.readouterr().out)["cameras"]
     assert {entry["model"] for entry in listed} == {"HERO7 Black"}
     assert listed[0]["row_time"] == pytest.approx(listed[0]["readout_time"] / listed[0]["height"])
@@ -134,7 +125,7 @@ def test_init_takes_the_row_time_of_a_camera(place, capsys):
     )  # of 2160 rows only: half the size
     error = refused(capsys, "init", "clip.mp4", "--camera", "Xperia 1 VI", *options)
     assert "similar: Sony Xperia 1 V" in error
-    assert run_command(["init", "clip.mp4", "--camera", "HERO5 Black", *options]) == 0  # scaled from 1520 rows
+    assert rsvib("init", "clip.mp4", "--camera", "HERO5 Black", *options) == 0  # scaled from 1520 rows
     assert sensor()["row_time"] == pytest.approx(26.69e-3 / 1080, rel=1e-3)
     text = " ".join(line.removeprefix("# ") for line in (place / "camera.toml").read_text().splitlines())
     assert "GoPro HERO5 Black, 1920 x 1080 px at 30/s" in text
@@ -146,10 +137,7 @@ def test_init_takes_the_row_time_of_a_camera(place, capsys):
 @pytest.mark.parametrize(
     ("tags", "camera"),
     [
-        (
-            {"com.apple.quicktime.make": "Apple", "com.apple.quicktime.model": "iPhone 7 Plus"},
-            "Apple iPhone 7 Plus",
-        ),
+        ({"com.apple.quicktime.make": "Apple", "com.apple.quicktime.model": "iPhone 7 Plus"}, "Apple iPhone 7 Plus"),
         ({"com.android.manufacturer": "Apple", "com.android.model": "iPhone 7 Plus"}, "Apple iPhone 7 Plus"),
         ({"firmware": "HD6.01.02.01.00"}, "GoPro HERO6 Black"),
     ],
@@ -159,7 +147,7 @@ def test_camera_that_a_video_names(capsys, tags, camera):
     assert rsv.read_stack_info("clip.mp4").camera == camera
     error = refused(capsys, "init", "clip.mp4", "--exposure", "1ms")
     assert f'--camera "{camera}" takes row time' in error
-    assert run_command(["init", "clip.mp4", "--exposure", "1ms", "--camera", camera]) == 0
+    assert rsvib("init", "clip.mp4", "--exposure", "1ms", "--camera", camera) == 0
     readout = {"Apple iPhone 7 Plus": 15.52e-3, "GoPro HERO6 Black": 8.34e-3}[camera]
     assert sensor()["row_time"] == pytest.approx(readout / 2160, rel=0.01)
 
@@ -168,7 +156,7 @@ def test_row_time_of_the_named_camera_is_proposed_in_a_terminal(monkeypatch):
     write_clip(size=(2160, 3840), tags={"firmware": "HD6.01.02.01.00"})
     monkeypatch.setattr("sys.stdin", Terminal("\n1ms\n"))  # the proposal is accepted
     monkeypatch.setattr("sys.stderr", Terminal())
-    assert run_command(["init", "clip.mp4"]) == 0
+    assert rsvib("init", "clip.mp4") == 0
     assert sensor()["row_time"] == pytest.approx(8.34167e-3 / 2160, rel=1e-5)
 
 
@@ -195,4 +183,4 @@ def test_files_without_a_camera_or_of_an_unknown_one(capsys):
     assert "names its camera, Toaster: no camera 'Toaster' in the table" in refused(
         capsys, "init", "other.mp4", "--exposure", "1ms"
     )
-    assert run_command(["init", "other.mp4", "--exposure", "1ms", "--row-time", "20us"]) == 0
+    assert rsvib("init", "other.mp4", "--exposure", "1ms", "--row-time", "20us") == 0

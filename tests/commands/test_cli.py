@@ -4,10 +4,7 @@ import csv
 import json
 import math
 import re
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -36,7 +33,7 @@ band_step = 8
 search = 8
 
 [simulation]
-frame_size = [448, 256]
+frame_size = [304, 176]
 seed = 5
 
 [simulation.vibration]
@@ -54,7 +51,7 @@ def make_place(tmp_path_factory):
     """A folder with a config, a scene, and simulated frames."""
     folder = tmp_path_factory.mktemp("camera")
     (folder / "camera.toml").write_text(CONFIG)
-    texture = torch.rand(1, 1, 512, 320, generator=torch.Generator().manual_seed(11))
+    texture = torch.rand(1, 1, 368, 240, generator=torch.Generator().manual_seed(11))
     scene = gaussian_blur2d(texture, (9, 9), (1.2, 1.2))[0]
     scene = (scene - scene.min()) / (scene.max() - scene.min())
     write_stack(folder / "scene.png", scene, dtype="uint16", full_scale=65535)
@@ -62,10 +59,28 @@ def make_place(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module", name="vibration_text")
+def detect_once(place):
+    assert rsvib("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", place / "detection") == 0
+    return (place / "detection" / "vibration.json").read_text()
+
+
+def restore_arguments(place, folder, out="r.tif"):
+    config = ("--config", place / "camera.toml")
+    return ("restore", place / "frames.tif", folder / out, *config, "--vibration", folder / "v.json")
+
+
+def change_vibration(text, folder, change):
+    """A v.json that differs from the detection."""
+    data = json.loads(text)
+    change(data)
+    (folder / "v.json").write_text(json.dumps(data))
+
+
 def still_frame(place):
     """The frame of a camera at rest."""
     scene = read_stack(place / "scene.png")[0]
-    return scene[32 : 32 + 448, 32 : 32 + 256]
+    return scene[32:-32, 32:-32]
 
 
 def psnr(frames, reference):
@@ -84,14 +99,14 @@ def check_detection(folder):
     with (folder / "offsets.csv").open() as file:
         lines = list(csv.DictReader(file))
     misfit = [abs(float(line["offset_x_px"]) - float(line["fitted_x_px"])) for line in lines if line["offset_x_px"]]
-    assert len(misfit) > 40
+    assert len(misfit) > 30
     assert np.mean(misfit) < 0.05
     assert cv2.imread(str(folder / "offsets.png")).std() > 5
 
 
 def test_simulated_frames_are_counts_of_the_camera(place):
     info = read_stack_info(place / "frames.tif")
-    assert (info.shape, info.dtype, info.full_scale) == ((2, 448, 256), "uint16", 4095.0)
+    assert (info.shape, info.dtype, info.full_scale) == ((2, 304, 176), "uint16", 4095.0)
     assert tifffile.imread(place / "frames.tif").max() <= 4095
     assert all(level < 30 for level in psnr(read_stack(place / "frames.tif"), still_frame(place)))
 
@@ -109,41 +124,26 @@ def test_detect_then_restore(place, tmp_path, capsys):
     restored = tmp_path / "restored.tif"
     assert rsvib("restore", frames, restored, "--config", config, "--vibration", out / "vibration.json") == 0
     info = read_stack_info(restored)
-    assert (info.shape, info.dtype, info.full_scale) == ((2, 448, 256), "uint16", 4095.0)
+    assert (info.shape, info.dtype, info.full_scale) == ((2, 304, 176), "uint16", 4095.0)
     before, after = (psnr(read_stack(path), still_frame(place)) for path in (frames, restored))
     assert min(after) - max(before) > 18
     assert sorted(path.name for path in tmp_path.iterdir()) == ["detection", "restored.tif"]
-
-
-def test_run_writes_all_results_and_can_be_repeated(place, tmp_path):
-    out = tmp_path / "out"
-    for more in ((), ("--overwrite",)):
-        assert rsvib("run", place / "frames.tif", out, "--config", place / "camera.toml", *more) == 0
-    names = ["before_after.png", "manifest.json", "restoration.json", "restored.tif", *OF_DETECTION]
-    assert sorted(path.name for path in out.iterdir()) == sorted(names)
-    check_detection(out)
-    assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 38
-    assert cv2.imread(str(out / "before_after.png")).std() > 5
 
 
 def reason(text):
     return {"code": "of a later version", "text": text}
 
 
-def test_an_unreliable_axis_is_not_restored(place, tmp_path, capsys):
-    frames, config = place / "frames.tif", place / "camera.toml"
-    assert rsvib("detect", frames, "--config", config, "--out", tmp_path) == 0
-    path = tmp_path / "vibration.json"
-    data = json.loads(path.read_text())
-    data.update(reliable=[False, False], findings=[[reason("blind")], [reason("too short"), reason("noisy")]])
-    path.write_text(json.dumps(data))
+def test_an_unreliable_axis_is_not_restored(place, vibration_text, tmp_path, capsys):
+    findings = [[reason("blind")], [reason("too short"), reason("noisy")]]
+    change_vibration(vibration_text, tmp_path, lambda data: data.update(reliable=[False, False], findings=findings))
     capsys.readouterr()
-    assert rsvib("restore", frames, tmp_path / "restored.tif", "--config", config, "--vibration", path) == 0
+    assert rsvib(*restore_arguments(place, tmp_path)) == 0
     shown = capsys.readouterr().out
     assert "  x: not reliable:\n   - blind\n  y: not reliable:\n   - too short\n   - noisy\n" in shown
     assert "  y unchanged: its vibration is not reliable, see the reasons above\n" in shown
     assert "  2 frames unchanged\n" in shown
-    difference = read_stack(tmp_path / "restored.tif") - read_stack(frames)
+    difference = read_stack(tmp_path / "r.tif") - read_stack(place / "frames.tif")
     assert difference.abs().mean() < 0.01
 
 
@@ -183,19 +183,11 @@ def test_pixels_without_data_are_neither_used_nor_changed(tmp_path, capsys):
     assert detected.vibration.amplitude[:, 0].tolist() == pytest.approx(AMPLITUDE, rel=0.01)
 
 
-def change_vibration(place, folder, change):
-    """A vibration.json that differs from the detection."""
-    assert rsvib("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", folder / "detected") == 0
-    data = json.loads((folder / "detected" / "vibration.json").read_text())
-    change(data)
-    (folder / "v.json").write_text(json.dumps(data))
-
-
-def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, tmp_path, capsys):
+def test_a_wrong_vibration_leaves_the_frames_unchanged_unless_forced(place, vibration_text, tmp_path, capsys):
     def turn(data):
         data["vibration"]["phase"] = [[p + 3.0 for p in axis] for axis in data["vibration"]["phase"]]
 
-    change_vibration(place, tmp_path, turn)
+    change_vibration(vibration_text, tmp_path, turn)
     arguments = restore_arguments(place, tmp_path)
     capsys.readouterr()
     assert rsvib(*arguments, "--report", tmp_path / "report.json") == 0
@@ -248,11 +240,11 @@ def test_known_motion_that_makes_frames_worse_leaves_them_unchanged_unless_force
     assert "k.npy: not kept from the input: ModelPixelScaleTag, GDAL_NODATA\n" in capsys.readouterr().out
 
 
-def test_half_of_the_vibration_is_restored_with_a_warning(place, tmp_path, capsys):
+def test_half_of_the_vibration_is_restored_with_a_warning(place, vibration_text, tmp_path, capsys):
     def halve(data):
         data["vibration"]["amplitude"] = [[0.5 * a for a in axis] for axis in data["vibration"]["amplitude"]]
 
-    change_vibration(place, tmp_path, halve)
+    change_vibration(vibration_text, tmp_path, halve)
     capsys.readouterr()
     assert rsvib(*restore_arguments(place, tmp_path)) == 0
     shown = capsys.readouterr()
@@ -274,10 +266,10 @@ def test_options_of_restoration_come_from_config_or_command_line(place, tmp_path
     assert rsvib(*common, "--method", "exact", "--joint", "all", "--saturation", 4095) == 0
     report = json.loads((out / "restoration.json").read_text())
     assert report["options"] == {"method": "exact", "joint": True, "saturation": 1.0}
-    assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
+    assert read_stack_info(out / "restored.tif").shape == (1, 304, 176)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
     assert rsvib(*common, "--method", "richardson-lucy", "--joint", "all") == 0
-    assert read_stack_info(out / "restored.tif").shape == (1, 448, 256)
+    assert read_stack_info(out / "restored.tif").shape == (1, 304, 176)
     assert min(psnr(read_stack(out / "restored.tif"), still_frame(place))) > 40
     capsys.readouterr()
     for options, message in (
@@ -298,16 +290,12 @@ def test_full_scale_comes_from_option_file_or_config(place, tmp_path, capsys):
     silent.write_text(CONFIG.replace("full_scale = 4095", ""))
     assert rsvib("detect", arguments[0], "--config", silent, "--out", tmp_path / "o", "--full-scale", 4095) == 0
     capsys.readouterr()
-    assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in refused(
-        capsys, "detect", arguments[0], "--config", silent, "--out", tmp_path / "out2"
-    )
+    unknown = refused(capsys, "detect", arguments[0], "--config", silent, "--out", tmp_path / "out2")
+    assert "full scale of uint16 frames unknown: pass full_scale, e.g. full_scale=4095" in unknown
     other = tmp_path / "other.toml"
     other.write_text(CONFIG.replace("4095", "16383"))
-    assert rsvib("detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2") == 2
-    assert (
-        "the full scale is 4095 in the file and 16383 in the configuration; choose one with --full-scale"
-        in capsys.readouterr().err
-    )
+    two = refused(capsys, "detect", place / "frames.tif", "--config", other, "--out", tmp_path / "out2")
+    assert "the full scale is 4095 in the file and 16383 in the configuration; choose one with --full-scale" in two
     assert "beyond full_scale=100" in refused(capsys, "detect", *arguments, "--full-scale", 100)
     assert not (tmp_path / "out2").exists()
 
@@ -385,33 +373,14 @@ def test_errors_of_bad_input_are_one_line_and_leave_no_files(
     assert list(tmp_path.iterdir()) == []
 
 
-def restore_arguments(place, folder, **change):
-    values = {"frames": place / "frames.tif", "out": folder / "r.tif", "vibration": folder / "v.json", **change}
-    return [
-        "restore",
-        values["frames"],
-        values["out"],
-        "--config",
-        values.get("config", place / "camera.toml"),
-        "--vibration",
-        values["vibration"],
-    ]
-
-
-@pytest.fixture(scope="module", name="vibration_text")
-def detect_once(place):
-    assert rsvib("detect", place / "frames.tif", "--config", place / "camera.toml", "--out", place / "detection") == 0
-    return (place / "detection" / "vibration.json").read_text()
-
-
 def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys, monkeypatch):
     (tmp_path / "v.json").write_text(vibration_text)
     (tmp_path / "file").write_text("")
     frames, config = place / "frames.tif", ("--config", place / "camera.toml")
     cases = [
-        (restore_arguments(place, tmp_path, out=tmp_path / "none" / "r.tif"), "none does not exist"),
-        (restore_arguments(place, tmp_path, out=tmp_path / "r.xyz"), "unknown file ending '.xyz'"),
-        (restore_arguments(place, tmp_path, out=tmp_path / "r.png"), "a PNG file holds one frame, got 2"),
+        (restore_arguments(place, tmp_path, "none/r.tif"), "none does not exist"),
+        (restore_arguments(place, tmp_path, "r.xyz"), "unknown file ending '.xyz'"),
+        (restore_arguments(place, tmp_path, "r.png"), "a PNG file holds one frame, got 2"),
         (("detect", frames, *config, "--out", tmp_path / "file"), "a file of that name exists"),
         (("run", frames, tmp_path / "file" / "out", *config), "file is not writable"),
         (("simulate", place / "scene.png", tmp_path / "f.webm", *config), "wmv files can only be read"),
@@ -434,7 +403,7 @@ def test_scenes_that_cannot_be_simulated(place, tmp_path, capsys):
     silent = tmp_path / "silent.toml"
     silent.write_text(CONFIG.partition("[simulation]")[0])
     large = tmp_path / "large.toml"
-    large.write_text(CONFIG.replace("[448, 256]", "[480, 256]"))
+    large.write_text(CONFIG.replace("[304, 176]", "[336, 176]"))
     for scene, config, message in (
         (place / "frames.tif", place / "camera.toml", "the scene must be one image, this file has 2 frames"),
         (place / "scene.png", silent, "silent.toml: simulation: missing key"),
@@ -454,25 +423,20 @@ def test_simulated_noise_has_a_seed(place, tmp_path):
 
 
 def test_usage_errors(capsys, tmp_path):
+    detect = ("detect", "f.tif", "--out", tmp_path)
+    undescribed = (
+        "the camera is not described: give --row-time, --frame-rate, or --config FILE (rsvib init FRAMES writes"
+    )
     for arguments, message in (
-        (["detect", "f.tif"], "Missing option '--out'"),
-        (
-            ["detect", "f.tif", "--out", tmp_path, "--exposure", "1ms"],
-            "the camera is not described: give --row-time, --frame-rate, or --config FILE (rsvib init FRAMES writes",
-        ),
-        (["detect", "f.tif", "--out", tmp_path, "--row-time", "20um"], "expected a time such as 14.5us, 1/500 or 2e-5"),
-        (["detect", "f.tif", "--out", tmp_path, "--exposure", "1/0"], "expected a time such as"),
-        (
-            ["detect", "f.tif", "--out", tmp_path, "--frame-rate", "fast"],
-            "expected a number such as 29.97 or 30000/1001",
-        ),
-        (["paint"], "No such command 'paint'"),
-        (["run", "a.png", "b.png", "out"], "(out); give a sequence of files as their folder"),
-        (["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--device", "tpu"], "'tpu' is not one of"),
-        (
-            ["detect", "f.tif", "--config", "c.toml", "--out", tmp_path, "--full-scale", "x"],
-            "Invalid value for '--full-scale'",
-        ),
+        (("detect", "f.tif"), "Missing option '--out'"),
+        ((*detect, "--exposure", "1ms"), undescribed),
+        ((*detect, "--row-time", "20um"), "expected a time such as 14.5us, 1/500 or 2e-5"),
+        ((*detect, "--exposure", "1/0"), "expected a time such as"),
+        ((*detect, "--frame-rate", "fast"), "expected a number such as 29.97 or 30000/1001"),
+        (("paint",), "No such command 'paint'"),
+        (("run", "a.png", "b.png", "out"), "(out); give a sequence of files as their folder"),
+        ((*detect, "--config", "c.toml", "--device", "tpu"), "'tpu' is not one of"),
+        ((*detect, "--config", "c.toml", "--full-scale", "x"), "Invalid value for '--full-scale'"),
     ):
         assert message in refused(capsys, *arguments)
     assert rsvib() == 0
@@ -501,11 +465,3 @@ def test_warnings_are_one_line(place, tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().err == (
         "rsvib: warning: the displacement within a row time is large\nrsvib: error: stopped here\n"
     )
-
-
-def test_entry_point():
-    command = Path(sys.executable).with_name("rsvib")
-    done = subprocess.run([command, "detect"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("rsvib: error: ")
-    assert "Traceback" not in done.stderr

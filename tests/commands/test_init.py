@@ -1,27 +1,22 @@
 """rsvib init: configuration files for the camera of a stack, and presets."""
 
-import io
-import os
-import struct
 import tomllib
 
-import cv2
 import numpy as np
 import pytest
 import torch
-from program import refused
+from program import Terminal, refused, rsvib
+from small_video import write_video
 
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.io import StackInfo, read_stack, write_stack
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read by the first video that OpenCV opens or writes
 TIMES = ("--row-time", "40us", "--exposure", "1/1250")
 RATE = ("--frame-rate", "30000/1001")
 
 
 def init(*arguments):
-    return run_command(["init", *map(str, arguments)])
+    return rsvib("init", *arguments)
 
 
 @pytest.fixture(name="frames")
@@ -35,26 +30,16 @@ def go_to_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def write_video(path, rate, angle=0):
-    """A video of five frames whose file states that they have to be turned by an angle."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), rate, (48, 64))
-    for level in range(5):
-        frame = np.full((64, 48, 3), 20 * level, np.uint8)
-        frame[:8] = 250
-        writer.write(frame)
-    writer.release()
-    cosine, sine = {0: (1, 0), 90: (0, 1), 180: (-1, 0), 270: (0, -1)}[angle]
-    data = bytearray(path.read_bytes())
-    matrix = data.index(b"tkhd") + 44  # ISO 14496-12, track header of version 0
-    values = (cosine, sine, 0, -sine, cosine, 0, 0, 0, 1)
-    data[matrix : matrix + 36] = struct.pack(
-        ">9i", *(value << (30 if i == 8 else 16) for i, value in enumerate(values))
-    )
-    path.write_bytes(data)
+def write_clip(path, angle=0):
+    """Five frames whose first rows are bright, at 25 per second, to be turned by an angle."""
+    frames = np.broadcast_to(20 * np.arange(5, dtype=np.uint8)[:, None, None, None], (5, 64, 48, 3)).copy()
+    frames[:, :8] = 250
+    options = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "rate": 25}
+    write_video(path, frames, np.arange(5) / 25, rotation=angle, **options)
 
 
 def test_values_of_a_video_and_of_options(place, capsys):
-    write_video(place / "clip.mp4", 25.0)
+    write_clip(place / "clip.mp4")
     assert init("clip.mp4", *TIMES) == 0
     text = (place / "camera.toml").read_text()
     assert tomllib.loads(text)["sensor"] == {
@@ -74,7 +59,7 @@ def test_values_of_a_video_and_of_options(place, capsys):
 @pytest.mark.parametrize("angle", [90, 180, 270])
 def test_rotated_video(place, angle):
     """Frames are read as stored: the rows that the sensor reads first are the first rows at any rotation."""
-    write_video(place / "clip.mp4", 25.0, angle)
+    write_clip(place / "clip.mp4", angle)
     assert init("clip.mp4", *TIMES) == 0
     sensor = tomllib.loads((place / "camera.toml").read_text())["sensor"]
     assert (sensor["scan_axis"], sensor["readout_direction"]) == ("y", "forward")
@@ -122,13 +107,6 @@ def test_missing_values_are_explained_in_one_line_each(place, frames, capsys):
     limit = "It is not 1 / (frame rate x rows), because sensors have blanking rows. Here it is less than 521.4 us."
     assert limit in error
     assert not (place / "camera.toml").exists()
-
-
-class Terminal(io.StringIO):
-    """Standard input or error that is a terminal."""
-
-    def isatty(self):
-        return True
 
 
 def test_questions_in_a_terminal(place, frames, monkeypatch):

@@ -35,13 +35,13 @@ def make_place(tmp_path_factory):
     return folder
 
 
-def restore(place, out, *more, config="camera.toml"):
-    vibration = ("--config", place / config, "--vibration", place / "found" / "vibration.json")
-    return rsvib("restore", place / "raw.tif", out, *vibration, *more)
+def restore(place, out, *more):
+    vibration = ("--config", place / "camera.toml", "--vibration", place / "found" / "vibration.json")
+    return ("restore", place / "raw.tif", out, *vibration, *more)
 
 
 def test_options(place, tmp_path):
-    assert restore(place, tmp_path / "out.tif", *OPTIONS) == 0
+    assert rsvib(*restore(place, tmp_path / "out.tif", *OPTIONS)) == 0
     image = read_stack(tmp_path / "out.tif")
     assert image.shape == (1, 3, 2 * HEIGHT, 2 * WIDTH)
     error = image[0, :, ::2, ::2].double().numpy() - STILL
@@ -68,30 +68,11 @@ def test_report_of_a_finer_grid(place, tmp_path):
     ("more", "message"),
     [
         (("--mosaic", "RGB"), "'RGB' is not one of 'RGGB', 'BGGR', 'GRBG', 'GBRG'"),
-        (("--mosaic", "RGGB", "--method", "dewarp"), "method='dewarp' has no option 'mosaic'; its options are"),
         (("--optics-sigma", -1), "error: --optics-sigma must be at least 0, got -1.0"),
-        (("--optics-sigma", 50), "optics transmit"),
         (("--optics-sigma", 0.4, "--method", "dewarp"), "method='dewarp' has no option 'optics'; its options are"),
         (("--scale", 3), "scale must be one of 1, 2; got 3"),
     ],
 )
 def test_errors(place, tmp_path, capsys, more, message):
-    assert restore(place, tmp_path / "out.tif", *more) == 2
-    shown = capsys.readouterr().err.splitlines()
-    assert len(shown) == 1
-    assert message in shown[0]
+    assert message in refused(capsys, *restore(place, tmp_path / "out.tif", *more))
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('mosaic = "RGB"', "restoration.mosaic: expected 'RGGB' or 'BGGR' or 'GRBG' or 'GBRG', got 'RGB'"),
-        ("optics = {width = 1.0}", "restoration.optics.width: unknown key; expected one of sigma, cutoff, pixel, mtf"),
-        ("optics = {mtf = [[0.2, 0.1], [1.0, 0.5]]}", "the frequencies of mtf must increase"),
-    ],
-)
-def test_errors_in_a_configuration(place, tmp_path, capsys, line, message):
-    (tmp_path / "wrong.toml").write_text(f"{CAMERA}\n[restoration]\n{line}\n")
-    vibration = ("--config", tmp_path / "wrong.toml", "--vibration", place / "found" / "vibration.json")
-    assert message in refused(capsys, "restore", place / "raw.tif", tmp_path / "out.tif", *vibration)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from field_truth import FieldMotion, take_field_frames
+from program import rsvib
 from truth import draw_scene
 
 import rsvib_torch as rsv
-from rsvib_torch.commands.main import run_command
 
 TIMING = rsv.SensorTiming(row_time=8e-5, exposure_rows=12, frame_rows=280)
 CONFIG = """
@@ -40,8 +40,8 @@ def folder(tmp_path_factory):
 
 
 def test_report_of_a_rolling_camera(folder, capsys):
-    arguments = ["report", str(folder / "frames.tif"), str(folder / "page"), "--config", str(folder / "camera.toml")]
-    assert run_command([*arguments, "--json"]) == 0
+    config = ("--config", folder / "camera.toml")
+    assert rsvib("report", folder / "frames.tif", folder / "page", *config, "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["detection"]["reliable"] == [True, True, True]
     assert answer["detection"]["vibration"]["amplitude"][2][0] == pytest.approx(2.5e-3, rel=0.03)
@@ -52,8 +52,8 @@ def test_report_of_a_rolling_camera(folder, capsys):
 
 def test_windows_of_a_rolling_camera(folder, capsys):
     out = folder / "windows"
-    arguments = ["detect", str(folder / "frames.tif"), "--out", str(out), "--config", str(folder / "camera.toml")]
-    assert run_command([*arguments, "--window", "3"]) == 0
+    config = ("--config", folder / "camera.toml")
+    assert rsvib("detect", folder / "frames.tif", "--out", out, *config, "--window", 3) == 0
     assert "roll" in capsys.readouterr().out
     head, *lines = (out / "tones.csv").read_text().splitlines()
     rows = [dict(zip(head.split(","), line.split(","), strict=True)) for line in lines]

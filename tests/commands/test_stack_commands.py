@@ -2,11 +2,6 @@
 
 import csv
 import json
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,29 +100,6 @@ def test_a_required_axis_that_is_not_reliable_is_exit_code_3(place, tmp_path, ca
     motion = ("motion", tmp_path / "noise.tif", *options, "--search", 6, "--frames", "6:10", "--model", "swept")
     assert rsvib(*motion, "--out", tmp_path / "motion.csv", "--require-reliable", "x") == 3
     assert "expected axes such as x,y" in refused(capsys, *found, "--require-reliable", "z")
-
-
-def test_interrupted_run_can_be_continued(place, tmp_path):
-    counts = np.concatenate([tifffile.imread(place / "frames.tif")] * 8)
-    np.save(tmp_path / "long.npy", counts)
-    out = tmp_path / "out"
-    arguments = ["run", tmp_path / "long.npy", out, "--config", place / "camera.toml", "--workers", "1"]
-    program = Path(sys.executable).with_name("rsvib")
-    work = out / ".restored.tif.rsvib"
-    # background jobs of a shell ignore SIGINT, and their children inherit that
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    with subprocess.Popen([program, *map(str, arguments)], stderr=subprocess.PIPE, text=True) as process:
-        signal.signal(signal.SIGINT, before)
-        while len(list(work.glob("*.done"))) < 2:
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        error = process.communicate(timeout=60)[1]
-    assert process.returncode == 130
-    assert error == "rsvib: error: stopped; the completed windows are kept, --resume continues\n"
-    assert not (out / "restored.tif").exists()
-    done = len(list(work.glob("*.done")))
-    assert 2 <= done < 35
 
 
 def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypatch):
