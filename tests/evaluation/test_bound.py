@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -141,14 +143,8 @@ def test_closed_form_of_a_wave_along_rows(method):
     scene = torch.from_numpy(np.tile(0.5 + a * np.sin(2 * np.pi * u * columns), (340, 1)))
     timing = rsv.SensorTiming(row_time=160e-6, exposure_rows=3, frame_rows=310)
     amplitude, frequency, phase = 1.2, 47.0, 0.7
-    bound = cramer_rao_bound(
-        scene,
-        timing,
-        rsv.Vibration([amplitude, 0.0], frequency, phase),
-        noise=noise,
-        frame_size=(300, width),
-        method=method,
-    )
+    motion = rsv.Vibration([amplitude, 0.0], frequency, phase)
+    bound = cramer_rao_bound(scene, timing, motion, noise=noise, frame_size=(300, width), method=method)
 
     def mean(values, starts):
         a, f, p, v = values
@@ -173,18 +169,9 @@ def test_closed_form_of_a_wave_along_rows(method):
 @pytest.mark.parametrize("method", ["projection", "gradients", "random"])
 def test_bound_is_infinite_for_a_blind_tone_only(method):
     scene = torch.from_numpy(smooth_scene(332, 80))
-    blind = 1 / TIMING.frame_period
-    bound, near = (
-        cramer_rao_bound(
-            scene,
-            TIMING,
-            rsv.Vibration([[1.0, 0.0], [0.0, 0.0]], [[f, 0.0], [0.0, 0.0]]),
-            noise=0.01,
-            frame_size=(280, 32),
-            method=method,
-        )
-        for f in (blind, 1.05 * blind)
-    )
+    blind, options = 1 / TIMING.frame_period, {"noise": 0.01, "frame_size": (280, 32), "method": method}
+    tones = (rsv.Vibration([[1.0, 0.0], [0.0, 0.0]], [[f, 0.0], [0.0, 0.0]]) for f in (blind, 1.05 * blind))
+    bound, near = (cramer_rao_bound(scene, TIMING, motion, **options) for motion in tones)
     assert torch.isinf(bound.amplitude[0, 0])
     assert torch.isinf(bound.phase[0, 0])
     assert torch.isfinite(bound.image_motion).all()
@@ -196,22 +183,11 @@ def test_bound_is_infinite_for_a_blind_tone_only(method):
 def test_uneven_frame_times_make_a_blind_frequency_measurable(method):
     scene = torch.from_numpy(smooth_scene(332, 80))
     period = TIMING.frame_period
-    uneven = rsv.SensorTiming(
-        row_time=TIMING.row_time, exposure_rows=3, frame_rows=300, frame_start_times=(0.0, 1.5 * period)
-    )
-    bounds = [
-        cramer_rao_bound(
-            scene,
-            timing,
-            rsv.Vibration([1.0, 0.0], [1 / period, 0.0]),
-            noise=0.01,
-            frame_size=(280, 32),
-            method=method,
-        )
-        for timing in (TIMING, uneven)
-    ]
-    assert torch.isinf(bounds[0].amplitude[0, 0])
-    assert float(bounds[1].amplitude[0, 0]) < 0.02
+    uneven = replace(TIMING, frame_start_times=(0.0, 1.5 * period))
+    motion, options = rsv.Vibration([1.0, 0.0], [1 / period, 0.0]), {"frame_size": (280, 32), "method": method}
+    even, other = (cramer_rao_bound(scene, timing, motion, noise=0.01, **options) for timing in (TIMING, uneven))
+    assert torch.isinf(even.amplitude[0, 0])
+    assert float(other.amplitude[0, 0]) < 0.02
 
 
 def test_random_scene_with_a_flat_spectrum():
@@ -240,9 +216,7 @@ def test_bound_follows_noise_and_orientation():
     bound = cramer_rao_bound(scene, TIMING, motion, noise=0.01, frame_size=(280, 32))
     double = cramer_rao_bound(scene, TIMING, motion, noise=0.02, frame_size=(280, 32))
     torch.testing.assert_close(values_of(double), 2 * values_of(bound))
-    turned = rsv.SensorTiming(
-        row_time=TIMING.row_time, exposure_rows=3, frame_rows=300, scan_axis="x", readout_direction="reverse"
-    )
+    turned = replace(TIMING, scan_axis="x", readout_direction="reverse")
     # the same camera, transposed and read in reverse
     swapped = rsv.Vibration([2.1, 1.3], [30.0, 50.0], [1.3 + np.pi, 0.4], [30.0, 20.0])
     aside = cramer_rao_bound(scene.flip(0).T.contiguous(), turned, swapped, noise=0.01, frame_size=(32, 280))
@@ -269,15 +243,11 @@ def test_unknown_acceleration_increases_the_bound():
         ({"num_frames": 1}, "num_frames must be at least 2"),
         ({"scene": torch.rand(3, 128, 96)}, r"scene must have shape \(H, W\)"),
         ({"frame_size": (400, 40)}, "too small"),
+        ({"scene": torch.zeros(128, 96, dtype=torch.uint8)}, "floating-point"),
     ],
 )
 def test_bad_input(change, match):
     scene = change.pop("scene", torch.rand(128, 96))
     options = {"noise": 0.01, "frame_size": (80, 40)} | change
-    with pytest.raises(ValueError, match=match):
+    with pytest.raises((ValueError, TypeError), match=match):
         cramer_rao_bound(scene, TIMING, rsv.Vibration(1.0, 50.0), **options)
-
-
-def test_integer_scenes_are_refused():
-    with pytest.raises(TypeError, match="floating-point"):
-        cramer_rao_bound(torch.zeros(128, 96, dtype=torch.uint8), TIMING, rsv.Vibration(1.0, 50.0), noise=0.01)

@@ -1,6 +1,7 @@
 """ISD of vibrating frames: positions and rays by the formulas of usgscsm against an independent rotating camera."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -191,36 +192,38 @@ def test_models_are_refused_with_their_errors(tmp_path):
     assert rsv.write_isd(path, wide.vibration(), TIMING, still_isd(wide), model="frame", tolerance=5.0) == "frame"
 
 
-def test_wrong_arguments(tmp_path):
+@pytest.mark.parametrize(
+    ("truth", "motion", "timing", "fields", "message"),
+    [
+        (SLOW, lambda motion: motion.expanded(2), {}, {}, r"batch of shape \(2,\); export one of them"),
+        (SLOW, None, {"scan_axis": "x"}, {}, "scan_axis must be -2"),
+        (SLOW, None, {}, {"detector_center": {}}, r"isd: detector_center\.line: missing key"),
+        (SLOW, None, {}, {"image_lines": 0}, "image_lines"),
+        (SLOW, None, {}, {"image_lines": 1000}, "frame_rows=320 is less than"),
+        (FAST, None, {}, {"optical_distortion": {"transverse": {}}}, "'transverse' is not supported"),
+        (FAST, None, {}, {"instrument_pointing": {"quaternions": 3}}, r"instrument_pointing\.quaternions"),
+        (FAST, lambda motion: motion.with_camera(rsv.Camera(500.0)), {}, {}, "500 px, isd one with 2.*with_camera"),
+    ],
+)
+def test_wrong_arguments(tmp_path, truth, motion, timing, fields, message):
+    vibration = truth.vibration() if motion is None else motion(truth.vibration())
+    with pytest.raises(ValueError, match=message):
+        rsv.write_isd(tmp_path / "frame.json", vibration, replace(TIMING, **timing), still_isd(truth) | fields)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_files_and_looks(tmp_path):
     path, vibration, still = tmp_path / "frame.json", SLOW.vibration(), still_isd(SLOW)
-    batch = vibration.expanded(2)
-    with pytest.raises(ValueError, match=r"batch of shape \(2,\); export one of them"):
-        rsv.write_isd(path, batch, TIMING, still)
-    with pytest.raises(ValueError, match="scan_axis must be -2"):
-        rsv.write_isd(path, vibration, rsv.SensorTiming(2e-5, 20, 400, scan_axis="x"), still)
-    with pytest.raises(ValueError, match=r"isd: detector_center\.line: missing key"):
-        rsv.write_isd(path, vibration, TIMING, still | {"detector_center": {}})
-    with pytest.raises(ValueError, match="image_lines"):
-        rsv.write_isd(path, vibration, TIMING, still | {"image_lines": 0})
-    with pytest.raises(ValueError, match="frame_rows=320 is less than"):
-        rsv.write_isd(path, vibration, TIMING, still | {"image_lines": 1000})
-    with pytest.raises(ValueError, match="'transverse' is not supported"):
-        rsv.write_isd(path, FAST.vibration(), TIMING, still_isd(FAST) | {"optical_distortion": {"transverse": {}}})
-    with pytest.raises(ValueError, match=r"instrument_pointing\.quaternions"):
-        rsv.write_isd(path, FAST.vibration(), TIMING, still_isd(FAST) | {"instrument_pointing": {"quaternions": 3}})
     with pytest.raises(ValueError, match="look must be a direction"):
         still_isd(SLOW, look=(0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match=r"focal_length=500 px, isd one with 2e\+06 px.*with_camera"):
-        rsv.write_isd(path, FAST.vibration().with_camera(rsv.Camera(500.0)), TIMING, still_isd(FAST))
     path.write_text(json.dumps(still))
     with pytest.raises(ValueError, match="same file as the input"):
         rsv.write_isd(path, vibration, TIMING, path)
     assert json.loads(path.read_text()) == still
-    path.unlink()
     (tmp_path / "broken.json").write_text("[1]")
     with pytest.raises(ValueError, match=r"broken\.json"):
-        rsv.write_isd(path, vibration, TIMING, tmp_path / "broken.json")
-    assert not path.exists()
+        rsv.write_isd(tmp_path / "new.json", vibration, TIMING, tmp_path / "broken.json")
+    assert not (tmp_path / "new.json").exists()
 
 
 def test_uniform_image_motion_and_zoom(tmp_path):

@@ -120,18 +120,8 @@ def test_integer_frames_are_scaled():
 @pytest.mark.parametrize(
     ("frames", "options", "error", "message"),
     [
-        (
-            torch.zeros(2, 4, 4, dtype=torch.uint16),
-            {},
-            ValueError,
-            "full scale of uint16 frames unknown: pass full_scale",
-        ),
-        (
-            torch.zeros(2, 4, 4, dtype=torch.int64),
-            {},
-            ValueError,
-            "full scale of int64 frames unknown: pass full_scale",
-        ),
+        (torch.zeros(2, 4, 4, dtype=torch.uint16), {}, ValueError, "full scale of uint16 frames unknown: pass full_sc"),
+        (torch.zeros(2, 4, 4, dtype=torch.int64), {}, ValueError, "full scale of int64 frames unknown: pass full_sc"),
         (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": 0}, ValueError, "full_scale must be larger than 0"),
         (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": "12 bit"}, TypeError, "full_scale must be a number"),
         (torch.zeros(4, 4), {}, ValueError, r"frames must have shape .* got \(4, 4\)"),

@@ -46,17 +46,9 @@ def test_kernel_is_equations_26_to_39(timing, row):
     height, width = psf.weights.shape[-2:]
     kernel[y : y + height, x : x + width] = psf.weights[1, row].numpy()
     assert np.abs(kernel - expected).max() < 1e-12
-
-
-def test_dense_kernels_equal_the_sparse_kernels():
-    starts = PAPER.row_starts(1, 2048)[0, ::64]
-    psf = row_psf(MOTION, starts, PAPER)
-    dense, (x, y) = psf.dense()
-    for row in range(len(starts)):
-        expected = literal_kernel(starts[row].item(), PAPER, (41, 41), 20)
-        height, width = dense.shape[-2:]
-        assert np.abs(dense[row].numpy() - expected[20 + y :, 20 + x :][:height, :width]).max() < 1e-12
-        assert dense[row].sum().item() == pytest.approx(1.0, abs=1e-12)
+    dense, (x, y) = row_psf(MOTION, starts[1, row:], timing).dense()
+    height, width = dense.shape[-2:]
+    assert np.abs(dense[0].numpy() - expected[20 + y :, 20 + x :][:height, :width]).max() < 1e-12
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])

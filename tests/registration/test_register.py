@@ -15,10 +15,6 @@ METHODS = get_args(Registration)
 RMS = {"projection": (0.08, 0.8), "ncc": (0.03, 0.08), "phase": (0.025, 0.04)}
 
 
-def test_type_of_the_methods_lists_the_table():
-    assert tuple(BAND_METHODS) == METHODS
-
-
 def float_frames(frames):
     return torch.from_numpy(frames).float()
 
@@ -248,11 +244,7 @@ def test_float32_against_float64(pair, paper_camera, method):
     ("options", "error", "message"),
     [
         ({"method": "sift"}, ValueError, "registration must be one of 'projection', 'ncc', 'phase'; got 'sift'"),
-        (
-            {"search": 60},
-            ValueError,
-            "frames of 256 x 200 px .* bands of 32 rows searched over 60 px",
-        ),
+        ({"search": 60}, ValueError, "frames of 256 x 200 px .* bands of 32 rows searched over 60 px"),
         ({"band_rows": 240}, ValueError, "too small for bands of 240 rows"),
     ],
 )

@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 import torch
 from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
-from program import refused
+from program import refused, rsvib
 
-from rsvib_torch.commands.main import run_command
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.evaluation import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
@@ -114,6 +113,7 @@ def test_page_is_self_contained(page):
     for _, attributes in reader.tags:
         assert "href" not in attributes
         assert "srcset" not in attributes
+        assert attributes.get("src", "data:").startswith("data:")
         assert not any(name.startswith("on") for name in attributes)
     style = (folder / "report.html").read_text().split("<style>")[1].split("</style>")[0]
     assert "url(" not in style
@@ -131,12 +131,6 @@ def test_text_of_the_user_is_escaped(page):
     assert text.count("<script>alert(1)</script>") == 2  # title and heading
     assert 'a "quoted" & <b>bold</b> name' in text
     assert "method = <exact>" in text
-
-
-def test_the_page_needs_no_network(page):
-    loaded = [dict(attributes).get("src", "") for _, attributes in page[2].tags]
-    loaded += [dict(attributes).get("href", "") for tag, attributes in page[2].tags if tag == "link"]
-    assert not any("//" in address for address in loaded if not address.startswith("data:"))
 
 
 def test_page_has_all_sections(page):
@@ -429,10 +423,10 @@ def make_place(tmp_path_factory):
     (folder / "camera.toml").write_text(
         "[sensor]\nrow_time = 4e-5\nexposure_rows = 12\nframe_rows = 512\nfull_scale = 4095\n"
     )
-    scene = resolution_chart(512, 320, sigma=0.7)
+    scene = resolution_chart(352, 240, sigma=0.7)
     noise = SensorNoise(read_noise=0.003, bits=12)
     frames = simulate_frames(
-        scene, TIMING, SHAKE, 2, frame_size=(448, 256), noise=noise, generator=torch.Generator().manual_seed(3)
+        scene, TIMING, SHAKE, 2, frame_size=(288, 176), noise=noise, generator=torch.Generator().manual_seed(3)
     )
     write_stack(folder / "chart & <co>.tif", frames, dtype="uint16", full_scale=4095)
     return folder
@@ -440,9 +434,9 @@ def make_place(tmp_path_factory):
 
 def test_command_writes_a_page(place, capsys):
     frames, config, out, found = (str(place / n) for n in ("chart & <co>.tif", "camera.toml", "out", "windows"))
-    assert run_command(["detect", frames, "--out", found, "--config", config, "--window", "2"]) == 0
+    assert rsvib("detect", frames, "--out", found, "--config", config, "--window", 2) == 0
     arguments = ["report", frames, out, "--config", config, "--manifest", str(place / "windows" / "manifest.json")]
-    assert run_command(arguments) == 0
+    assert rsvib(*arguments) == 0
     capsys.readouterr()
     reader = read(place / "out" / "report.html")
     text = "".join(reader.text)
@@ -462,8 +456,7 @@ def test_command_without_vibration_names_no_written_frames(place, capsys):
         2, 256, 224, generator=torch.Generator().manual_seed(4)
     )
     write_stack(place / "still.npy", still)
-    arguments = ["report", str(place / "still.npy"), str(place / "still"), "--config", str(place / "camera.toml")]
-    assert run_command(arguments) == 0
+    assert rsvib("report", place / "still.npy", place / "still", "--config", place / "camera.toml") == 0
     printed = capsys.readouterr()
     assert "no vibration was found that can be removed: the page has the input frames only" in printed.err
     assert "written" not in printed.err
