@@ -76,36 +76,6 @@ def test_corrector_restores_a_batch_and_states_its_options(frames, scene):
         rsv.VibrationCorrector(TIMING, restoration={"blur": 1})
 
 
-def test_batches_without_channels_are_refused_with_the_remedy(frames):
-    grey = frames[:, :, 0]  # (B, T, H, W)
-    message = r"frames of shape \(2, 2, 256, 160\) appear to be a batch.*pass frames\[:, :, None\]"
-    with pytest.raises(ValueError, match=message):
-        rsv.VibrationCorrector(TIMING)(grey)
-    with pytest.raises(ValueError, match=message):
-        rsv.VibrationRestorer(TIMING, check=False)(grey, MOTIONS[0].vibration())
-    in_channels = rsv.VibrationRestorer(TIMING, method="dewarp", check=False, channels="first")
-    assert in_channels(grey, MOTIONS[0].vibration()).shape == grey.shape
-
-
-def test_batch_of_stacks_is_detected_and_restored(frames, vibration, scene):
-    """From frames to restored frames with modules only; a batch equals its single stacks."""
-    detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
-    found = detector(frames)
-    torch.testing.assert_close(found.vibration.amplitude, vibration.amplitude, rtol=0, atol=0.4)  # bands
-    torch.testing.assert_close(found.vibration.frequency, vibration.frequency, rtol=0.02, atol=0)
-    for index in range(2):
-        alone = detector(frames[index]).vibration
-        torch.testing.assert_close(alone.amplitude, found.vibration.amplitude[index], rtol=1e-3, atol=1e-3)
-    still = crop(scene)
-    assert all(decibel(frame[0], still) < 26 for stack in frames for frame in stack)
-    for method in METHODS:
-        restorer = rsv.VibrationRestorer(TIMING, method=method)
-        restored = restorer(frames, vibration)
-        assert restored.shape == frames.shape
-        assert all(decibel(frame[0], still) > 33 for stack in restored for frame in stack)
-        torch.testing.assert_close(restorer(frames[1], vibration[1]), restored[1], rtol=0, atol=2e-3)
-
-
 def test_warnings_point_at_the_caller(frames):
     wrong = rsv.Vibration([2.0, 3.0], [40.0, 250.0], [2.0, 0.0])
     with pytest.warns(rsv.RestorationWarning) as given:
@@ -246,29 +216,3 @@ def unit(kind, axis):
     one = torch.zeros(3, 2, dtype=torch.float64)
     one[kind, axis] = 1.0
     return one
-
-
-def test_blur_is_the_linear_operator_of_a_solver():
-    """Least squares by conjugate gradients, with only ``A`` and ``A_adjoint``, recovers the scene."""
-    generator = torch.Generator().manual_seed(6)
-    truth = torch.rand(1, 1, 72, 64, generator=generator, dtype=torch.float64)
-    truth = torch.nn.functional.avg_pool2d(truth, 9, 1)  # 64 rows; the frame has 48
-    short = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=320)
-    starts = short.row_starts(1, 48)[0]
-    psf = rsv.row_psf(MOTIONS[0].vibration(), starts, short, interpolation="cubic", quadrature="gauss")
-    operator = rsv.RowVaryingBlur(psf, scene_size=(64, 56))
-    measured = operator.A(truth)
-    scene = torch.zeros_like(truth)
-    residual = operator.A_adjoint(measured)
-    direction, energy = residual, residual.square().sum()
-    for _ in range(120):
-        product = operator.A_adjoint(operator.A(direction))
-        length = energy / (direction * product).sum()
-        scene, residual = scene + length * direction, residual - length * product
-        energy, previous = residual.square().sum(), energy
-        direction = residual + energy / previous * direction
-    inner = (..., slice(8, -8), slice(8, -8))
-    seen = (..., slice(8, -8), slice(None))  # scene rows within the frame
-    before, after = ((image - truth[seen])[inner].square().mean().sqrt() for image in (measured, scene[seen]))
-    assert before > 0.01
-    assert after < 0.1 * before

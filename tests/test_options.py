@@ -50,6 +50,7 @@ def test_values_are_kept_or_refused_but_not_converted():
         ({"noise": float("nan")}, ValueError, "noise must be finite, got nan"),
         ({"method": "dewarp", "chunk_rows": 0}, ValueError, "chunk_rows must be at least 1"),
         ({"method": "richardson-lucy", "iterations": 0}, ValueError, "iterations must be at least 1"),
+        ({"method": "richardson-lucy", "iterations": 10**9}, ValueError, "iterations must be at most 1000, got"),
         ({"method": "richardson-lucy", "joint": 0}, ValueError, "joint must be at least 1"),
         ({"interpolation": "linea"}, ValueError, "interpolation must be one of 'linear', 'cubic'; got 'linea'"),
         ({"optics": {"sigma": "wide"}}, TypeError, "optics.sigma must be a number, got 'wide'"),

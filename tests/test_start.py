@@ -117,7 +117,7 @@ def test_functions_named_like_their_module_stay_functions():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_type_checker_knows_the_names(tmp_path):
+def test_type_checker_knows_the_names(tmp_path, pytestconfig):
     pytest.importorskip("mypy")
     (tmp_path / "user.py").write_text(
         "import rsvib_torch as rsv\n"
@@ -140,7 +140,8 @@ def test_type_checker_knows_the_names(tmp_path):
         "rows_showing(row, start, timing.in_row_order(), still)\n"
         "rows_showing(row, start, timing, still)\n"
     )
-    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "user.py"]
+    cache = pytestconfig.cache.mkdir("mypy")  # types of PyTorch are read once, in a minute
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(cache), "user.py"]
     found = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}  # mypy does not follow the hooks of editable installations
     shown = subprocess.run(command, cwd=tmp_path, env=found, capture_output=True, text=True, check=False).stdout
     assert 'note: Revealed type is "torch._tensor.Tensor"' in shown
