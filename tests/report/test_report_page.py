@@ -456,16 +456,17 @@ def test_command_without_vibration_names_no_written_frames(place, capsys):
         2, 256, 224, generator=torch.Generator().manual_seed(4)
     )
     write_stack(place / "still.npy", still)
-    assert rsvib("report", place / "still.npy", place / "still", "--config", place / "camera.toml") == 0
+    arguments = ("report", place / "still.npy", place / "still", "--config", place / "camera.toml")
+    assert rsvib(*arguments) == 0
     printed = capsys.readouterr()
     assert "no vibration was found that can be removed: the page has the input frames only" in printed.err
     assert "written" not in printed.err
     assert printed.out.count("no significant tone") == 2
     assert "displacement of the rows is uncertain" not in printed.out  # there is none
-    frames, out = str(place / "chart & <co>.tif"), place / "run"
-    assert run_command(["run", frames, str(out), "--config", str(place / "camera.toml")]) == 0
+    frames, out = place / "chart & <co>.tif", place / "run"
+    assert rsvib("run", frames, out, "--config", place / "camera.toml") == 0
     capsys.readouterr()
-    assert run_command([*arguments, "--overwrite", "--manifest", str(out / "manifest.json")]) == 0
+    assert rsvib(*arguments, "--overwrite", "--manifest", out / "manifest.json") == 0
     assert f"Restoration according to {out / 'manifest.json'}\n  1 of 1 window restored\n" in capsys.readouterr().out
     assert "Windows of the stack were restored before" in "".join(read(place / "still" / "report.html").text)
 
