@@ -176,7 +176,8 @@ def test_images_are_read_as_stored_and_their_orientation_is_kept(tmp_path, endin
         write_stack(tmp_path / output, read, dtype="uint8", like=info)
         assert read_stack_info(tmp_path / output).orientation == 6
         assert read_stack(tmp_path / output).shape[-2:] == frames.shape[-2:]
-    with Image.open(tmp_path / "images" / "frame_0000.png") as image:
+    name = "frame0.tif" if ending == "tif" else "frame_0000.png"  # folders of TIFF files keep their names
+    with Image.open(tmp_path / "images" / name) as image:
         assert image.getexif()[ExifTags.Base.Orientation] == 6
 
 

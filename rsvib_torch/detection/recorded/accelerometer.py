@@ -154,16 +154,23 @@ def compare_accelerometer(
         offsets: Smallest and largest offset to try.
 
     Raises:
-        ValueError: If no axis is reliable, or the record does not cover the frames or is too slow for a tone.
+        ValueError: If no axis is reliable, or the record is no table of finite values, does not cover the frames, is
+            constant, or is too slow for a tone.
     """
     stamps, values = (
         table(as_tensor(name, of)).astype(float) for name, of in (("times", times), ("acceleration", acceleration))
     )
+    if stamps.ndim != 1 or len(stamps) < 2 or values.shape != (len(stamps), 2):
+        raise ValueError(f"times {stamps.shape} and acceleration {values.shape} must have the shapes (N,) and (N, 2)")
+    if not (np.isfinite(stamps).all() and np.isfinite(values).all() and (np.diff(stamps) > 0).all()):
+        raise ValueError("times and acceleration must be finite, and times must increase: remove the other samples")
     pixel_size = check_pixel_size(pixel_size)
+    if detection.batch_shape:
+        raise ValueError(f"detection is a batch of {detection.batch_shape[0]}: pass one of them, detection[0]")
     found, std = detection.vibration, detection.std
     places = [(a, k) for a, k in found.amplitude[:2].nonzero().tolist() if detection.reliable[a]]
-    if detection.batch_shape or not places:
-        raise ValueError("no axis of the detection is reliable" if not places else "detection is a batch: select one")
+    if not places:
+        raise ValueError("no axis of the detection is reliable")
     axes = np.array([axis for axis, _ in places])
     amplitude, frequency, phase, amplitude_std, frequency_std, phase_std = (
         np.array([float(of[place]) for place in places])
@@ -175,6 +182,9 @@ def compare_accelerometer(
     curve = detection.offsets
     first, last = float(curve.times.min()), float(curve.later_times.max())
     values = values - values.mean(0)
+    for axis in sorted(set(axes.tolist())):
+        if np.ptp(values[:, axis]) == 0:
+            raise ValueError(f"acceleration along {AXIS_NAMES[axis]} is constant: is the accelerometer connected?")
     # complex acceleration of each tone per px, and in px/s^2: its real part is the second derivative of A sin(wt + p)
     angular = 2 * np.pi * frequency
     known = 1j * amplitude * np.square(angular) * np.exp(1j * phase)
