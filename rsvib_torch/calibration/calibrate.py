@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.calibration.flicker import BandFit, Profiles, find_bands, row_profiles
+from rsvib_torch.calibration.flicker import Array, BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels
@@ -198,8 +199,8 @@ def calibrate_row_time(
         exposure_time=exposure,
         exposure_time_std=exposure_std,
         notes=tuple(notes),
-        light=bands.fitted + bands.residual,
-        fitted_light=bands.fitted,
+        light=torch.from_numpy(bands.fitted + bands.residual),
+        fitted_light=torch.from_numpy(bands.fitted),
     )
 
 
@@ -247,23 +248,23 @@ def calibrate_row_time_by_exposure(
         find_bands(Profiles(r[None], p[None], 0.0))[0] for r, p in zip(profiles.rows, profiles.parts, strict=True)
     ]
     period = sum(s.period / s.period_std**2 for s in singles) / sum(1 / s.period_std**2 for s in singles)
-    phases = [float(s.coefficients[0, 0].angle()) for s in singles]
-    fit = fit_strobe(profiles.rows, period, phases, exposures=exposures)
-    row_time = max(exposures) / float(fit.exposure_rows.max())
-    shortest = min(range(len(exposures)), key=exposures.__getitem__)
+    phases = np.concatenate([s.phases for s in singles])
+    fit = fit_strobe(profiles.rows, period, phases, np.array(exposures))
+    row_time = max(exposures) / fit.exposure_rows
+    shortest = int(np.argmin(exposures))
     return RowTimeCalibration(
         row_time=row_time,
-        row_time_std=fit.std["row_time"],
+        row_time_std=row_time * fit.exposure_std / fit.exposure_rows,
         period_rows=fit.period,
-        contrast=float(singles[shortest].coefficients[0, 0].abs()),
+        contrast=float(np.abs(singles[shortest].coefficients[0, 0])),
         flicker_frequency=1 / (fit.period * row_time),
         frame_rows=None,
         readout_direction=None,
         exposure_time=exposures[shortest],
         exposure_time_std=0.0,
         notes=("readout direction unknown: it requires the flicker frequency and the frame rate",),
-        light=torch.cat([s.fitted + s.residual for s in singles]),
-        fitted_light=torch.cat([s.fitted for s in singles]),
+        light=torch.from_numpy(np.concatenate([s.fitted + s.residual for s in singles])),
+        fitted_light=torch.from_numpy(np.concatenate([s.fitted for s in singles])),
     )
 
 
@@ -299,7 +300,7 @@ def _direction(
     exponent for reverse readout.
     """
     first = bands.coefficients[:, 0]
-    contrast = float(first.abs().mean())
+    contrast = float(np.abs(first).mean())
     if len(first) < 2:
         return None, contrast, "it requires two consecutive frames"
     if frame_rate is None:
@@ -319,20 +320,14 @@ def _direction(
     return ("forward" if forward else "reverse"), amplitudes[0 if forward else 1], ""
 
 
-def _turning(values: Tensor, turns: float) -> tuple[float, float]:
+def _turning(values: Array, turns: float) -> tuple[float, float]:
     """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
     count = len(values)
-    angle = 2 * math.pi * turns * torch.arange(count, dtype=torch.float64, device="cpu")
-    columns = torch.stack(
-        [torch.ones(count, dtype=values.dtype, device="cpu"), torch.polar(torch.ones_like(angle), angle)], 1
-    )
+    columns = np.stack([np.ones(count), np.exp(2j * math.pi * turns * np.arange(count))], 1)
     penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
-    gram = columns.mH @ columns + torch.diag(torch.tensor([penalty, 0.0], dtype=torch.float32, device="cpu")).to(
-        values.dtype
-    )
-    solution = torch.linalg.solve(gram, columns.mH @ values)
-    cost = (values - columns @ solution).abs().square().sum() + penalty * solution[0].abs().square()
-    return float(cost / values.abs().square().sum()), float(solution[1].abs())
+    solution = np.linalg.solve(columns.conj().T @ columns + np.diag([penalty, 0.0]), columns.conj().T @ values)
+    cost = (np.abs(values - columns @ solution) ** 2).sum() + penalty * np.abs(solution[0]) ** 2
+    return float(cost / (np.abs(values) ** 2).sum()), float(np.abs(solution[1]))
 
 
 def _exposure(
@@ -349,15 +344,15 @@ def _exposure(
     if profiles.clipped > 0.02:
         return None, None, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
     if light_contrast is not None:
-        noise = float((bands.coefficients[:, 0].abs().square().sum() / max(bands.certainty, 1e-9)).sqrt())
-        exposure = exposure_from_contrast(contrast, light_contrast, bands.period * row_time)
-        less = max(contrast - noise / math.sqrt(2), 1e-6)
-        further = exposure_from_contrast(less, light_contrast, bands.period * row_time)
+        noise = math.sqrt((np.abs(bands.coefficients[:, 0]) ** 2).sum() / max(bands.certainty, 1e-9))
+        exposure, further = (
+            exposure_from_contrast(value, light_contrast, bands.period * row_time)
+            for value in (contrast, max(contrast - noise / math.sqrt(2), 1e-6))
+        )
         return exposure, abs(further - exposure), ""
-    phases = [float(value.angle()) for value in bands.coefficients[:, 0]]
-    even = profiles.rows / (bands.scene / bands.scene.mean(1, keepdim=True))
+    even = profiles.rows / (bands.scene / bands.scene.mean(1, keepdims=True))
     try:
-        fit = fit_strobe(even, bands.period, phases, on_fraction=on_fraction)
+        fit = fit_strobe(even, bands.period, bands.phases, np.ones(len(even)), on_fraction)
     except ValueError as error:
         return None, None, str(error)
-    return float(fit.exposure_rows[0]) * row_time, fit.std["exposure_rows"] * row_time, ""
+    return fit.exposure_rows * row_time, fit.exposure_std * row_time, ""

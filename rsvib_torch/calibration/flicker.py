@@ -6,10 +6,11 @@ of period P. Gauss-Newton fits period, waveforms and a smooth scene, and the tex
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
 
 from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import check_choice, check_number
@@ -17,19 +18,23 @@ from rsvib_torch.frames.prepare import as_float_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 
 SceneModel = Literal["smooth", "fixed"]
+Array = NDArray[Any]
+_TINY = 1e-300  # smallest divisor
+_MIN_PERIODS = 1.5  # that a frame must contain
+_MIN_PERIOD = 4.0  # rows; shorter bands may be aliases of longer ones
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
     """Brightness of rows."""
 
-    rows: Tensor  # (T, H) float64, mean over the columns of each row, first row of the image first
-    parts: Tensor  # (T, P, H) float64, the same for parts of the columns side by side
+    rows: Array  # (T, H) float64, mean over the columns of each row, first row of the image first
+    parts: Array  # (T, P, H) float64, the same for parts of the columns side by side
     clipped: float  # fraction of all pixels that are saturated
 
 
 def row_profiles(
-    frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels = None
+    frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels
 ) -> Profiles:
     """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W)."""
     check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
@@ -42,17 +47,15 @@ def row_profiles(
     images = images.transpose(-2, -1) if scan_axis in (-1, "x") else images
     if images.shape[-2] < 32:
         raise ValueError(f"frames have {images.shape[-2]} rows along the scan; at least 32 are needed")
-    clipped = images >= 1.0 - 1e-6
-    lit = (images > 0.02).double().mean()
-    if float(lit) == 0.0:
+    lit = float((images > 0.02).double().mean())
+    if lit == 0.0:
         raise ValueError("all pixels are below 0.02 of full scale: no light to calibrate with, use a longer exposure")
-    share = float(clipped.double().mean())
-    if share > 0.9 * float(lit):
+    share = float((images >= 1.0 - 1e-6).double().mean())
+    if share > 0.9 * lit:
         raise ValueError(f"{share:.0%} of the pixels are saturated: take less light or a shorter exposure")
     linear = images.double().clamp(min=0.0) ** gamma
-    parts = torch.stack([part.mean(-1) for part in linear.tensor_split(min(8, linear.shape[-1]), dim=-1)], 1)
-    # the fits to these short curves are sequential, and faster on the CPU
-    return Profiles(linear.mean(-1).cpu(), parts.cpu(), share)
+    parts = [part.mean(-1).cpu().numpy() for part in linear.tensor_split(min(8, linear.shape[-1]), dim=-1)]
+    return Profiles(linear.mean(-1).cpu().numpy(), np.stack(parts, 1), share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,44 +64,58 @@ class BandFit:
 
     period: float  # P in rows
     period_std: float  # its standard deviation in rows, from the residuals with their correlation
-    coefficients: Tensor  # (T, K) complex128, waveform of each frame over its mean
-    scene: Tensor  # (T, H) float64, brightness of the rows without flicker
-    fitted: Tensor  # (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``
-    residual: Tensor  # (T, H) float64, residual brightness over that of the scene
+    coefficients: Array  # (T, K) complex128, waveform of each frame over its mean
+    scene: Array  # (T, H) float64, brightness of the rows without flicker
+    fitted: Array  # (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``
+    residual: Array  # (T, H) float64, residual brightness over that of the scene
     certainty: float  # power of the fundamental over that of residuals at frequencies beside it, all frames together
     evidence: float  # Gaussian log-likelihood less half the number of parameters times log N (BIC)
 
+    @property
+    def phases(self) -> Array:
+        """(T,) phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``."""
+        return np.angle(self.coefficients[:, 0])
 
-def _harmonics(rows: Tensor, period: float, count: int) -> tuple[Tensor, Tensor]:
-    """Cosines and sines (H, 2 K) of the first harmonics at the rows, and their derivatives with the period."""
-    order = torch.arange(1, count + 1, dtype=torch.float64, device="cpu")
-    angle = 2 * math.pi * rows[:, None] * order / period
-    basis = torch.cat([angle.cos(), angle.sin()], 1)
-    slope = torch.cat([angle.sin() * angle, -angle.cos() * angle], 1) / period
-    return basis, slope
+    @property
+    def moves(self) -> bool:
+        """Whether the bands move from frame to frame."""
+        first = self.coefficients[:, 0]
+        return bool((np.abs(first - first.mean()) ** 2).mean() > 0.02 * (np.abs(first) ** 2).mean())
 
 
-def _solve(matrix: Tensor, right: Tensor) -> Tensor:
+def _solve(matrix: Array, right: Array) -> Array:
     """Least squares (T, N) of (T, H, N) and (T, H) by normal equations, with a ridge for collinear columns."""
     gram = matrix.mT @ matrix
-    gram = gram + torch.diag_embed(1e-11 * gram.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300))
-    found: Tensor = torch.linalg.solve(gram, matrix.mT @ right[..., None])[..., 0]
-    return found
+    ridge = 1e-11 * np.maximum(np.diagonal(gram, axis1=-2, axis2=-1), _TINY)
+    found: Array = np.linalg.solve(gram + ridge[..., None] * np.eye(gram.shape[-1]), matrix.mT @ right[..., None])
+    return found[..., 0]
 
 
-def _residual(matrix: Tensor, values: Tensor) -> Tensor:
+def unexplained(matrix: Array, values: Array) -> Array:
     """Residual of a least-squares fit of (T, H, N) to (T, H)."""
-    return values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
+    residual: Array = values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
+    return residual
 
 
-def _polynomials(height: int, period: float) -> Tensor:
-    """Chebyshev polynomials over the rows (H, N), at most one per period, up to degree 8."""
-    degree = max(2, min(8, round(height / period)))
-    place = torch.linspace(-1, 1, height, dtype=torch.float64, device="cpu")
-    return torch.cos(torch.arange(degree + 1, dtype=torch.float64, device="cpu") * torch.acos(place)[:, None])
+def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
+    """Standard deviations (N,) of fitted parameters, with the correlation of residuals within ``reach`` rows.
+
+    The derivatives of the model are (T, H, N), the residuals (T, H). The covariance of the residuals is weighted by
+    Bartlett's window. The result is not smaller than for residuals without correlation.
+    """
+    information = np.linalg.pinv(np.einsum("tin,tim->nm", jacobian, jacobian))
+    score = jacobian * residual[..., None]
+    reach = min(reach, residual.shape[1] - 1)
+    window = 1 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
+    correlated = np.einsum("tin,tim->nm", score, ndimage.convolve1d(score, window, axis=1, mode="constant"))
+    sums = (correlated, np.einsum("tin,tim->nm", score, score))
+    variances = [np.diag(information @ total @ information) for total in sums]
+    variances.append((residual**2).mean() * np.diag(information))
+    std: Array = np.sqrt(np.max(variances, axis=0).clip(min=0.0))
+    return std
 
 
-def fit_period(brightness: Tensor, start: float, scene: SceneModel) -> BandFit | None:
+def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
     """Fit bands to the brightness (T, H) of rows, with the number of harmonics that maximises the evidence.
 
     The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; of a ``"fixed"`` scene
@@ -117,60 +134,62 @@ def fit_period(brightness: Tensor, start: float, scene: SceneModel) -> BandFit |
     return best
 
 
-def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int, dark: float = 0.02) -> BandFit | None:
-    """Gauss-Newton on period, waveforms and smooth scene together, and on the texture in turn.
-
-    The brightness of the scene is at least ``dark`` times its mean.
-    """
+def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> BandFit | None:
+    """Gauss-Newton on period, waveforms and smooth scene together, and on the texture in turn."""
     frames, height = brightness.shape
     centre = 0.5 * (height - 1)
-    rows = torch.arange(height, dtype=torch.float64, device="cpu") - centre
-    smooth = _polynomials(height, period)
-    floor = dark * brightness.mean(1, keepdim=True)
-    texture = torch.ones(height, dtype=torch.float64, device="cpu")
-    level = torch.maximum(_solve(smooth.expand(frames, -1, -1), brightness) @ smooth.T, floor)
-    waves = torch.zeros(frames, 2 * count, dtype=torch.float64, device="cpu")
+    rows = np.arange(height) - centre
+    order = np.arange(1, count + 1)
+    degree = max(2, min(8, round(height / period)))  # of the smooth scene, at most one per period
+    smooth = np.polynomial.chebyshev.chebvander(rows / centre, degree)
+    dark = 0.02  # smallest brightness of the scene, of its mean
+    floor = dark * brightness.mean(1, keepdims=True)
+    texture = np.ones(height)
+    level = np.maximum(_solve(np.broadcast_to(smooth, (frames, *smooth.shape)), brightness) @ smooth.T, floor)
+    waves = np.zeros((frames, 2 * count))  # cosines and sines of the harmonics
+
+    def linearised() -> tuple[Array, Array, Array]:
+        """Pattern (T, H), its derivatives by waves and smooth scene (T, H, N), and by the period (T, H)."""
+        angle = 2 * math.pi * rows[:, None] * order / period
+        basis = np.concatenate([np.cos(angle), np.sin(angle)], 1)
+        slope = np.concatenate([np.sin(angle) * angle, -np.cos(angle) * angle], 1) / period
+        return 1 + waves @ basis.T, basis, waves @ slope.T
+
     for turn in range(60):
-        basis, slope = _harmonics(rows, period, count)
-        pattern = 1 + waves @ basis.T
+        pattern, basis, by_period = linearised()
         if scene == "fixed" and turn > 2:
             shape = level * pattern
-            texture = ((shape * brightness).sum(0) / shape.square().sum(0).clamp(min=1e-300)).clamp(min=dark)
-        even = brightness / texture
-        fixed = torch.cat([level[..., None] * basis, pattern[..., None] * smooth], -1)
-        shift = level * (waves @ slope.T)
-        residual = even - level * pattern
-        unexplained = _residual(fixed, shift)  # of the derivative by the period
-        power = float((unexplained * shift).sum())
-        step = float((unexplained * residual).sum()) / power if turn > 2 and power > 0 else 0.0
+            texture = ((shape * brightness).sum(0) / (shape**2).sum(0).clip(min=_TINY)).clip(min=dark)
+        fixed = np.concatenate([level[..., None] * basis, pattern[..., None] * smooth], -1)
+        shift = level * by_period
+        residual = brightness / texture - level * pattern
+        free = unexplained(fixed, shift)  # part of the derivative by the period that the others do not explain
+        power = float((free * shift).sum())
+        step = float((free * residual).sum()) / power if turn > 2 and power > 0 else 0.0
         change = _solve(fixed, residual - step * shift)
         period += max(-0.05 * period, min(0.05 * period, step))
         waves = waves + change[:, : 2 * count]
-        level = torch.maximum(level + change[:, 2 * count :] @ smooth.T, floor)
+        level = np.maximum(level + change[:, 2 * count :] @ smooth.T, floor)
         if not math.isfinite(period) or not 2.0 <= period <= 2 * height:
             return None
         if turn > 8 and abs(step) < 1e-8 * period:
             break
-    basis, slope = _harmonics(rows, period, count)
-    pattern = 1 + waves @ basis.T
+    pattern, basis, shift = linearised()
     residual = (brightness / texture - level * pattern) / level
-    leverage = waves @ slope.T
+    leverage = shift
     if scene == "fixed":
-        leverage = leverage - pattern * (pattern * leverage).sum(0) / pattern.square().sum(0).clamp(min=1e-300)
-    leverage = _residual(torch.cat([basis.expand(frames, -1, -1), pattern[..., None] * smooth], -1), leverage)
-    back = torch.polar(
-        torch.ones(count, dtype=torch.float64, device="cpu"),
-        2 * math.pi * centre / period * torch.arange(1, count + 1, dtype=torch.float64, device="cpu"),
-    )
-    coefficients = torch.complex(waves[:, :count], waves[:, count:]) * back
+        leverage = leverage - pattern * (pattern * leverage).sum(0) / (pattern**2).sum(0).clip(min=_TINY)
+    basis = np.broadcast_to(basis, (frames, *basis.shape))
+    leverage = unexplained(np.concatenate([basis, pattern[..., None] * smooth], -1), leverage)
+    back = np.exp(2j * math.pi * centre / period * order)
+    coefficients = (waves[:, :count] + 1j * waves[:, count:]) * back
     certainty = _certainty(coefficients, residual, period)
-    values = brightness.numel() / _correlation_rows(residual)  # independent ones
-    evidence = -0.5 * values * math.log(float(residual.square().mean()) + 1e-300)
+    values = brightness.size / _correlation_rows(residual)  # independent ones
+    evidence = -0.5 * values * math.log(float((residual**2).mean()) + _TINY)
+    period_std = float(deviations(leverage[..., None], residual, max(8, math.ceil(period)))[0])
     return BandFit(
         period=period,
-        period_std=max(
-            _period_std(leverage, residual, period), _period_std_beside(leverage, waves @ slope.T, certainty, period)
-        ),
+        period_std=max(period_std, _period_std_beside(leverage, shift, certainty, period)),
         coefficients=coefficients,
         scene=level * texture,
         fitted=pattern,
@@ -180,143 +199,109 @@ def _fit(brightness: Tensor, period: float, scene: SceneModel, count: int, dark:
     )
 
 
-def _correlation_rows(residual: Tensor) -> float:
+def _correlation_rows(residual: Array) -> float:
     """Correlation length of the residuals in rows: ``1 + 2 sum rho(k)`` up to the first rho below 0.05."""
     length = residual.shape[1]
-    power = torch.fft.rfft(residual, n=2 * length).abs().square().sum(0)
-    covariance = torch.fft.irfft(power)[:length]
-    ratio = covariance / covariance[0].clamp(min=1e-300)
-    below = (ratio < 0.05).nonzero()
-    last = int(below[0]) if len(below) else length
-    return float((1 + 2 * ratio[1:last].sum()).clamp(min=1.0))
+    power = (np.abs(np.fft.rfft(residual, n=2 * length)) ** 2).sum(0)
+    covariance = np.fft.irfft(power)[:length]
+    ratio = covariance / max(covariance[0], _TINY)
+    below = np.flatnonzero(ratio < 0.05)
+    return max(1.0, float(1 + 2 * ratio[1 : below[0] if len(below) else length].sum()))
 
 
-def _period_std(leverage: Tensor, residual: Tensor, period: float) -> float:
-    """Standard deviation of the period, with the correlation of residuals within one period (Bartlett's window)."""
-    score = leverage * residual
-    length = score.shape[1]
-    reach = min(max(8, math.ceil(period)), length - 1)
-    power = torch.fft.rfft(score, n=2 * length).abs().square().sum(0)
-    covariance = torch.fft.irfft(power)[: reach + 1]
-    window = 1 - torch.arange(reach + 1, dtype=torch.float64, device="cpu") / (reach + 1)
-    whole = covariance[0] + 2 * (window * covariance)[1:].sum()
-    white = residual.square().mean() * leverage.square().sum()
-    variance = torch.maximum(whole, torch.maximum(white, covariance[0]))
-    return float(variance.sqrt() / leverage.square().sum().clamp(min=1e-300))
-
-
-def _period_std_beside(leverage: Tensor, shift: Tensor, certainty: float, period: float) -> float:
+def _period_std_beside(leverage: Array, shift: Array, certainty: float, period: float) -> float:
     """Standard deviation of the period from the power of residuals beside the fundamental, such as texture.
 
     The angular frequency of a wave of amplitude A over H rows has the standard deviation ``sqrt(6 N) / (A H)`` if its
     coefficient has noise of power N, and a larger one if the scene explains a part of the derivative ``shift``. The
     factor 1.5 allows for the red spectrum of texture; it was measured on drawn scenes.
     """
-    height = leverage.shape[1]
-    centred = shift - shift.mean(1, keepdim=True)
-    loss = float(centred.square().sum() / leverage.square().sum().clamp(min=1e-300))
-    return 1.5 * period**2 / (2 * math.pi * height) * math.sqrt(6 / max(certainty, 1e-300) * max(loss, 1.0))
+    height = int(leverage.shape[1])
+    loss = float(height * shift.var(1).sum()) / max(float((leverage**2).sum()), _TINY)
+    return 1.5 * period**2 / (2 * math.pi * height) * math.sqrt(6 / max(certainty, _TINY) * max(loss, 1.0))
 
 
-def _certainty(coefficients: Tensor, residual: Tensor, period: float) -> float:
-    """Power of the fundamental over the mean power of residuals at 24 frequencies around it."""
+def _certainty(coefficients: Array, residual: Array, period: float) -> float:
+    """Power of the fundamental over the mean power of residuals at 22 frequencies around it."""
     height = residual.shape[1]
-    rows = torch.arange(height, dtype=torch.float64, device="cpu")
-    steps = torch.arange(-12, 13, dtype=torch.float64, device="cpu")
-    frequencies = 1 / period + steps[steps.abs() >= 2] / (2 * height)
+    steps = np.arange(-12, 13)
+    frequencies = 1 / period + steps[np.abs(steps) >= 2] / (2 * height)
     frequencies = frequencies[(frequencies > 0.25 / height) & (frequencies < 0.5)]
-    wave = torch.polar(torch.ones(1, dtype=torch.float64, device="cpu"), 2 * math.pi * rows[:, None] * frequencies)
-    beside = 2 / height * (residual.to(wave.dtype) @ wave)
-    noise = beside.abs().square().mean(1)
-    return float((coefficients[:, 0].abs().square() / noise.clamp(min=1e-300)).sum())
+    beside = 2 / height * (residual @ np.exp(2j * math.pi * np.arange(height)[:, None] * frequencies))
+    noise = (np.abs(beside) ** 2).mean(1)
+    return float((np.abs(coefficients[:, 0]) ** 2 / noise.clip(min=_TINY)).sum())
 
 
-def _less_parabola(curves: Tensor) -> Tensor:
-    """Curves (N, H) less the parabola that fits each of them."""
-    place = torch.linspace(-1, 1, curves.shape[-1], dtype=torch.float64, device="cpu")
-    smooth = torch.stack([torch.ones_like(place), place, place.square()], 1)
-    weight: Tensor = torch.linalg.lstsq(smooth, curves.mT).solution
-    return curves - (smooth @ weight).mT
+def _less_parabola(curves: Array) -> Array:
+    """Curves (..., H) less the parabola that fits each of them."""
+    smooth = np.linalg.qr(np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, curves.shape[-1]), 2))[0]
+    flat: Array = curves - curves @ smooth @ smooth.T
+    return flat
 
 
-def _starts(brightness: Tensor, min_periods: float, padding: int = 4) -> list[float]:
-    """Periods in rows at the peaks of the spectrum, the six highest and the six highest above the background.
-
-    The transform is ``padding`` times as long as a frame, for the height of its peaks.
-    """
+def _starts(brightness: Array) -> list[float]:
+    """Periods in rows at the peaks of the spectrum, the six highest and the six highest above the background."""
     height = brightness.shape[1]
-    flat = _less_parabola(brightness) / brightness.mean(1, keepdim=True)
-    window = torch.hann_window(height, dtype=torch.float64, device="cpu")
-    power = torch.fft.rfft(flat * window, n=padding * height).abs().square().sum(0)
-    frequencies = torch.fft.rfftfreq(padding * height, dtype=torch.float32, device="cpu").double()
-    usable = (frequencies >= 0.8 * min_periods / height) & (frequencies <= 0.45)
+    padding = 4  # length of the transform over that of a frame, for the height of its peaks
+    flat = _less_parabola(brightness) / brightness.mean(1, keepdims=True)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(height) / height)
+    power = (np.abs(np.fft.rfft(flat * window, n=padding * height)) ** 2).sum(0)
+    frequencies = np.fft.rfftfreq(padding * height)
+    usable = (frequencies >= 0.8 * _MIN_PERIODS / height) & (frequencies <= 0.45)
     usable[1:-1] &= (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
-    reach = 8 * padding
-    around = torch.nn.functional.pad(power[None, None], (reach, reach), mode="reflect")[0, 0]
-    background = around.unfold(0, 2 * reach + 1, 1).median(-1).values
-    places = usable.nonzero()[:, 0]
+    background = ndimage.median_filter(power, 16 * padding + 1, mode="mirror")
+    places = np.flatnonzero(usable)
     starts: set[float] = set()
     # without the peaks above the background, texture alone is found as flicker in some pairs of frames
-    for score in (power, power / background.clamp(min=1e-300)):
-        highest = places[score[places].argsort(descending=True)[:6]]
-        starts |= set((1 / frequencies[highest]).tolist())
+    for score in (power, power / background.clip(min=_TINY)):
+        starts |= set((1 / frequencies[places[np.argsort(-score[places])[:6]]]).tolist())
     return sorted(starts)
 
 
-def find_bands(profiles: Profiles, *, min_periods: float = 1.5, min_period: float = 4.0) -> tuple[BandFit, SceneModel]:
+def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     """The bands whose period has the smallest relative standard deviation, and the model of the scene.
 
     Several frames of a still scene are fitted together if their bands move, which eliminates the texture of the scene.
-    A frame must contain ``min_periods``; bands of less than ``min_period`` rows may be aliases of coarser ones.
     """
     brightness = profiles.rows
-    fitted: list[tuple[BandFit, SceneModel]] = []
-    scenes: list[tuple[SceneModel, Tensor]] = [("smooth", brightness)]
+    scenes: list[tuple[SceneModel, Array]] = [("smooth", brightness)]
     if len(brightness) > 1:
-        even = brightness / brightness.mean(1, keepdim=True)
+        even = brightness / brightness.mean(1, keepdims=True)
         scenes.append(("fixed", even - even.mean(0) + 1.0))
+    trusted: list[tuple[BandFit, SceneModel]] = []
     for scene, curve in scenes:
-        fits = [fit_period(brightness, start, scene) for start in _starts(curve, min_periods)]
+        fits = [_fit_period(brightness, start, scene) for start in _starts(curve)]
         usable = [fit for fit in fits if fit is not None and fit.period <= brightness.shape[1]]
         if scene == "fixed":  # a pattern at the same rows in all frames is texture
-            usable = [fit for fit in usable if moves(fit)]
-        fitted += [(max(usable, key=lambda fit: fit.evidence), scene)] if usable else []
-    trusted = [
-        (fit, scene)
-        for fit, scene in fitted
-        if fit.certainty > 50.0  # texture stays below on drawn scenes
-        and float(fit.coefficients[:, 0].abs().amax()) > 2e-3
-        and (scene == "smooth" or moves(fit))
-        and same_everywhere(profiles, fit, scene)
-    ]
+            usable = [fit for fit in usable if fit.moves]
+        if not usable:
+            continue
+        fit = max(usable, key=lambda fit: fit.evidence)
+        visible = float(np.abs(fit.coefficients[:, 0]).max()) > 2e-3
+        # the certainty of texture stays below 50 on drawn scenes
+        if fit.certainty > 50.0 and visible and _same_everywhere(profiles, fit, scene):
+            trusted.append((fit, scene))
     if not trusted:
         raise ValueError(
             "no flicker found: no bands of the same period across all columns exceed the texture of the scene; at "
-            f"least {min_periods:g} periods of the flicker must fit into a frame with visible contrast; two or more "
+            f"least {_MIN_PERIODS:g} periods of the flicker must fit into a frame with visible contrast; two or more "
             "frames of a still scene eliminate its texture"
         )
     best, model = min(trusted, key=lambda item: item[0].period_std / item[0].period)
-    if best.period < min_period:
+    if best.period < _MIN_PERIOD:
         raise ValueError(
             f"the bands repeat every {best.period:.2f} rows: flicker this fast is ambiguous; "
-            f"use a flicker with bands of at least {min_period:g} rows"
+            f"use a flicker with bands of at least {_MIN_PERIOD:g} rows"
         )
-    if brightness.shape[1] / best.period < min_periods:
+    if brightness.shape[1] / best.period < _MIN_PERIODS:
         raise ValueError(
             f"flicker is slower than a frame: {brightness.shape[1] / best.period:.2f} periods in its rows, at least "
-            f"{min_periods:g} are needed; use a faster flicker"
+            f"{_MIN_PERIODS:g} are needed; use a faster flicker"
         )
     return best, model
 
 
-def moves(fit: BandFit) -> bool:
-    """Whether the bands move from frame to frame."""
-    first = fit.coefficients[:, 0]
-    spread = (first - first.mean()).abs().square().mean()
-    return bool(spread > 0.02 * first.abs().square().mean())
-
-
-def same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> bool:
+def _same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> bool:
     """Whether the bands lie at the same rows in all parts of the columns, as those of light do."""
     parts = profiles.parts
     height = parts.shape[-1]
@@ -325,9 +310,7 @@ def same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> bool
     if scene == "fixed":
         parts = parts - parts.mean(0) * (parts.mean(-1) / parts.mean((0, -1)))[..., None]
     else:
-        parts = _less_parabola(parts.flatten(0, 1)).view_as(parts)
-    angle = -2 * torch.pi * torch.arange(kept, dtype=torch.float64, device="cpu") / fit.period
-    wave = torch.polar(torch.hann_window(kept, dtype=torch.float64, device="cpu"), angle)
-    amplitude = parts[..., :kept].to(wave.dtype) @ wave
-    together, each = amplitude.sum(1).abs().sum(), amplitude.abs().sum()
-    return bool(together > 0.7 * each)
+        parts = _less_parabola(parts)
+    phase = 2 * np.pi * np.arange(kept)
+    amplitude = parts[..., :kept] @ ((0.5 - 0.5 * np.cos(phase / kept)) * np.exp(-1j * phase / fit.period))
+    return bool(np.abs(amplitude.sum(1)).sum() > 0.7 * np.abs(amplitude).sum())

@@ -1,18 +1,17 @@
 """Exposure from the shape of the bands of an on-off light, or from the contrast of those of a sinusoidal light."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
-from torch import Tensor
 
-Array = NDArray[np.float64]
+from rsvib_torch.calibration.flicker import Array, deviations, unexplained
+
+_MAX_MISFIT = 0.3  # largest root mean square of the residuals over the brightness
 
 
-def lit_fraction(begin: Array, exposure: float, on_time: float, period: float) -> Array:
+def lit_fraction(begin: Array, exposure: Array | float, on_time: float, period: float) -> Array:
     """Fraction of exposures from ``begin`` on in which a light is on that goes on at 0, P, 2 P ... for ``on_time``.
 
     Example:
@@ -32,112 +31,52 @@ class StrobeFit:
     """Bands of an on-off light, in rows."""
 
     period: float  # P
-    on_rows: float  # rows read while the light is on
-    exposure_rows: Array  # (T,) rows read during the exposure of one row
-    std: dict[str, float]  # standard deviations of the free parameters, by name
-
-
-def _residuals(brightness: Array, smooth: Array, shape: Array) -> Array:
-    """Residuals of bands of this shape (T, H) times a cubic along the rows of each frame, fitted to the brightness."""
-    residuals = []
-    for values, waves in zip(brightness, shape, strict=True):
-        columns = smooth * waves[:, None]
-        weight, *_ = np.linalg.lstsq(columns, values, rcond=None)
-        residuals.append(values - columns @ weight)
-    return np.concatenate(residuals)
+    exposure_rows: float  # rows read during the longest exposure of a row
+    exposure_std: float  # its standard deviation
 
 
 def fit_strobe(
-    brightness: Tensor,
-    period: float,
-    phases: Sequence[float],
-    *,
-    on_fraction: float | None = None,
-    exposures: Sequence[float] | None = None,
-    max_misfit: float = 0.3,
+    brightness: Array, period: float, phases: Array, exposures: Array, on_fraction: float | None = None
 ) -> StrobeFit:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row.
-
-    Given the fraction of time that the light is on, the exposure is estimated; given the exposures of two or more
-    frames in seconds, the row time and the on-time.
 
     Args:
         brightness: (T, H), in proportion to light.
         period: Period of the bands in rows, to start with.
-        phases: Phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``, to start with.
-        on_fraction: Fraction of the period that the light is on.
-        exposures: Exposures in seconds, one a frame; ``std["row_time"]`` then holds that of the row time.
-        max_misfit: Largest root mean square of the residuals over the brightness.
+        phases: (T,) phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``, to start with.
+        exposures: (T,) exposure of each frame, in any unit.
+        on_fraction: Fraction of the period that the light is on; None to estimate it, from different exposures.
     """
-    values = (brightness / brightness.mean(1, keepdim=True)).numpy()
-    height = values.shape[1]
-    rows = np.arange(height, dtype=np.float64)
+    values = brightness / brightness.mean(1, keepdims=True)
+    count, height = values.shape
+    rows = np.arange(height)
     smooth = np.polynomial.chebyshev.chebvander(2 * rows / (height - 1) - 1, 3)
-    count = len(values)
-
-    def exposure_rows(parameters: Array) -> Array:
-        if exposures is None:
-            return np.full(count, parameters[1])
-        rows: Array = np.asarray(exposures, dtype=np.float64) / parameters[1]
-        return rows
-
-    def on_rows(parameters: Array) -> float:
-        return float(on_fraction * parameters[0] if on_fraction is not None else parameters[2])
+    relative = exposures[:, None] / exposures.max()
 
     def residuals(parameters: Array) -> Array:
-        long, lit = exposure_rows(parameters), on_rows(parameters)
+        """Residuals of the bands times a cubic along the rows of each frame, fitted to the brightness."""
+        long, middles = parameters[1] * relative, parameters[-count:, None]
+        lit = float(parameters[2] if on_fraction is None else on_fraction * parameters[0])
         # the brightest row is exposed symmetrically about the pulse
-        shape = np.stack(
-            [
-                lit_fraction(rows - middle - 0.5 * e + 0.5 * lit, e, lit, parameters[0])
-                for middle, e in zip(parameters[-count:], long, strict=True)
-            ]
-        )
-        return _residuals(values, smooth, shape)
+        shape = lit_fraction(rows - middles - 0.5 * long + 0.5 * lit, long, lit, parameters[0])
+        return unexplained(smooth * shape[..., None], values).ravel()
 
-    middles = [phase / (2 * math.pi) * period for phase in phases]
-    best = None
-    starts, longest_exposure = 9, 3.0  # periods
+    # period, longest exposure and on-time in rows, and the brightest row of each frame
+    kept = [0, 1, 2, *range(3, 3 + count)] if on_fraction is None else [0, 1, *range(3, 3 + count)]
+    middles = phases / (2 * math.pi) * period
+    lower = np.array([0.8 * period, 1e-3, 1e-3, *(middles - period)])[kept]
+    upper = np.array([1.25 * period, 4 * period, 1.1 * period, *(middles + period)])[kept]
+    trials = []
+    starts, longest = 9, 3.0  # periods
     for step in range(1, starts + 1):
-        if exposures is None:
-            guess = [period, longest_exposure * period * (step / starts) ** 2]
-            lower, upper = [0.8 * period, 1e-3], [1.25 * period, (longest_exposure + 0.5) * period]
-        else:
-            longest = max(exposures)
-            guess = [period, longest / (period * 0.8 * step / starts), 0.3 * period]
-            lower, upper = [0.8 * period, longest / (4 * period)], [1.25 * period, longest]
-            lower, upper = [*lower, 1e-3], [*upper, 1.1 * period]
-        bounds = ([*lower, *(m - period for m in middles)], [*upper, *(m + period for m in middles)])
-        start = np.clip([*guess, *middles], np.asarray(bounds[0]) * 1.0, np.asarray(bounds[1]))
-        trial = least_squares(residuals, start, bounds=bounds, x_scale=np.maximum(np.abs(start), 1e-12))
-        if best is None or trial.cost < best.cost:
-            best = trial
-    assert best is not None
+        start = np.array([period, longest * period * (step / starts) ** 2, 0.3 * period, *middles])[kept]
+        trials.append(least_squares(residuals, start, bounds=(lower, upper), x_scale=np.maximum(np.abs(start), 1e-12)))
+    best = min(trials, key=lambda trial: trial.cost)
     misfit = math.sqrt(2 * best.cost / values.size)
-    if misfit > max_misfit:
+    if misfit > _MAX_MISFIT:
         raise ValueError(f"the bands do not have the shape of an on-off light (misfit {misfit:.0%} of the mean)")
-    names = ["period", "exposure_rows"] if exposures is None else ["period", "row_time", "on_rows"]
-    std = _deviations(best.jac, best.fun.reshape(count, height), period)
-    return StrobeFit(
-        period=float(best.x[0]),
-        on_rows=on_rows(best.x),
-        exposure_rows=exposure_rows(best.x),
-        std=dict(zip(names, std, strict=False)),
-    )
-
-
-def _deviations(jacobian: Array, residual: Array, period: float) -> list[float]:
-    """Standard deviations of parameters, with the correlation of residuals over a quarter of a period."""
-    information = np.linalg.pinv(jacobian.T @ jacobian)
-    reach = max(4, round(period / 4))
-    score = jacobian.reshape(*residual.shape, -1) * residual[..., None]
-    total = np.einsum("tin,tim->nm", score, score)
-    for lag in range(1, min(reach, residual.shape[1] - 1) + 1):
-        both = np.einsum("tin,tim->nm", score[:, lag:], score[:, :-lag])
-        total += (1 - lag / (reach + 1)) * (both + both.T)
-    white = np.mean(residual**2) * information
-    variance = np.maximum(np.diag(information @ total @ information), np.diag(white))
-    return [float(v) for v in np.sqrt(np.maximum(variance, 0.0))]
+    std = deviations(best.jac.reshape(count, height, -1), best.fun.reshape(count, height), max(4, round(period / 4)))
+    return StrobeFit(float(best.x[0]), float(best.x[1]), float(std[1]))
 
 
 def exposure_from_contrast(contrast: float, light_contrast: float, period: float) -> float:
