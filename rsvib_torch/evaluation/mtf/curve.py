@@ -1,10 +1,10 @@
 """Slanted-edge measurement of the MTF (ISO 12233, e-SFR), and its result."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
@@ -157,7 +157,12 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
 
     frequency = torch.linspace(0, 1, 101, dtype=torch.float64, device=grey.device)
     mtf = spread.mtf(frequency)
-    mtf50 = _first_crossing(spread.mtf, frequency, mtf, 0.5)
+    below = (mtf <= 0.5).nonzero()
+    crossing = math.nan
+    if len(below):
+        around = frequency[int(below[0]) - 1 : int(below[0]) + 1].tolist()
+        crossing = brentq(lambda f: float(spread.mtf(frequency.new_tensor([f]))) - 0.5, *around, xtol=1e-15)
+    mtf50 = frequency.new_tensor(crossing)
     step = 1e-4  # cycles/px, for the slope of the curve
     beside = spread.mtf(torch.stack([mtf50 - step, mtf50 + step]))
     mtf50_std = spread.std(mtf50[None])[0] * 2 * step / (beside[1] - beside[0]).abs()
@@ -178,17 +183,3 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
         levels=spread.fit.sides[:, 0],
         noise=spread.noise,
     )
-
-
-def _first_crossing(curve: Callable[[Tensor], Tensor], frequency: Tensor, mtf: Tensor, level: float) -> Tensor:
-    """Frequency at which the MTF ``curve`` first falls to ``level``; NaN where it does not within ``frequency``."""
-    below = mtf <= level
-    if not bool(below.any()):
-        return torch.full((), math.nan, dtype=mtf.dtype, device=mtf.device)
-    index = int(below.to(torch.int8).argmax())
-    low, high = frequency[index - 1], frequency[index]
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        above = curve(middle[None])[0] > level
-        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
-    return 0.5 * (low + high)

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from rsvib_torch.evaluation.mtf.edge import EdgeFit, Scatter, edge_spread, linearised, moved
 
-# parameters of ``EdgeFit`` with a prior, the slopes of the two sides across the edge, and those without
-_RANDOM, _FIXED = [6, 9], [0, 1, 2, 3, 4, 5, 7, 8, 10]
-_SLOPES, _FREE = len(_RANDOM), len(_FIXED)
+_EDGE = 11  # parameters of ``EdgeFit``; all coefficients of the departure follow them
+_BLUR, _DARK, _BRIGHT = 4, 5, 8  # log blur, and values of the sides in the middle of the ROI, among them
+_SLOPES = [6, 9]  # slopes of the two sides across the edge, which have a prior
+_SHADINGS = (1e-12, 0.1)  # standard deviations of these slopes over the contrast, per half ROI: none, or some
+_STRENGTHS = (0.0, *(10.0 ** (0.5 * k) for k in range(-10, 0)))  # of the departure over the contrast
 
 
 # --- Departure from the Gaussian model and its priors ---
@@ -105,20 +107,13 @@ def lay_knots(room: float, width: float, like: Tensor) -> Knots:
     return Knots(place, step, stretch, Tail(2.0 * max(1.0, width)))
 
 
-def prior_roots(
-    knots: Knots,
-    width: float,
-    smoothness: tuple[float, ...] = (0.4, 0.8, 1.8),
-    decay: tuple[float, ...] = (1.0, 2.5, 6.0),
-) -> Tensor:
+def prior_roots(knots: Knots, width: float) -> Tensor:
     """Square roots (P, 1 + K, 1 + K) of prior covariances of tail and splines, at strength 1 in the middle.
 
-    Args:
-        knots: Of the departure.
-        width: Standard deviation of the line spread function in px; lengths are in px for widths of up to 1 px.
-        smoothness: Correlation lengths of the departures.
-        decay: Distances over which departures decay quadratically; one more prior decays linearly, as the tail.
+    Lengths are in px for a line spread function of a standard deviation ``width`` of up to 1 px.
     """
+    smoothness = (0.4, 0.8, 1.8)  # correlation lengths of the departures
+    decay = (1.0, 2.5, 6.0)  # over which departures decay quadratically; one more prior decays linearly, as the tail
     scale = max(1.0, width)
     distance = knots.distance.abs()
     apart = (knots.place[:, None] - knots.place).square()
@@ -155,92 +150,65 @@ def normal_equations(dense: Tensor, index: Tensor, taps: Tensor, count: int, res
 
 @dataclass(frozen=True)
 class Posterior:
-    """Free parameters, and slopes and coefficients for every prior of at least 0.1 % of the best weight."""
+    """Parameters of edge and sides, tail and splines for every prior of at least 0.1 % of the best weight."""
 
     weights: Tensor  # (A,) of the priors
-    coefficients: Tensor  # (A, 2 + K) under each of them: slopes, tail and splines
-    roots: Tensor  # (A, 2 + K, 2 + K) square roots of their covariances
-    mean: Tensor  # (2 + K,) coefficients over all priors
-    fixed: Tensor  # (F,) free parameters at the mean coefficients
-    projection: Tensor  # (F, 2 + K) negative derivatives of the free parameters by the coefficients
-    fixed_root: Tensor  # (F, F) square root of their covariance at given coefficients
-    used: Tensor  # (P,) spline priors with weight
+    parameters: Tensor  # (A, 11 + 1 + K) under each of them
+    roots: Tensor  # (A, 11 + 1 + K, S) square roots of their covariances
+    used: Tensor  # (P,) priors of the departure with weight
+
+    @property
+    def mean(self) -> Tensor:
+        """Parameters (11 + 1 + K) over all priors."""
+        return self.weights @ self.parameters
 
 
-def posterior(
-    matrix: Tensor, right: Tensor, roots: Tensor, contrast: Tensor, shadings: tuple[float, ...] = (0.0, 0.1)
-) -> Posterior:
+def posterior(matrix: Tensor, right: Tensor, roots: Tensor, contrast: Tensor) -> Posterior:
     """Average over priors, each weighted by its restricted likelihood, for noise of variance 1.
 
-    ``matrix`` and ``right`` are the normal equations of all parameters, ``roots`` (P, K, K) square roots of the prior
-    covariances of the departure at strength 1. ``shadings`` are standard deviations of the slopes of the sides across
-    the edge over the contrast, per half ROI.
+    ``matrix`` and ``right`` are the normal equations of all parameters, ``roots`` (P, 1 + K, 1 + K) square roots of the
+    prior covariances of the departure at strength 1.
     """
-    size = matrix.diagonal()[:_FREE].sqrt()
-    size = size.clamp(min=1e-12 * float(size.max()))
-    normal = matrix[:_FREE, :_FREE] / size / size[:, None]
-    normal.diagonal().add_(1e-13)
-    factor = torch.linalg.cholesky(normal)
-    mixed = matrix[:_FREE, _FREE:] / size[:, None]
-    projection = torch.cholesky_solve(mixed, factor)
-    start = torch.cholesky_solve((right[:_FREE] / size)[:, None], factor)[:, 0]
-    gram = matrix[_FREE:, _FREE:] - mixed.T @ projection
-    right = right[_FREE:] - mixed.T @ start
-
-    solutions = [_under_shading(gram, right, roots, shading * contrast) for shading in shadings]
+    edge, rest = slice(None, _EDGE), slice(_EDGE, None)
+    strength = matrix.new_tensor(_STRENGTHS).square()[:, None]
+    solutions = []
+    for shading in _SHADINGS:
+        # elimination of edge and sides, with the prior of the slopes
+        normal = matrix[edge, edge].clone()
+        normal[_SLOPES, _SLOPES] += (shading * contrast) ** -2
+        size = normal.diagonal().sqrt()
+        size = size.clamp(min=1e-12 * float(matrix.diagonal()[edge].max()) ** 0.5)
+        normal = normal / size / size[:, None]
+        normal.diagonal().add_(1e-13)
+        factor = torch.linalg.cholesky(normal)
+        follow = -torch.cholesky_solve(matrix[edge, rest] / size[:, None], factor) / size[:, None]
+        start = torch.cholesky_solve((right[edge] / size)[:, None], factor)[:, 0] / size
+        gram = matrix[rest, rest] + matrix[rest, edge] @ follow
+        evidence = 0.5 * right[edge] @ start - (factor.diagonal() * size).log().sum() - 2 * (shading * contrast).log()
+        # modes of tail and splines, which all strengths have in common
+        values, vectors = torch.linalg.eigh(roots.mT @ gram @ roots)
+        values, modes = values.clamp(min=0.0)[:, None], roots @ vectors
+        projected = (modes.mT @ (right[rest] - matrix[rest, edge] @ start))[:, None]
+        shrunk = strength / (1 + strength * values)  # variances (P, strengths, 1 + K) of the modes
+        evidence = evidence + 0.5 * (shrunk * projected.square() - torch.log1p(strength * values)).sum(-1)
+        free = torch.linalg.inv(factor).T / size[:, None]  # square root of the covariance of edge and sides alone
+        solutions.append((evidence, modes, shrunk, shrunk * projected, start, follow, free))
     best = torch.stack([evidence.max() for evidence, *_ in solutions]).max()
-    weights, coefficients, spreads = [], [], []
+    weights, parameters, spreads = [], [], []
     used = torch.zeros(len(roots), dtype=torch.bool, device=roots.device)
-    for evidence, modes, shrunk, mean, gain in solutions:
+    for evidence, modes, shrunk, mean, start, follow, free in solutions:
         weight = torch.exp(evidence - best)
         kept = weight > 1e-3
-        which = kept.nonzero()[:, 0]
         used |= kept.any(1)
         weights.append(weight[kept])
-        spline = (modes[which] @ mean[kept][..., None])[..., 0]
-        follow = -gain @ gram[:_SLOPES, _SLOPES:]
-        coefficients.append(torch.cat([gain @ right[:_SLOPES] + spline @ follow.T, spline], dim=1))
-        root = modes[which] * shrunk[kept].sqrt()[:, None]
-        spread = root.new_zeros(len(root), *gram.shape)
-        spread[:, :_SLOPES, :_SLOPES] = torch.linalg.cholesky_ex(gain)[0]
-        spread[:, :_SLOPES, _SLOPES:], spread[:, _SLOPES:, _SLOPES:] = follow @ root, root
-        spreads.append(spread)
-    weight, coefficient = torch.cat(weights), torch.cat(coefficients)
-    weight = weight / weight.sum()
-    average = weight @ coefficient
-    return Posterior(
-        weight,
-        coefficient,
-        torch.cat(spreads),
-        average,
-        (start - projection @ average) / size,
-        projection / size[:, None],
-        torch.linalg.inv(factor).T / size[:, None],
-        used,
-    )
-
-
-def _under_shading(
-    gram: Tensor, right: Tensor, roots: Tensor, shading: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Log likelihood (P, S), modes (P, K, K), their variances and means (P, S, K), covariance of the slopes (2, 2)."""
-    slopes, rest = slice(None, _SLOPES), slice(_SLOPES, None)
-    # elimination of the slopes, with their own prior, from the equations of the spline
-    informed = gram[slopes, slopes] * shading**2 + torch.eye(_SLOPES, dtype=gram.dtype, device=gram.device)
-    gain = shading**2 * torch.linalg.inv(informed)
-    gain = 0.5 * (gain + gain.T)
-    spline_gram = gram[rest, rest] - gram[rest, slopes] @ gain @ gram[slopes, rest]
-    spline_right = right[rest] - gram[rest, slopes] @ gain @ right[slopes]
-    values, vectors = torch.linalg.eigh(roots.mT @ spline_gram @ roots)
-    values = values.clamp(min=0.0)[:, None]
-    modes = roots @ vectors
-    projected = (modes.mT @ spline_right)[:, None]
-    # of the departures over the contrast
-    strength = gram.new_tensor([0.0, *(10.0 ** (0.5 * k) for k in range(-10, 0))]).square()[:, None]
-    shrunk = strength / (1 + strength * values)
-    evidence = 0.5 * (shrunk * projected.square() - torch.log1p(strength * values)).sum(-1)
-    evidence = evidence + 0.5 * (right[slopes] @ gain @ right[slopes] - torch.logdet(informed))
-    return evidence, modes, shrunk, shrunk * projected, gain
+        chosen = modes[kept.nonzero()[:, 0]]
+        departure = (chosen @ mean[kept][..., None])[..., 0]
+        parameters.append(torch.cat([start + departure @ follow.T, departure], dim=1))
+        root = chosen * shrunk[kept].sqrt()[:, None]
+        of_edge = torch.cat([follow @ root, free.expand(len(root), -1, -1)], dim=-1)
+        spreads.append(torch.cat([of_edge, torch.nn.functional.pad(root, (0, _EDGE))], dim=-2))
+    total = torch.cat(weights)
+    return Posterior(total / total.sum(), torch.cat(parameters), torch.cat(spreads), used)
 
 
 # --- Fit and result ---
@@ -259,7 +227,7 @@ class Spread:
     alternatives: Tensor  # (A, N) line spread functions by prior
     alternative_far: Tensor  # (A,) amplitude of the tail in each
     weights: Tensor  # (A,) of the alternatives
-    basis: Tensor  # (N, R) derivatives of the line spread function by the uncertain parameters
+    basis: Tensor  # (N, R) derivatives of the line spread function by blur, tail and splines
     roots: Tensor  # (A, R, S) square roots of the covariance of these parameters, by prior
     noise: Tensor  # () standard deviation of the noise of a pixel
 
@@ -305,14 +273,14 @@ def fit_spread(fit: EdgeFit, scatter: Scatter, room: float) -> Spread:
         contrast = sides[:, 1] - sides[:, 0]
         index, values, slopes = knots.taps(distance)
         if result is not None:
-            tail, splines = result.mean[_SLOPES], result.mean[_SLOPES + 1 :]
+            tail, splines = result.mean[_EDGE], result.mean[_EDGE + 1 :]
             steeper = (slopes * splines[index]).sum(1) + knots.tail.lsf(distance) * tail
             jacobian[:, :4] += (contrast * steeper)[:, None] * fit.distance(scatter)[1]
         beyond = contrast * knots.tail.esf(distance)
-        dense = torch.cat([jacobian[:, _FIXED + _RANDOM], beyond[:, None]], dim=1)
+        dense = torch.cat([jacobian, beyond[:, None]], dim=1)
         taps = contrast[:, None] * values
         # the prior of the slopes is centred on 0, not on their last estimate
-        residual = scatter.value - model + jacobian[:, _RANDOM] @ fit.sides[:, 1]
+        residual = scatter.value - model + jacobian[:, _SLOPES] @ fit.sides[:, 1]
         if count == 0:
             # all parameters free, with slight damping
             matrix, right = normal_equations(dense, index, taps, len(knots.place), residual)
@@ -328,9 +296,8 @@ def fit_spread(fit: EdgeFit, scatter: Scatter, room: float) -> Spread:
         weighted = (dense / noise[:, None], index, taps / noise[:, None], len(knots.place), residual / noise)
         result = posterior(*normal_equations(*weighted), roots, fit.contrast)
         roots = roots[result.used]
-        step = torch.zeros_like(jacobian[0])
-        step[_FIXED] = result.fixed
-        step[_RANDOM] = result.mean[:_SLOPES] - fit.sides[:, 1]
+        step = result.mean[:_EDGE]
+        step[_SLOPES] -= fit.sides[:, 1]
         before, fit = fit, moved(fit, step)
     assert result is not None
     return _sampled(before, result, knots, scatter, noise)
@@ -353,33 +320,26 @@ def _sampled(fit: EdgeFit, found: Posterior, knots: Knots, scatter: Scatter, noi
     position = torch.arange(-count, count + 1, dtype=noise.dtype, device=noise.device) / samples
     slope = fit.slope(scatter)
     esf, lsf, _ = edge_spread(position, fit.sigma, slope)
-    values, slopes = knots.matrices(position)
     # derivative of both by log sigma
     change = 1e-3
     wider, narrower = (edge_spread(position, fit.sigma * math.exp(sign * change), slope) for sign in (1, -1))
-    esf_by_blur, by_blur = ((a - b) / (2 * change) for a, b in zip(wider[:2], narrower[:2], strict=True))
-    shrink = fit.contrast / (fit.contrast + found.fixed[7] - found.fixed[5])
+    by_blur = [(a - b)[:, None] / (2 * change) for a, b in zip(wider[:2], narrower[:2], strict=True)]
+    esf_basis, lsf_basis = (torch.cat(both, dim=1) for both in zip(by_blur, knots.matrices(position), strict=True))
     mean = found.mean
-    blur, followed = found.fixed[4], found.projection[4]
-    alternatives = lsf + shrink * (
-        (blur - (found.coefficients - mean) @ followed)[:, None] * by_blur + found.coefficients[:, _SLOPES:] @ slopes.T
-    )
-    basis = torch.cat([slopes.new_zeros(len(slopes), _SLOPES), slopes], dim=1) - by_blur[:, None] * followed
-    own = found.fixed_root[4:5].expand(len(alternatives), 1, -1)
-    (k, m), n = found.roots.shape[1:], own.shape[-1]
-    roots = own.new_zeros(len(own), k + 1, m + n)
-    roots[:, :k, :m], roots[:, k:, m:] = found.roots, own
+    shrink = fit.contrast / (fit.contrast + mean[_BRIGHT] - mean[_DARK])
+    used = [_BLUR, *range(_EDGE, len(mean))]  # parameters that change the shape
+    basis, alternatives = shrink * lsf_basis, found.parameters[:, used]
     return Spread(
         fit,
         position,
-        esf + shrink * (blur * esf_by_blur + values @ mean[_SLOPES:]),
-        lsf + shrink * (blur * by_blur + slopes @ mean[_SLOPES:]),
+        esf + shrink * (esf_basis @ mean[used]),
+        lsf + basis @ mean[used],
         knots.tail,
-        shrink * mean[_SLOPES],
-        alternatives,
-        shrink * found.coefficients[:, _SLOPES],
+        shrink * mean[_EDGE],
+        lsf + alternatives @ basis.T,
+        shrink * found.parameters[:, _EDGE],
         found.weights,
-        shrink * torch.cat([basis, by_blur[:, None]], dim=1),
-        roots,
+        basis,
+        found.roots[:, used],
         noise.square().mean().sqrt(),
     )

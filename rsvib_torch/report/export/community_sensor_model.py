@@ -94,7 +94,7 @@ def camera_isd(
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right = np.array([0.0, 1.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
     # rows: axes of the sensor in axes of the body
-    pointing = _quaternions(Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward])))
+    pointing = Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward]))
     f = camera.focal_length
     k1, k2, p1, p2, k3 = camera.distortion
     lens: dict[str, Any] = {"radial": {"coefficients": [0.0, 0.0, 0.0]}}
@@ -125,7 +125,7 @@ def camera_isd(
         "radii": {"semimajor": radii[0], "semiminor": radii[1], "unit": "km"},
         "reference_height": {"maxheight": 1000, "minheight": -1000, "unit": "m"},
         "instrument_position": {"unit": "km", "positions": [list(position)], "velocities": [[0.0] * 3], **once},
-        "instrument_pointing": {"quaternions": pointing.tolist(), **once},
+        "instrument_pointing": {"quaternions": [pointing.as_quat(scalar_first=True).tolist()], **once},
         "body_rotation": {"quaternions": [[1.0, 0.0, 0.0, 0.0]], **once},
         "sun_position": {"unit": "km", "positions": [[1.5e8, 0.0, 0.0]], "velocities": [[0.0] * 3], **once},
     }
@@ -364,17 +364,15 @@ def _with_jitter(
     step = float(np.abs(np.diff(target, axis=0)).max()) if rows > 1 else 0.0
     duration = rows * timing.row_time
     shown = times - 0.5 * timing.exposure_time + duration
-    scaled = (shown - 1.5 * duration) / (0.5 * duration)
     power, rest = np.zeros((1, 2)), np.inf
     for degree in range(1, min(_MAX_DEGREE, rows) + 1):
-        # shown times a Chebyshev series: zero at time 0
-        fitted = [np.polynomial.Chebyshev.fit(scaled, target[:, k] / shown, degree - 1, domain=(-1, 1)) for k in (0, 1)]
-        inner = [f.convert(kind=np.polynomial.Polynomial).coef for f in fitted]
-        middle = np.polynomial.Polynomial([-3.0, 2.0 / duration])  # scaled time as a polynomial of the time
-        series = [np.polynomial.Polynomial(c)(middle) * np.polynomial.Polynomial([0.0, 1.0]) for c in inner]
-        power = np.stack([np.pad(s.coef, (0, degree + 1 - len(s.coef)))[:0:-1] for s in series], -1)
-        exponents = np.arange(degree, 0, -1)
-        value = (shown[:, None] ** exponents) @ power
+        # the time times a Chebyshev series, which is zero at time 0, as powers of the time from the highest on
+        fitted = [np.polynomial.Chebyshev.fit(shown, values / shown, degree - 1) for values in target.T]
+        power = np.zeros((degree, 2))
+        for axis, series in enumerate(fitted):
+            coefficients = series.convert(kind=np.polynomial.Polynomial).coef[::-1]
+            power[degree - len(coefficients) :, axis] = coefficients
+        value = (shown[:, None] ** np.arange(degree, 0, -1)) @ power
         rest = float(np.maximum(np.abs(value - low), np.abs(value - high)).max())
         if rest - columns <= 0.1 * tolerance:
             break
@@ -405,21 +403,21 @@ def _as_line_scan(
     # the line of the scanner: through the optical axis
     axis = (camera.centre[0] + camera.offset[0] - camera.start[0]) / camera.summing[0]
     scanned = camera.rays(np.full_like(sample, axis), sample)  # (columns, 3)
-    turned = _best_rotations(scanned, seen)
-    pixels = camera.pixels(np.einsum("rij,cj->rci", turned, scanned)) - camera.pixels(seen)
+    scanned, seen = (rays / np.linalg.norm(rays, axis=-1, keepdims=True) for rays in (scanned, seen))
+    turned = Rotation.concatenate([Rotation.align_vectors(rays, scanned)[0] for rays in seen])
+    pixels = camera.pixels(np.einsum("rij,cj->rci", turned.as_matrix(), scanned)) - camera.pixels(seen)
     error = float(np.abs(pixels[_PADDING:-_PADDING]).max())
     reason = f"line-scan: {error:.2g} px, since no rotation takes the line of the scanner to all pixels of a row"
     if error > tolerance:
         return None, reason
-    still = Rotation.from_quat(np.roll(camera.state("instrument_pointing", "quaternions", 4), -1))
+    still = Rotation.from_quat(camera.state("instrument_pointing", "quaternions", 4), scalar_first=True)
     if "constant_rotation" in camera.isd["instrument_pointing"]:
         constant = camera.state("instrument_pointing", "constant_rotation", 9)
         still = Rotation.from_matrix(constant.reshape(3, 3)) * still
     # a ray e of row r has the direction still^-1 turned e in the reference frame, and pointing^-1 e in the file
-    pointing = _quaternions(Rotation.from_matrix(turned).inv() * still)
-    pointing[1:] *= np.cumprod(np.sign((pointing[1:] * pointing[:-1]).sum(1)))[
-        :, None
-    ]  # continuous: q and -q are equal
+    pointing = (turned.inv() * still).as_quat(scalar_first=True)
+    same_side = np.sign((pointing[1:] * pointing[:-1]).sum(1))
+    pointing[1:] *= np.cumprod(same_side)[:, None]  # continuous: q and -q are the same rotation
     centre = camera._number("center_ephemeris_time")
     # whole multiples of the resolution of float64 at these times: equal distances for the interpolation
     resolution = np.spacing(max(abs(centre), 1e-3))
@@ -427,13 +425,19 @@ def _as_line_scan(
     first = centre - round(0.5 * (rows - 1) * duration / resolution) * resolution
     times = first + duration * np.arange(rows)
     found = {name: value for name, value in camera.isd.items() if name != "jitter"}
-    every = {"ephemeris_times": times.tolist()}
     body = camera.state("body_rotation", "quaternions", 4)
     position = camera.state("instrument_position", "positions", 3)
     velocity = camera.state("instrument_position", "velocities", 3)
     sun, sun_velocity = (camera.state("sun_position", name, 3) for name in ("positions", "velocities"))
     if np.linalg.norm(np.cross(position, velocity)) == 0:  # usgscsm divides by it; the direction is not used
         velocity = np.cross(position, np.eye(3)[np.argmin(np.abs(position))]) * 1e-9
+
+    def states(name: str, times: Array, **values: Array) -> dict[str, Any]:
+        """A table of states with new values; what describes the old ones is left out."""
+        kept = {key: value for key, value in camera.isd[name].items() if key in ("unit", "reference_frame")}
+        new = {key: np.broadcast_to(value, (len(times), value.shape[-1])).tolist() for key, value in values.items()}
+        return kept | new | {"ephemeris_times": times.tolist()}
+
     found |= {
         "name_model": _LINE_SCAN,
         "starting_ephemeris_time": float(times[_PADDING] - 0.5 * duration),
@@ -444,39 +448,9 @@ def _as_line_scan(
         "dt_quaternion": float(duration),
         "starting_detector_line": 0,
         "detector_center": {"line": float(-camera.offset[0]), "sample": float(camera.centre[1])},
-        "instrument_pointing": _states(camera, "instrument_pointing", quaternions=pointing) | every,
-        "body_rotation": _states(camera, "body_rotation", quaternions=np.tile(body, (rows, 1))) | every,
-        "instrument_position": _states(
-            camera,
-            "instrument_position",
-            positions=np.tile(position, (rows, 1)),
-            velocities=np.tile(velocity, (rows, 1)),
-        )
-        | every,
-        "sun_position": _states(
-            camera, "sun_position", positions=np.tile(sun, (2, 1)), velocities=np.tile(sun_velocity, (2, 1))
-        )
-        | {"ephemeris_times": [float(times[0]), float(times[-1])]},
+        "instrument_pointing": states("instrument_pointing", times, quaternions=pointing),
+        "body_rotation": states("body_rotation", times, quaternions=body),
+        "instrument_position": states("instrument_position", times, positions=position, velocities=velocity),
+        "sun_position": states("sun_position", times[[0, -1]], positions=sun, velocities=sun_velocity),
     }
     return found, reason
-
-
-def _states(camera: _Camera, name: str, **values: Array) -> dict[str, Any]:
-    """A table of states with new values; what describes the old ones is left out."""
-    kept = {key: value for key, value in camera.isd[name].items() if key in ("unit", "reference_frame")}
-    return kept | {key: array.tolist() for key, array in values.items()}
-
-
-def _best_rotations(rays: Array, targets: Array) -> Array:
-    """Rotations (R, 3, 3) that take rays (C, 3) to targets (R, C, 3) with the least squared error (Kabsch 1976)."""
-    rays, targets = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (rays, targets))
-    left, _, right = np.linalg.svd(np.einsum("rci,cj->rij", targets, rays))
-    signs = np.ones((len(targets), 3))
-    signs[:, 2] = np.linalg.det(left @ right)
-    rotations: Array = (left * signs[:, None]) @ right
-    return rotations
-
-
-def _quaternions(rotations: Rotation) -> Array:
-    """Quaternions (N, 4) in the order (w, x, y, z)."""
-    return np.roll(np.atleast_2d(rotations.as_quat()), 1, axis=-1)
