@@ -11,8 +11,8 @@ from rsvib_torch.core.arrays import FramesLike, as_tensor
 from rsvib_torch.core.checks import check_number, check_whole_number
 
 
-def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tensor, Tensor]:
-    """Both images without their rim in float32 or float64, as (N, C, H, W), one entry of N an image."""
+def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tensor, Tensor, torch.Size]:
+    """Both images without their rim, float32 or float64 (N, C, H, W), and the shape of the result: (), (T,), (B, T)."""
     image, reference = as_tensor("image", image), as_tensor("reference", reference)
     for name, value in (("image", image), ("reference", reference)):
         if value.dtype.is_complex or value.dtype == torch.bool:
@@ -21,32 +21,27 @@ def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tenso
         raise ValueError(
             f"image must have shape (H, W), (T, H, W), (T, C, H, W) or (B, T, C, H, W), got {tuple(image.shape)}"
         )
-    if reference.ndim > image.ndim or reference.ndim < 2 or reference.shape[-2:] != image.shape[-2:]:
-        raise ValueError(f"reference of shape {tuple(reference.shape)} does not fit image {tuple(image.shape)}")
+    misfit = (
+        f"reference of shape {tuple(reference.shape)} does not fit image {tuple(image.shape)}, or holds more images"
+    )
+    if reference.shape[-2:] != image.shape[-2:]:
+        raise ValueError(misfit)
     rim = check_whole_number("rim", rim, at_least=0)
     if min(image.shape[-2:]) <= 2 * rim:
         raise ValueError(f"rim={rim} is too large for an image of {image.shape[-2]} x {image.shape[-1]} px")
     try:
-        pair = torch.broadcast_tensors(image, reference)
+        pair = (image, reference.expand_as(image))
     except RuntimeError as error:
-        raise ValueError(
-            f"reference of shape {tuple(reference.shape)} does not fit image {tuple(image.shape)}"
-        ) from error
-    if pair[0].shape != image.shape:
-        raise ValueError(f"reference of shape {tuple(reference.shape)} holds more images than {tuple(image.shape)}")
-    dtype = torch.promote_types(image.dtype, reference.dtype)
-    if dtype != torch.float32:
-        dtype = torch.float32 if dtype in (torch.float16, torch.bfloat16) else torch.float64
-    first, second = (value[..., rim : value.shape[-2] - rim, rim : value.shape[-1] - rim].to(dtype) for value in pair)
-    channels = image.shape[-3] if image.ndim >= 4 else 1
-    size = (-1, channels, *first.shape[-2:])
-    return first.reshape(size), second.reshape(size)
-
-
-def _per_image(values: Tensor, image: FramesLike) -> Tensor:
-    """Values (N,) in the leading shape of the images: (), (T,) or (B, T)."""
-    shape = as_tensor("image", image).shape
-    return values.reshape(shape[: -3 if len(shape) >= 4 else -2])
+        raise ValueError(misfit) from error
+    is_single = torch.promote_types(image.dtype, reference.dtype) in (torch.float16, torch.bfloat16, torch.float32)
+    channels = 1 if image.ndim < 4 else image.shape[-3]
+    first, second = (
+        value[..., rim : value.shape[-2] - rim, rim : value.shape[-1] - rim]
+        .to(torch.float32 if is_single else torch.float64)
+        .reshape(-1, channels, *(size - 2 * rim for size in image.shape[-2:]))
+        for value in pair
+    )
+    return first, second, image.shape[: -3 if image.ndim >= 4 else -2]
 
 
 @checks_arguments
@@ -74,9 +69,9 @@ def psnr(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
         tensor([20.0000, 20.0000], dtype=torch.float64)
     """
     data_range = check_number("data_range", data_range, above=0.0)
-    first, second = _compared(image, reference, rim)
+    first, second, shape = _compared(image, reference, rim)
     error = (first - second).flatten(1).to(torch.float64).square().mean(1)
-    return _per_image(10.0 * torch.log10(data_range**2 / error), image)
+    return (10.0 * torch.log10(data_range**2 / error)).reshape(shape)
 
 
 @checks_arguments
@@ -107,7 +102,7 @@ def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
         tensor(1., dtype=torch.float64)
     """
     data_range = check_number("data_range", data_range, above=0.0)
-    first, second = _compared(image, reference, rim)
+    first, second, shape = _compared(image, reference, rim)
     window = 11  # px, of a Gaussian of 1.5 px cut at 3.5 standard deviations, as in scikit-image
     if min(first.shape[-2:]) < window:
         raise ValueError(
@@ -116,7 +111,8 @@ def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
     # the separable filters are several times faster along the channel axis than along the batch axis
     folded = [value.flatten(0, 1)[None] for value in (first, second)]
     similarity = kornia_ssim(folded[0], folded[1], window, max_val=data_range, eps=0.0, padding="valid")
-    return _per_image(similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64), image)
+    means: Tensor = similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64)
+    return means.reshape(shape)
 
 
 @checks_arguments

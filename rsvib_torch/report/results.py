@@ -155,10 +155,9 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         "time_s": curve.times,
     }
     axes = ("x_px", "y_px", "roll_rad", "zoom")[: result.vibration.num_axes]
-    columns |= {f"offset_{name}": curve.offsets[..., axis] for axis, name in enumerate(axes)}
-    columns |= {f"fitted_{name}": result.fitted[..., axis] for axis, name in enumerate(axes)}
-    residual = curve.offsets - result.fitted
-    columns |= {f"residual_{name}": residual[..., axis] for axis, name in enumerate(axes)}
+    curves = {"offset": curve.offsets, "fitted": result.fitted, "residual": curve.offsets - result.fitted}
+    for kind, values_of_axes in curves.items():
+        columns |= {f"{kind}_{name}": values_of_axes[..., axis] for axis, name in enumerate(axes)}
     columns["quality"] = curve.quality
     if curve.std is not None:
         columns |= {f"std_{name}": curve.std[..., axis] for axis, name in enumerate(axes)}

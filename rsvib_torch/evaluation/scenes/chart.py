@@ -8,6 +8,7 @@ from torch import Tensor
 
 from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.evaluation.scenes.drawing import (
+    FLOAT,
     Canvas,
     bars,
     disc,
@@ -55,13 +56,13 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
     generator = torch.Generator(device="cpu").manual_seed(seed)
     grain = fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
     texture = fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
-    canvas = Canvas(torch.full((height, width), _PAPER, dtype=torch.float32, device="cpu"), sigma)
+    canvas = Canvas(torch.full((height, width), _PAPER, **FLOAT), sigma)
 
     rim = max(10.0, 0.014 * min(height, width))
     rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * field) - 0.5) + 1) for size in (height, width))
     pitch = ((width - 4 * rim) / columns, (height - 4 * rim) / rows)
     size = min(pitch)
-    relief = torch.full((2, height, width), 0.02, dtype=torch.float32, device="cpu")  # amplitude of grain and texture
+    relief = torch.full((2, height, width), 0.02, **FLOAT)  # amplitude of grain and texture
     relief[1] = 0.012
     for i in range(rows):
         for j in range(columns):
@@ -84,12 +85,12 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
 def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, steps: tuple[int, int]) -> None:
     """Draw the field at a position (down, right) from the middle one."""
     down, right = steps
-    if down == 0 and right == 0:
+    ring = max(abs(down), abs(right))
+    if ring == 0:
         _draw_star(canvas, centre, 0.42 * size, 72)
         return
-    if 0 in (down, right) and max(abs(down), abs(right)) <= 2:
+    if 0 in (down, right) and ring <= 2:
         return  # the wedges
-    ring = max(abs(down), abs(right))
     if abs(down) == abs(right):
         dark = (ring + (down > 0) + (right > 0)) % 2 == 0
         turn = math.copysign(math.radians(5.0), down * right)

@@ -6,9 +6,15 @@ sums of such edges and exact; curved edges are nearly so.
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
+
+FLOAT: Any = {
+    "dtype": torch.float32,
+    "device": "cpu",
+}  # of all values; drawn scenes do not depend on defaults of PyTorch
 
 
 def edge(distance: Tensor, sigma: float) -> Tensor:
@@ -55,12 +61,16 @@ def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
 
 def smoothed(image: Tensor, sigma: float) -> Tensor:
     """Image blurred by a Gaussian, periodic at its borders (a product of Fourier transforms)."""
-    height, width = image.shape[-2:]
-    v = torch.fft.fftfreq(height, dtype=image.dtype, device=image.device)[:, None]
-    u = torch.fft.rfftfreq(width, dtype=image.dtype, device=image.device)
-    transfer = torch.exp(-2 * (math.pi * sigma) ** 2 * (v.square() + u.square()))
-    blurred: Tensor = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=(height, width))
+    squared = _squared_frequencies(*image.shape[-2:])
+    transfer = torch.exp(-2 * (math.pi * sigma) ** 2 * squared)
+    blurred: Tensor = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=image.shape[-2:])
     return blurred
+
+
+def _squared_frequencies(height: int, width: int) -> Tensor:
+    """Squares of the frequencies of ``rfft2``, in cycles/px."""
+    squared: Tensor = torch.fft.fftfreq(height, **FLOAT)[:, None].square() + torch.fft.rfftfreq(width, **FLOAT).square()
+    return squared
 
 
 def fractal_texture(
@@ -71,10 +81,8 @@ def fractal_texture(
     The exponent is 0 for white noise and 1 for natural scenes. The spectrum is flat beyond the wavelength ``longest``
     in px, and the optics blur by ``sigma`` px.
     """
-    white = torch.randn(height, width, generator=generator, dtype=torch.float32, device="cpu")
-    v = torch.fft.fftfreq(height, dtype=torch.float32, device="cpu")[:, None]
-    u = torch.fft.rfftfreq(width, dtype=torch.float32, device="cpu")
-    squared = v.square() + u.square()
+    white = torch.randn(height, width, generator=generator, **FLOAT)
+    squared = _squared_frequencies(height, width)
     shape = (squared + longest**-2) ** (-0.5 * exponent) * torch.exp(-2 * (math.pi * sigma) ** 2 * squared)
     shape[0, 0] = 0.0
     texture: Tensor = torch.fft.irfft2(torch.fft.rfft2(white) * shape, s=(height, width))
@@ -109,14 +117,11 @@ class Canvas:
         The window has the half size ``reach`` (x, y) in px around the centre (column, row). ``coverage`` is a function
         of the coordinates x (1, w) and y (h, 1) in px from the centre.
         """
+        halves = reach if isinstance(reach, tuple) else (reach, reach)
         places = []
-        for middle, half, size in zip(
-            centre, reach if isinstance(reach, tuple) else (reach, reach), reversed(self.image.shape), strict=True
-        ):
+        for middle, half, size in zip(centre, halves, reversed(self.image.shape), strict=True):
             pad = half + 5 * self.sigma
-            places.append(
-                torch.arange(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size), device="cpu")
-            )
-        columns, rows = places
-        window = self.image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            places.append(slice(max(math.floor(middle - pad), 0), min(math.ceil(middle + pad) + 1, size)))
+        window = self.image[places[1], places[0]]
+        columns, rows = (torch.arange(place.start, place.stop, device="cpu") for place in places)
         window += coverage(columns[None] - centre[0], rows[:, None] - centre[1]) * (tone - window)

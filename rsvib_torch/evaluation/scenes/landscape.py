@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.evaluation.scenes.drawing import edge, fractal_texture, rectangle, rotated, smoothed
+from rsvib_torch.evaluation.scenes.drawing import FLOAT, edge, fractal_texture, rectangle, rotated, smoothed
 
 _FIELDS, _TOWN, _WORKS, _WOOD = range(4)
 # points of the ground per px along each axis, against aliasing; rms difference from 8 points: 1.0 % of full scale with
@@ -76,7 +76,7 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
     generator = torch.Generator(device="cpu").manual_seed(seed)
     districts = _lay_out_districts(height, width, generator)
     lines = _lay_out_lines(height, width, generator)
-    table = torch.rand(4096, 4, generator=generator, dtype=torch.float32, device="cpu")  # for parcels
+    table = torch.rand(4096, 4, generator=generator, **FLOAT)  # for parcels
     relief = fractal_texture(height, width, generator, exponent=1.3, longest=500.0, sigma=sigma)
     detail = fractal_texture(height, width, generator, exponent=2.0, longest=7.0, sigma=sigma)
 
@@ -91,33 +91,19 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
     return _draw_buildings(image, buildings, sigma).clamp(0.0, 1.0)
 
 
-def _points(begin: int, end: int) -> Tensor:
-    """Sample positions within the pixels ``begin ... end - 1``."""
-    return (
-        torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING, dtype=torch.float32, device="cpu") + 0.5
-    ) / _OVERSAMPLING - 0.5
-
-
 def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _Districts:
     pitch = min(400.0, 0.5 * min(height, width))  # px, mean size of a district
     rows, columns = (math.ceil(size / pitch) + 2 for size in (height, width))
 
     def uniform(*size: int) -> Tensor:
-        return torch.rand(*size, generator=generator, dtype=torch.float32, device="cpu")
+        return torch.rand(*size, generator=generator, **FLOAT)
 
-    grid = torch.stack(
-        torch.meshgrid(
-            *(torch.arange(count, dtype=torch.float32, device="cpu") for count in (columns, rows)), indexing="xy"
-        ),
-        dim=-1,
-    )
-    place = (grid - 1 + 0.15 + 0.7 * uniform(rows, columns, 2)) * pitch
+    grid = torch.meshgrid(torch.arange(columns, **FLOAT), torch.arange(rows, **FLOAT), indexing="xy")
+    place = (torch.stack(grid, -1) - 1 + 0.15 + 0.7 * uniform(rows, columns, 2)) * pitch
     # about equal parts of fields and town, and a quarter of works and woods, mixed at any image size
-    draw = torch.remainder(
-        torch.arange(rows * columns, dtype=torch.float32, device="cpu") * 0.618034 + uniform(1), 1.0
-    ).view(rows, columns)
-    kind = torch.bucketize(draw, torch.tensor([0.37, 0.75, 0.87], dtype=torch.float32, device="cpu"))
-    sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]], dtype=torch.float32, device="cpu")
+    draw = torch.remainder(torch.arange(rows * columns, **FLOAT) * 0.618034 + uniform(1), 1.0)
+    kind = torch.bucketize(draw.view(rows, columns), torch.tensor([0.37, 0.75, 0.87], **FLOAT))
+    sizes = torch.tensor([[110.0, 70.0], [104.0, 64.0], [150.0, 110.0], [1e4, 1e4]], **FLOAT)
     parcel = sizes[kind] * (0.85 + 0.4 * uniform(rows, columns, 2))
     return _Districts(place, math.pi * uniform(rows, columns), kind, parcel, pitch)
 
@@ -126,20 +112,14 @@ def _lay_out_lines(height: int, width: int, generator: torch.Generator) -> list[
     """Main roads, and a river as the last line."""
     count = 4
     angle = (
-        math.pi
-        * (
-            torch.arange(count, device="cpu")
-            + 0.8 * torch.rand(count, generator=generator, dtype=torch.float32, device="cpu")
-        )
-        / count
+        math.pi * (torch.arange(count, device="cpu") + 0.8 * torch.rand(count, generator=generator, **FLOAT)) / count
     )
-    through = torch.tensor([width, height], device="cpu") * (
-        0.2 + 0.6 * torch.rand(count, 2, generator=generator, dtype=torch.float32, device="cpu")
-    )
+    share = 0.2 + 0.6 * torch.rand(count, 2, generator=generator, **FLOAT)
+    through = torch.tensor([width, height], device="cpu") * share
     level = through[:, 0] * angle.cos() + through[:, 1] * angle.sin()
     size = float(max(height, width))
-    random = torch.rand(3, count, generator=generator, dtype=torch.float32, device="cpu")
-    half_width = torch.tensor([6.0, 5.0, 5.0, 15.0], dtype=torch.float32, device="cpu")
+    random = torch.rand(3, count, generator=generator, **FLOAT)
+    half_width = torch.tensor([6.0, 5.0, 5.0, 15.0], **FLOAT)
     swing = size * (0.02 + 0.02 * random[0])
     lines = torch.stack([angle, level, swing, size * (0.5 + 0.4 * random[1]), 2 * math.pi * random[2], half_width], 1)
     return [_Line(*line) for line in lines.tolist()]
@@ -180,9 +160,12 @@ def _borders(strip: tuple[int, int], width: int, districts: _Districts) -> tuple
 
     The two nearest districts are those of the pixel; which of the two is nearer is computed for each point.
     """
-    rows, columns = (torch.arange(*limits, dtype=torch.float32, device="cpu") for limits in (strip, (0, width)))
+    rows, columns = (torch.arange(*limits, **FLOAT) for limits in (strip, (0, width)))
     pair = _two_nearest_districts(columns[None], rows[:, None], districts)
-    y, x = (_points(*limits) for limits in (strip, (0, width)))
+    y, x = (
+        (torch.arange(begin * _OVERSAMPLING, end * _OVERSAMPLING, **FLOAT) + 0.5) / _OVERSAMPLING - 0.5
+        for begin, end in (strip, (0, width))
+    )
     x, y = x[None], y[:, None]
     first, second = (index.repeat_interleave(_OVERSAMPLING, 0).repeat_interleave(_OVERSAMPLING, 1) for index in pair)
     border = _border_distance(x, y, first, second, districts)
@@ -215,7 +198,7 @@ def _lay_out_ground(
     yard = torch.where(edge_of_lot < 5.5, 0.5, 0.4 + 0.12 * draw[0])
     tone = torch.where(kind == _FIELDS, field, torch.where(kind == _TOWN, block, yard))
     tone = torch.where(kind == _WOOD, 0.25, tone)
-    wildness = torch.tensor([0.08, 0.45, 0.05, 1.0], dtype=torch.float32, device="cpu")[kind]
+    wildness = torch.tensor([0.08, 0.45, 0.05, 1.0], **FLOAT)[kind]
     wildness = torch.where((kind == _TOWN) & (edge_of_lot < 4.5), 0.0, wildness)
 
     *roads, river = lines
@@ -247,11 +230,9 @@ def _plan_buildings(
         rad, tone of the roof, length of the shadow, all lengths in px, and 1 where the two sides of the roof differ
         in tone, 0 where it is flat.
     """
-    plans = [torch.zeros(0, 8, dtype=torch.float32, device="cpu")]
-    for index, kind in enumerate(districts.kind.view(-1).tolist()):
-        if kind != _WOOD:
-            plans.append(_plan_district(index, kind, districts, lines, generator))
-    plan = torch.cat(plans)
+    kinds = enumerate(districts.kind.view(-1).tolist())
+    plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]
+    plan = torch.cat([torch.zeros(0, 8, **FLOAT), *plans])
     inside = (plan[:, :2] > -40).all(-1) & (plan[:, 0] < width + 40) & (plan[:, 1] < height + 40)
     return plan[inside]
 
@@ -262,26 +243,17 @@ def _plan_district(
     parcel = districts.parcel.view(-1, 2)[index]
     place, angle = districts.place.view(-1, 2)[index], float(districts.angle.view(-1)[index])
     street, share = {_FIELDS: (12.0, 0.12), _TOWN: (7.5, 0.93), _WORKS: (10.0, 0.85)}[kind]
-    wanted = {
-        _FIELDS: parcel,
-        _TOWN: torch.tensor([23.0, 27.0], dtype=torch.float32, device="cpu"),
-        _WORKS: torch.tensor([62.0, 44.0], dtype=torch.float32, device="cpu"),
-    }[kind]
-    per_lot = ((parcel - 2 * street) / wanted).round().clamp(min=1.0)
+    wanted = {_FIELDS: parcel.tolist(), _TOWN: [23.0, 27.0], _WORKS: [62.0, 44.0]}[kind]
+    per_lot = ((parcel - 2 * street) / torch.tensor(wanted, **FLOAT)).round().clamp(min=1.0)
     lot = (parcel - 2 * street) / per_lot
     reach = (1.5 * districts.pitch / parcel).ceil()
-    steps = [
-        (
-            torch.arange(-int(n), int(n), device="cpu")[:, None] * size
-            + street
-            + (torch.arange(int(count), dtype=torch.float32, device="cpu") + 0.5) * step
-        ).flatten()
-        for n, size, count, step in zip(reach, parcel, per_lot, lot, strict=True)
-    ]
+    steps = []
+    for n, size, count, step in zip(reach, parcel, per_lot, lot, strict=True):
+        parcels, lots = torch.arange(-int(n), int(n), device="cpu"), torch.arange(int(count), **FLOAT)
+        steps.append((parcels[:, None] * size + street + (lots + 0.5) * step).flatten())
     u, v = (t.flatten() for t in torch.meshgrid(*steps, indexing="xy"))
-    count = len(u)
-    random = torch.rand(count, 8, generator=generator, dtype=torch.float32, device="cpu")
-    largest = torch.minimum(0.5 * lot - 2.0, torch.tensor([24.0, 18.0], dtype=torch.float32, device="cpu"))
+    random = torch.rand(len(u), 8, generator=generator, **FLOAT)
+    largest = torch.minimum(0.5 * lot - 2.0, torch.tensor([24.0, 18.0], **FLOAT))
     half = largest * (0.62 + 0.38 * random[:, :2])
     slack = 0.5 * lot - 1.5 - half
     u = u + slack[:, 0] * (2 * random[:, 2] - 1)
@@ -297,19 +269,20 @@ def _plan_district(
     tone = 0.3 + 0.5 * random[:, 5]
     tone = torch.where(random[:, 6] < 0.12, 0.82, tone)
     rise = (3.0 + 5.0 * random[:, 7]) * (1.0 if kind == _TOWN else 1.3)
-    gabled = torch.full((count,), float(kind != _WORKS), dtype=torch.float32, device="cpu")
+    gabled = torch.full_like(tone, float(kind != _WORKS))
     return torch.cat([centre, half, torch.stack([torch.full_like(tone, angle), tone, rise, gabled], 1)], 1)[keep]
 
 
-def _draw_buildings(image: Tensor, plan: Tensor, sigma: float, chunk: int = 256) -> Tensor:
-    """Draw shadows, then roofs, over the ground (H, W), ``chunk`` buildings at a time."""
+def _draw_buildings(image: Tensor, plan: Tensor, sigma: float) -> Tensor:
+    """Draw shadows, then roofs, over the ground (H, W)."""
+    chunk = 256  # buildings at a time
     height, width = image.shape
     room = torch.linalg.vector_norm(plan[:, 2:4], dim=-1) + plan[:, 6] + 5 * sigma
     room, order = room.sort()
     plan = plan[order]
     pad = int(room.max()) + 64 if len(room) else 0
     # logarithm of the light, tone and coverage of the roofs
-    layers = torch.zeros(3, height + 2 * pad, width + 2 * pad, dtype=torch.float32, device="cpu")
+    layers = torch.zeros(3, height + 2 * pad, width + 2 * pad, **FLOAT)
     for begin in range(0, len(room), chunk):
         part = plan[begin : begin + chunk]
         reach = math.ceil(float(room[begin : begin + chunk].max()))
@@ -332,7 +305,7 @@ def _draw_windows(x: Tensor, y: Tensor, plan: Tensor, sigma: float) -> Tensor:
     """Light, tone and coverage (3, N, h, w) of each building in its own window."""
     half_u, half_v, angle, tone, rise, gabled = plan[:, 2:, None, None].unbind(1)
     sun = math.radians(215.0)  # direction in which shadows fall
-    shadow = torch.zeros((), dtype=torch.float32, device="cpu")
+    shadow = torch.zeros((), **FLOAT)
     for share in (0.25, 0.5, 0.75, 1.0):  # copies of the outline
         u, v = rotated(x - share * rise * math.cos(sun), y - share * rise * math.sin(sun), angle)
         shadow = torch.maximum(shadow, rectangle(u, v, half_u, half_v, sigma))

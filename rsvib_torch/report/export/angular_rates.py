@@ -91,15 +91,13 @@ def write_gcsv(
         raise ValueError("motion has zoom, which angular rates do not contain; write_stmap exports it")
     starts = timing.frame_starts(num_frames)
     first, last = float(starts[0]), float(starts[-1]) + rows * timing.row_time + timing.exposure_time
+    rate = _LOWEST_RATE
     if sample_rate is not None:
         rate = check_number("sample_rate", sample_rate, at_least=1.0, at_most=1e9)
-        index, counts, _ = _sampled(motion, first, last, rate)
-    else:
-        rate = _LOWEST_RATE
+    index, counts, error = _sampled(motion, first, last, rate)
+    while sample_rate is None and error > _LARGEST_ERROR:
+        rate *= 2
         index, counts, error = _sampled(motion, first, last, rate)
-        while error > _LARGEST_ERROR:
-            rate *= 2
-            index, counts, error = _sampled(motion, first, last, rate)
     header = {
         "version": "1.3",
         "id": "rsvib_torch",

@@ -23,7 +23,6 @@ from rsvib_torch.report.html.template import (
     BeforeAfter,
     Blink,
     Drawing,
-    GreyLevels,
     before_after,
     blink,
     drawing,
@@ -150,22 +149,15 @@ def _edge_row(edge: Edge, restored: bool) -> list[str]:
     return [_region(*edge.box), edge.direction, f"{edge.after.angle:.1f}°", before, *([after] if restored else [])]
 
 
-def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> list[Drawing]:
-    drawings = []
+def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> dict[str, Drawing]:
+    """Figures of the edges of each direction, by the name of their file."""
+    drawings = {}
     for direction in ("horizontal", "vertical"):
         chosen = [edge for edge in edges if edge.direction == direction]
         if chosen:
             before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
-            points = {names[-1]: chosen[0].points}
-            drawings.append(
-                drawing(
-                    plots.mtf_figure(dict(zip(names, (before, after), strict=False)), points=points),
-                    f"mtf_{direction}",
-                    f"{direction.capitalize()} sharpness",
-                    "Thin lines: single edges; bold lines: their mean. The displacement of rows does not count as "
-                    "blur, because the measurement follows the edge.",
-                )
-            )
+            curves = dict(zip(names, (before, after), strict=False))
+            drawings[f"mtf_{direction}"] = drawing(plots.mtf_figure(curves, points={names[-1]: chosen[0].points}))
     return drawings
 
 
@@ -187,14 +179,6 @@ def _details(before: Tensor, after: Tensor, names: tuple[str, ...]) -> list[Befo
     return pairs
 
 
-def _grey_scale(levels: GreyLevels) -> str:
-    low, high = PERCENTILES
-    return (
-        f"Grey levels are stretched: black is {levels[0]:.3f} and white {levels[1]:.3f} of full scale, the "
-        f"percentiles {low:g} and {high:g}"
-    )
-
-
 def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: tuple[str, ...]) -> BeforeAfter:
     """One frame of the input, and the restored one beside it if there is one, with a part at full resolution."""
     grey = _grey(frames[-1]).float()
@@ -210,8 +194,12 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
     if pair.full is not None:
         part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
         parts.append(f"The magnifier shows {part}")
-    alike = " of both images" if len(frames) > 1 else ""
-    return replace(pair, caption=f"{'. '.join([*parts, _grey_scale(pair.levels)])}{alike}.")
+    (black, white), (low, high) = pair.levels, PERCENTILES
+    parts.append(
+        f"Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} "
+        f"and {high:g}{' of both images' if len(frames) > 1 else ''}."
+    )
+    return replace(pair, caption=". ".join(parts))
 
 
 def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
@@ -257,21 +245,11 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
 
 
 def _windows(manifest: StackManifest) -> dict[str, Any]:
-    """Tones of all windows of a stack: lines, table and figure."""
+    """Lines and table of the tones of all windows of a stack."""
     vibration, restoration = manifest.lines()
     head, rows = manifest.tone_table()
-    starts = [record.start_time for record in manifest.windows]
-    return {
-        "lines": [*vibration[1:], *(restoration if manifest.output is not None else [])],
-        "head": head,
-        "rows": rows,
-        "figure": drawing(
-            plots.windows_figure(starts, manifest.detections()),
-            "windows",
-            "Amplitude and frequency over the windows",
-            "Error bars of two standard deviations. Hollow points are not reliable.",
-        ),
-    }
+    lines = [*vibration[1:], *(restoration if manifest.output is not None else [])]
+    return {"lines": lines, "head": head, "rows": rows}
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
@@ -295,53 +273,21 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     num_rows = report.frames.shape[int(timing.scan_axis)]
     removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
     centre = removed.translation()
-    where = " at the centre of the frame" if removed.num_axes > 2 else ""
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
     before = report.frames[index]
     last = min(index, len(report.restored) - 1)
     after = report.restored[last] if report.was_restored else None
     detail = finer[last] if report.was_restored else before
-    offsets = [
-        drawing(
-            plots.axis_offset_figure(result, axis),
-            f"offsets_{name}",
-            f"Offsets along {name}" if axis < 2 else f"Offsets of {name}",
-            "Top: measured offset of the rows, and the offset curve of the detected vibration. Bottom: residual, "
-            f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]} on average.",
-        )
-        for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes])
-    ]
-    tone_figures = [
-        drawing(
-            plots.gain_figure(result, timing),
-            "offset_gain",
-            "Offset gain of a pair of frames",
-            "Top: offset gain, offset in px per px of displacement. Dashed: blind frequencies, at which all frames are "
-            "displaced alike or the exposure averages the vibration to zero. Bottom: detected tones, with error bars "
-            "of two standard deviations.",
-        )
-    ]
+    axes = AXIS_NAMES[: result.vibration.num_axes]
+    figures = {f"offsets_{name}": drawing(plots.axis_offset_figure(result, axis)) for axis, name in enumerate(axes)}
+    figures["offset_gain"] = drawing(plots.gain_figure(result, timing))
     if bool(centre.moving_axes().any()):
-        tone_figures += [
-            drawing(
-                plots.rows_figure(centre, timing, num_rows),
-                "rows",
-                f"Displacement and motion blur{where}",
-                "Top: mean displacement of each row of frame 0. Bottom: range of the displacement during the exposure "
-                "of the row.",
-            ),
-            drawing(
-                plots.psf_figure(centre, timing, num_rows),
-                "psf",
-                f"Point spread functions{where}",
-                "Kernels of rows of frame 0 from first to last, one square per px, each centred on the mean "
-                "displacement of its row. Line: path of the image during the exposure.",
-            ),
-        ]
+        figures["rows"] = drawing(plots.rows_figure(centre, timing, num_rows))
+        figures["psf"] = drawing(plots.psf_figure(centre, timing, num_rows))
     shown = (before,) if after is None else (before, after)
     names = ("input", "restored")[: len(shown)]
     measured, notes = measure_edges(_grey(before), _grey(detail), edges)
-    mtf_figures = _mtf_drawings(measured, names)
+    figures |= _mtf_drawings(measured, names)
     restored = report.was_restored
     sentences = words.verdict_sentences(
         result,
@@ -355,34 +301,35 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     if not restored and report.windows is not None and report.windows.totals()["restored"]:
         sentences[0] = words.WINDOWS_RESTORED
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
-    windows = None if report.windows is None else _windows(report.windows)
+    if report.windows is not None:
+        starts = [record.start_time for record in report.windows.windows]
+        figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
+        "report": report,
         "title": report.title,
-        "subtitle": report.subtitle,
         "mark": words.mark_of(result, report.verdict, restored),
         "verdict": sentences if restored else sentences[:1],
         "tried": tried,
-        "next_steps": report.next_steps,
         "frames_title": "Input and restored frame" if restored else "Input frame",
         "overview": whole_frame(report, index, shown, names),
         "blink": frames_in_turn(report, index, removed),
         "details": [] if after is None else _details(before, detail, names),
-        "offsets": offsets,
-        "tones_head": words.detected_tones_head(result),
+        "figures": figures,
+        "residuals": [
+            (name, f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]}") for axis, name in enumerate(axes)
+        ],
         "tones": words.detected_tones(result),
-        "tone_figures": tone_figures,
-        "windows": windows,
+        "at_centre": " at the centre of the frame" if removed.num_axes > 2 else "",
+        "windows": None if report.windows is None else _windows(report.windows),
         "mtf_head": mtf_head,
         "mtf_rows": [_edge_row(edge, restored) for edge in measured],
         "mtf_notes": notes,
-        "mtf_figures": mtf_figures,
         "camera": words.camera_rows(timing, report.frames.shape),
         "about": words.about_rows(report.created, report.version, report.command, report.options if restored else {}),
         "terms": words.TERMS,
     }
     write_page(folder / "report.html", "report.html", content)
-    figures = [*offsets, *tone_figures, *mtf_figures, *([windows["figure"]] if windows else [])]
-    for figure in figures:
-        (folder / f"{figure.name}.png").write_bytes(figure.png)
-    return ["report.html", *(f"{figure.name}.png" for figure in figures)]
+    for name, figure in figures.items():
+        (folder / f"{name}.png").write_bytes(figure.png)
+    return ["report.html", *(f"{name}.png" for name in figures)]

@@ -31,9 +31,6 @@ _FULL_PIXELS = 2048 * 2048  # a larger frame is reduced, and its part of this si
 class Drawing:
     """A figure of a page."""
 
-    name: str  # file name of the image without its ending
-    title: str  # heading
-    caption: str  # description
     png: bytes  # the image
     width: int  # largest width on the page in px
 
@@ -77,11 +74,11 @@ def data_uri(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def drawing(figure: Figure, name: str, title: str, caption: str) -> Drawing:
+def drawing(figure: Figure) -> Drawing:
     """Render a figure as PNG."""
     file = io.BytesIO()
     FigureCanvasAgg(figure).print_figure(file, dpi=140, facecolor="white", format="png")
-    return Drawing(name, title, caption, file.getvalue(), round(100 * figure.get_figwidth()))
+    return Drawing(file.getvalue(), round(100 * figure.get_figwidth()))
 
 
 def _pixels(image: Tensor, longest: int | None = None) -> Any:
@@ -174,13 +171,10 @@ def _explained(text: str, terms: Mapping[str, str]) -> Markup:
     )
 
 
-def write_page(
-    path: str | os.PathLike[str], template: str, content: dict[str, Any], *folders: str | os.PathLike[str]
-) -> None:
-    """Write a page from a template of the package or of further folders; text is escaped."""
-    loaders = [jinja2.PackageLoader("rsvib_torch.report.html"), *(jinja2.FileSystemLoader(f) for f in folders)]
+def write_page(path: str | os.PathLike[str], template: str, content: dict[str, Any]) -> None:
+    """Write a page from a template of the package; text is escaped."""
     environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader(loaders),
+        loader=jinja2.PackageLoader("rsvib_torch.report.html"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -185,18 +185,15 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def detected_tones_head(result: DetectionResult) -> tuple[str, ...]:
-    """Heads of the columns of the table of tones."""
-    return ("axis", *tone_head(_QUANTITIES, result.vibration.num_axes), "offset gain", "verdict")
-
-
-def detected_tones(result: DetectionResult) -> list[list[str]]:
-    """Lines of the table of tones, in the order of ``detected_tones_head``."""
-    return [
+def detected_tones(result: DetectionResult) -> tuple[tuple[str, ...], list[list[str]]]:
+    """Heads of the columns, and lines, of the table of tones."""
+    head = ("axis", *tone_head(_QUANTITIES, result.vibration.num_axes), "offset gain", "verdict")
+    lines = [
         [*cells, f"{float(result.gain[at]):+.2f}", "reliable" if bool(result.reliable[at[0]]) else "not reliable"]
         for at, cells in tone_rows(result.vibration, result.std, _QUANTITIES, result.std_if_hidden_tone)
         if float(result.vibration.amplitude[at]) > 0
     ]
+    return head, lines
 
 
 def camera_rows(timing: SensorTiming, shape: Sequence[int]) -> list[list[str]]:
