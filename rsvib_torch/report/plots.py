@@ -52,6 +52,8 @@ _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
 _AXIS_COLOURS = {"x": "#14487a", "y": "#c8102e"}
 _FIT_COLOUR = _AXIS_COLOURS["y"]
 _LEGEND_ABOVE: dict[str, Any] = {"fontsize": 9, "frameon": False, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+_TITLE: dict[str, Any] = {"loc": "left", "fontsize": 9.5, "color": _INK}
+_HEADING: dict[str, Any] = {"loc": "left", "fontsize": 12, "fontweight": "bold", "color": _INK}
 _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
 
@@ -114,14 +116,9 @@ def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", headin
     panel.tick_params(colors=_INK, labelsize=9)
     panel.grid(color=_GRID, linewidth=0.6)
     panel.set_axisbelow(True)
-    if x:
-        panel.set_xlabel(x, color=_INK)
-    if y:
-        panel.set_ylabel(y, color=_INK)
-    if title:
-        panel.set_title(title, loc="left", fontsize=9.5, color=_INK)
-    if heading:
-        panel.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=_INK)
+    panel.set_xlabel(x, color=_INK)
+    panel.set_ylabel(y, color=_INK)
+    panel.set_title(heading or title, **(_HEADING if heading else _TITLE))
 
 
 def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Any]:
@@ -245,7 +242,7 @@ def offset_figure(result: DetectionResult) -> Figure:
     figure, panels = _offset_panels(result, range(axes), 6.5 * axes, 6.4)
     for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
         heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
-        upper.set_title(heading, loc="left", fontsize=12, fontweight="bold", color=_INK, pad=36)
+        upper.set_title(heading, **_HEADING, pad=36)
         text = ",  ".join(tones_text(result, axis))
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
@@ -364,7 +361,7 @@ def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
         for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
         if not bool(good)
     ]
-    panel.set_title("\n".join(lines), loc="left", fontsize=9.5, color=_INK)
+    panel.set_title("\n".join(lines), **_TITLE)
 
 
 def _swept_figure(result: SweptTone) -> Figure:
@@ -388,12 +385,11 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
     figure, (panels,) = _panels(10, 3.4, 1, 3)
     pairs = np.arange(len(verdict.outcome))
     for axis in range(2):
-        for values, style, label in (
-            (verdict.misfit_before, "o-", "frames as taken"),
-            (verdict.misfit_after, "s-", "after restoration"),
-            (verdict.resolution, ":", "smallest visible"),
+        for values, style, colour, label in (
+            (verdict.misfit_before, "o-", _AXIS_COLOURS["x"], "frames as taken"),
+            (verdict.misfit_after, "s-", _AXIS_COLOURS["y"], "after restoration"),
+            (verdict.resolution, ":", _GREY, "smallest visible"),
         ):
-            colour = _GREY if style == ":" else _AXIS_COLOURS["y" if style == "s-" else "x"]
             panels[axis].plot(pairs, values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
         panels[axis].set_ylim(bottom=0)
     panels[0].legend(fontsize=9, frameon=False)
@@ -445,10 +441,8 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         reliable = bool(result.reliable[axis])
         style: dict[str, Any] = {"color": _AXIS_COLOURS[name], "marker": "o", "markersize": 6, "linestyle": "none"}
         style |= {} if reliable else {"markerfacecolor": "white"}
-        for tone in range(vibration.amplitude.shape[-1]):
+        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist():
             at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
-            if amplitude <= 0:
-                continue
             tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
             labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
             errors = [2 * float(values[axis, tone]) for values in (std.amplitude, std.frequency)]
@@ -648,7 +642,7 @@ def comparison_figure(
             panel.locator_params(nbins=4)
             if index == 0:
                 panel.set_ylabel("row (px)", color=_INK)
-                panel.set_title(name, loc="left", fontsize=12, fontweight="bold", color=_INK)
+                panel.set_title(name, **_HEADING)
         panels[1, index].set_xlabel("column (px)", color=_INK)
     return figure
 
@@ -661,18 +655,13 @@ def picture(frame: Tensor) -> Tensor:
     return frame.movedim(0, -1)
 
 
-def _curve_figure(curve: MtfCurve) -> Figure:
-    return mtf_figure({f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]})
-
-
 def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
     figure, ((panel,),) = _panels(5.6, 3.9)
     frequency = result.frequency.cpu().numpy()
     for name, values, limit in zip("xy", result.mtf.cpu().numpy(), result.resolution.tolist(), strict=True):
         label = f"{name}: 0.5 at {limit:.2f} cycles/px"
         panel.plot(frequency, values, color=_AXIS_COLOURS[name], linewidth=2.0, label=label)
-    legend = f"noise gain {result.noise_gain:.2f}"
-    _finish_mtf(panel, float(frequency[-1]), "MTF of the restoration", legend)
+    _finish_mtf(panel, float(frequency[-1]), "MTF of the restoration", f"noise gain {result.noise_gain:.2f}")
     return figure
 
 
@@ -727,9 +716,7 @@ def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
                 panel.set_ylim(bottom, 5 * max(float(np.nanmax(values)), 10 * bottom))
             quantity = "amplitude" if panel is panels[0, axis] else "PSD"
             plain_axes(panel, "" if quantity == "amplitude" else "frequency (Hz)", f"{quantity} ({unit_of_panel})")
-        panels[0, axis].set_title(
-            f"Displacement along {name}" if axis < 2 else name.capitalize(), loc="left", fontweight="bold"
-        )
+        panels[0, axis].set_title(f"Displacement along {name}" if axis < 2 else name.capitalize(), **_HEADING)
         labelled: list[float] = []
         label_width = 0.09 * math.log(frequency[-1] / frequency[0])  # 9 % of the panel
         lines = result.lines.amplitude[axis].tolist(), result.lines.frequency[axis].tolist()
@@ -794,8 +781,8 @@ def _rotation_figure(result: RotationAlignment) -> Figure:
         panel.plot(times, measured, "o", color=_AXIS_COLOURS["x"], markersize=3.5, label="frames")
         panel.plot(times, measured - predicted, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
         panel.legend(**_LEGEND_ABOVE, ncols=3)
-        plain_axes(panel, "" if axis < 2 else "time (s)", f"{name} ({unit})")
-    panels[0, 0].set_title("Between consecutive frames", loc="left", fontsize=12, fontweight="bold", color=_INK)
+        heading = "Between consecutive frames" if axis == 0 else ""
+        plain_axes(panel, "" if axis < 2 else "time (s)", f"{name} ({unit})", heading=heading)
     return figure
 
 
@@ -813,7 +800,9 @@ FIGURES.update(
         (AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
-        (MtfCurve, 0): _curve_figure,
+        (MtfCurve, 0): lambda curve: mtf_figure(
+            {f"MTF50 {measured_text(curve.mtf50, curve.mtf50_std)} cycles/px": [curve]}
+        ),
         (RestorationMtf, 0): _restoration_mtf_figure,
         (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): verdict_figure,
