@@ -3,10 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.calibration.flicker import Array, BandFit, Profiles, find_bands, row_profiles
@@ -17,8 +18,10 @@ from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text, wrapped
+from rsvib_torch.core.validation import Positive
 from rsvib_torch.io.stack_reading import FramesOrFiles
 
+Gamma = Annotated[float, Field(gt=0, le=4)]
 ScanAxis = Literal[-2, -1, "y", "x"]
 
 
@@ -113,13 +116,13 @@ class RowTimeCalibration(
 @checks_arguments
 def calibrate_row_time(
     frames: FramesOrFiles,
-    flicker_frequency: float,
+    flicker_frequency: Positive,
     *,
-    frame_rate: float | None = None,
-    on_fraction: float | None = None,
-    light_contrast: float | None = None,
+    frame_rate: Positive | None = None,
+    on_fraction: Annotated[float, Field(gt=0, le=0.999)] | None = None,
+    light_contrast: Annotated[float, Field(gt=0, le=2)] | None = None,
     scan_axis: ScanAxis = -2,
-    gamma: float = 1.0,
+    gamma: Gamma = 1.0,
     full_scale: float | None = None,
     channels: Channels = None,
 ) -> RowTimeCalibration:
@@ -161,18 +164,12 @@ def calibrate_row_time(
         >>> round(1e6 * found.row_time, 3)
         15.625
     """
-    frequency = check_number("flicker_frequency", flicker_frequency, above=0.0)
-    if frame_rate is not None:
-        frame_rate = check_number("frame_rate", frame_rate, above=0.0)
-        if frequency < 1.5 * frame_rate:
-            raise ValueError(
-                f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
-                "1.5 periods fit into one; use a faster flicker"
-            )
-    if on_fraction is not None:
-        check_number("on_fraction", on_fraction, above=0.0, at_most=0.999)
-    if light_contrast is not None:
-        check_number("light_contrast", light_contrast, above=0.0, at_most=2.0)
+    frequency = float(flicker_frequency)
+    if frame_rate is not None and frequency < 1.5 * frame_rate:
+        raise ValueError(
+            f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
+            "1.5 periods fit into one; use a faster flicker"
+        )
     if on_fraction is not None and light_contrast is not None:
         raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")
     profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
@@ -207,10 +204,10 @@ def calibrate_row_time(
 @checks_arguments
 def calibrate_row_time_by_exposure(
     frames: FramesOrFiles,
-    exposure_times: Sequence[float],
+    exposure_times: Sequence[Annotated[float, Field(gt=0, le=10)]],
     *,
     scan_axis: ScanAxis = -2,
-    gamma: float = 1.0,
+    gamma: Gamma = 1.0,
     full_scale: float | None = None,
     channels: Channels = None,
 ) -> RowTimeCalibration:
@@ -235,7 +232,7 @@ def calibrate_row_time_by_exposure(
         TypeError: If an argument is not a number.
         ValueError: If there are no bands, exposures do not fit the frames or are all the same.
     """
-    exposures = [check_number("exposure_times", value, above=0.0, at_most=10.0) for value in exposure_times]
+    exposures = [float(exposure) for exposure in exposure_times]
     profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
     if len(exposures) != len(profiles.rows):
         raise ValueError(f"{len(exposures)} exposure times do not fit {len(profiles.rows)} frames; one a frame")

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from rsvib_torch.core.arrays import Channels, channel_axis
-from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.frames.prepare import as_float_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 
@@ -37,8 +36,6 @@ def row_profiles(
     frames: FramesOrFiles, scan_axis: int | str, full_scale: float | None, gamma: float, channels: Channels
 ) -> Profiles:
     """Mean brightness of the rows of a stack (T, H, W) or (T, C, H, W)."""
-    check_choice("scan_axis", scan_axis, (-2, "y", -1, "x"))
-    check_number("gamma", gamma, above=0.0, at_most=4.0)
     loaded = load_frames(frames, full_scale)
     images = as_float_frames(loaded.frames, loaded.full_scale, channels=channels).detach()
     if images.ndim == 5:

@@ -7,16 +7,18 @@ the frames is that of the middle column; derivatives by roll and zoom depend on 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch.core.arguments import check_images, checks_arguments
 from rsvib_torch.core.banded_solver import solve_banded
-from rsvib_torch.core.checks import check_choice, check_number
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
+from rsvib_torch.core.validation import Positive
 from rsvib_torch.frames.orientation import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing, simulate_frames
 from rsvib_torch.motion.field import ColumnMotion, displacement_factors
@@ -27,6 +29,7 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 _DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
 _RIDGE = 1e-10  # of the largest element, for scene rows outside all frames; 1e-9, 1e-11: bounds change by 0.8 %
+_CHUNK = 1 << 17  # rows of frames times frequencies, that are computed at once
 # Derivative of an image of the scene by a component of the motion, less its sign: terms (field, derivative along x or y
 # or none, factor) with the fields s, y s and x s of the scene s, e.g. for roll -y ds/dx + x ds/dy.
 _DERIVATIVES = (
@@ -86,14 +89,14 @@ def scale_of_information(recording: Recording) -> Tensor:
     return recording.sensitivity(recording.starts).square().sum((1, 2)) * moved * slope * recording.size[1]
 
 
-def projected_information(recording: Recording, *, margin: int = _MARGIN, chunk: int = 1 << 17) -> Tensor:
+def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Tensor:
     """Information of the parameters when the scene is unknown, for unit noise.
 
     ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and the
     part of D that a scene could explain contains no information. The displacement along a row is a phase ramp, so that
     A is a banded matrix for each frequency along the row and the projection needs no iterations.
     The scene is periodic along rows, ``margin`` px beyond its ends, without detail above 0.4 cycles/row; only pixels
-    count whose content is visible in another frame. ``chunk`` rows of frames times frequencies are computed at once.
+    count whose content is visible in another frame.
 
     Returns:
         Matrix (P, P).
@@ -110,11 +113,9 @@ def projected_information(recording: Recording, *, margin: int = _MARGIN, chunk:
     coefficients = bspline_coefficients(fields, _DEGREE, -2)
     spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))  # (F, Hs, U)
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=spectra.device)
-    step = max(1, chunk // place.first.numel())
-    residuals = []
-    for begin in range(0, len(u), step):
-        part = slice(begin, begin + step)
-        residuals.append(_unexplained(place, spectra[..., part], u[part]))
+    step = max(1, _CHUNK // place.first.numel())
+    parts = zip(spectra.split(step, -1), u.split(step), strict=True)
+    residuals = [_unexplained(place, *part) for part in parts]
     columns = slice(recording.origin[1], recording.origin[1] + recording.size[1])
     images = torch.fft.irfft(torch.cat(residuals, dim=-1), n=length)[..., columns]  # (P, T, R, W)
     images = (images * _shown_twice(recording)).flatten(1)
@@ -173,15 +174,11 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
         images[number, "y"] = (place.slopes.to(seen.dtype) @ seen) * ramps
         images[number, ""] = value
     by_component = [
-        sum((-factor * images[field, of] for field, of, factor in terms), start=torch.zeros((), device=u.device))
+        torch.stack([-factor * images[field, of] for field, of, factor in terms]).sum(0)
         for terms in _DERIVATIVES[: max(place.axes) + 1]
     ]
-    derivatives = torch.stack(
-        [
-            (sensitivity[..., None] * by_component[axis]).sum(-2)
-            for axis, sensitivity in zip(place.axes, place.sensitivity, strict=True)
-        ]
-    )
+    by_parameter = zip(place.axes, place.sensitivity, strict=True)
+    derivatives = torch.stack([(slope[..., None] * by_component[axis]).sum(-2) for axis, slope in by_parameter])
     kernels = place.taps.to(ramps.dtype).transpose(-2, -1) @ ramps  # (T, R, J, U)
     base = (place.first - place.first.amin()).flatten()
     count = int(base.amax()) + reach
@@ -195,11 +192,9 @@ def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
             band[:, d].index_add_(0, base + i, kernels[:, i + d].conj() * kernels[:, i])
     band[:, 0] += _RIDGE * band[:, 0].real.amax()
     solution = solve_banded(band, right)
-    explained = sum(
-        (kernels[:, i, None] * solution[base + i] for i in range(reach)),
-        start=torch.zeros((), dtype=rows.dtype, device="cpu"),
-    )
-    residual: Tensor = (rows - explained).transpose(0, 1).unflatten(1, place.first.shape)
+    for i in range(reach):
+        rows = rows - kernels[:, i, None] * solution[base + i]
+    residual: Tensor = rows.transpose(0, 1).unflatten(1, place.first.shape)
     return residual
 
 
@@ -338,13 +333,14 @@ def _deviations(information: Tensor, typical: Tensor) -> Tensor:
     return deviations
 
 
+@checks_arguments
 def cramer_rao_bound(
     scene: Tensor,
     timing: SensorTiming,
     vibration: Vibration,
-    num_frames: int = 2,
+    num_frames: Annotated[int, Field(ge=2)] = 2,
     *,
-    noise: float,
+    noise: Positive,
     frame_size: tuple[int, int] | None = None,
     method: BoundMethod = "projection",
     acceleration: bool = False,
@@ -387,14 +383,7 @@ def cramer_rao_bound(
         >>> bool((bound.amplitude < 0.05).all())
         True
     """
-    check_choice("method", method, ("projection", "gradients", "random"))
-    noise = check_number("noise", noise, above=0.0)
-    if not isinstance(scene, Tensor) or not scene.dtype.is_floating_point:
-        raise TypeError("scene must be a floating-point tensor whose full scale is 1")
-    if scene.ndim != 2:
-        raise ValueError(f"scene must have shape (H, W), got {tuple(scene.shape)}")
-    if num_frames < 2:
-        raise ValueError(f"num_frames must be at least 2, got {num_frames}")
+    check_images({"scene": scene}, {"scene": "H W"})
     if vibration.camera is not None:
         raise ValueError("the bound is not defined with a camera: pass the vibration without camera=")
     # the simulation checks the sizes and the motion

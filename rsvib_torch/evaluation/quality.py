@@ -1,14 +1,17 @@
 """Quality of restored images and of measured offset curves."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from kornia.metrics import ssim as kornia_ssim
+from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.core.arguments import check_broadcast, checks_arguments
 from rsvib_torch.core.arrays import FramesLike, as_tensor
-from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.validation import Positive
+
+_Rim = Annotated[int, Field(ge=0)]
 
 
 def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tensor, Tensor, torch.Size]:
@@ -26,7 +29,6 @@ def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tenso
     )
     if reference.shape[-2:] != image.shape[-2:]:
         raise ValueError(misfit)
-    rim = check_whole_number("rim", rim, at_least=0)
     if min(image.shape[-2:]) <= 2 * rim:
         raise ValueError(f"rim={rim} is too large for an image of {image.shape[-2]} x {image.shape[-1]} px")
     try:
@@ -45,7 +47,7 @@ def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tenso
 
 
 @checks_arguments
-def psnr(image: FramesLike, reference: FramesLike, data_range: float, *, rim: int = 0) -> Tensor:
+def psnr(image: FramesLike, reference: FramesLike, data_range: Positive, *, rim: _Rim = 0) -> Tensor:
     """Peak signal-to-noise ratio of each image.
 
     ``10 log10(data_range^2 / mean (image - reference)^2)`` in dB, the mean over the pixels and channels of one image;
@@ -68,14 +70,13 @@ def psnr(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
         >>> psnr(torch.full((2, 8, 8), 0.6), torch.full((8, 8), 0.5), 1.0)
         tensor([20.0000, 20.0000], dtype=torch.float64)
     """
-    data_range = check_number("data_range", data_range, above=0.0)
     first, second, shape = _compared(image, reference, rim)
     error = (first - second).flatten(1).to(torch.float64).square().mean(1)
     return (10.0 * torch.log10(data_range**2 / error)).reshape(shape)
 
 
 @checks_arguments
-def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: int = 0) -> Tensor:
+def ssim(image: FramesLike, reference: FramesLike, data_range: Positive, *, rim: _Rim = 0) -> Tensor:
     """Structural similarity of each image (Wang et al. 2004).
 
     Equal to scikit-image's with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``: Gaussian window of
@@ -101,7 +102,6 @@ def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
         >>> ssim(scene, scene, 1.0)
         tensor(1., dtype=torch.float64)
     """
-    data_range = check_number("data_range", data_range, above=0.0)
     first, second, shape = _compared(image, reference, rim)
     window = 11  # px, of a Gaussian of 1.5 px cut at 3.5 standard deviations, as in scikit-image
     if min(first.shape[-2:]) < window:
@@ -110,7 +110,7 @@ def ssim(image: FramesLike, reference: FramesLike, data_range: float, *, rim: in
         )
     # the separable filters are several times faster along the channel axis than along the batch axis
     folded = [value.flatten(0, 1)[None] for value in (first, second)]
-    similarity = kornia_ssim(folded[0], folded[1], window, max_val=data_range, eps=0.0, padding="valid")
+    similarity = kornia_ssim(folded[0], folded[1], window, max_val=float(data_range), eps=0.0, padding="valid")
     means: Tensor = similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64)
     return means.reshape(shape)
 
@@ -142,11 +142,8 @@ def offset_endpoint_error(
     for name, value in (("measured", measured), ("truth", truth)):
         if value.ndim < 2 or value.shape[-1] != 2:
             raise ValueError(f"{name} must have shape (..., N, 2), got {tuple(value.shape)}")
-    try:
-        difference = measured.to(torch.float64) - truth.to(torch.float64)
-    except RuntimeError as error:
-        raise ValueError(f"truth of shape {tuple(truth.shape)} does not fit {tuple(measured.shape)}") from error
-    distance: Tensor = torch.linalg.vector_norm(difference, dim=-1)
+    check_broadcast(measured=measured, truth=truth)
+    distance: Tensor = torch.linalg.vector_norm(measured.double() - truth.double(), dim=-1)
     if reduction == "none":
         return distance
     return distance.nanmean(-1) if reduction == "mean" else distance.square().nanmean(-1).sqrt()

@@ -62,9 +62,14 @@ class _Drawing(Figure):
     """A figure that notebooks show without pyplot."""
 
     def _repr_png_(self) -> bytes:
-        picture = io.BytesIO()
-        FigureCanvasAgg(self).print_figure(picture, dpi=90, facecolor="white")
-        return picture.getvalue()
+        return figure_png(self, dpi=90)
+
+
+def figure_png(figure: Figure, dpi: int) -> bytes:
+    """A figure as PNG image."""
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(picture, dpi=dpi, facecolor="white", format="png")
+    return picture.getvalue()
 
 
 def _check_one(result: Result) -> None:

@@ -28,7 +28,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
 from rsvib_torch.report.html.page import frames_in_turn, measure_edges, whole_frame
-from rsvib_torch.report.html.words import TERMS, about_rows, mark_of, verdict_sentences
+from rsvib_torch.report.html.words import TERMS, about_rows, overall_result, verdict_sentences
 from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
 from rsvib_torch.restoration import RestorationVerdict
 
@@ -247,7 +247,7 @@ def test_edges_are_measured_in_both_frames():
 def test_sentences_match_the_verdict(reliable, verdict, restored, mood, first):
     reasons = tuple(() if good else ("only a third of a period is seen",) for good in reliable)
     result = result_of(reliable=reliable, reasons=reasons)
-    assert mark_of(result, verdict, restored) == mood
+    assert overall_result(result, verdict, restored)[0] == mood
     words = verdict_sentences(result, SHAKE, TIMING, 256, restored=restored, left_alone=(), verdict=verdict)
     assert first in words[0]
     for name, good in zip("xy", reliable, strict=True):

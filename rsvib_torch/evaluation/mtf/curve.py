@@ -12,7 +12,7 @@ from rsvib_torch.core.arrays import ArrayLike
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text
-from rsvib_torch.evaluation.mtf.edge import as_real, check_edge, check_roi, fit_edge, start_edge, straighten
+from rsvib_torch.evaluation.mtf.edge import as_real, check_edge, check_roi, fit_edge, straighten
 from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
 
 
@@ -150,10 +150,9 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
     limits = (0.0, 1.0)
     if not grey.dtype.is_floating_point:
         limits = (float(torch.iinfo(grey.dtype).min), float(torch.iinfo(grey.dtype).max))
-    scatter, columns, near_vertical, mirrored = straighten(values)
-    fit = fit_edge(scatter, start_edge(scatter, columns))
-    room = check_edge(fit, scatter, columns, limits)
-    spread = fit_spread(fit, scatter, room)
+    scatter = straighten(values)
+    fit = fit_edge(scatter)
+    spread = fit_spread(fit, scatter, room=check_edge(fit, scatter, limits))
 
     frequency = torch.linspace(0, 1, 101, dtype=torch.float64, device=grey.device)
     mtf = spread.mtf(frequency)
@@ -166,15 +165,14 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
     step = 1e-4  # cycles/px, for the slope of the curve
     beside = spread.mtf(torch.stack([mtf50 - step, mtf50 + step]))
     mtf50_std = spread.std(mtf50[None])[0] * 2 * step / (beside[1] - beside[0]).abs()
-    turn = math.degrees(math.atan(float(spread.fit.slope(scatter))))
     return MtfCurve(
         frequency=frequency,
         mtf=mtf,
         std=spread.std(frequency),
         mtf50=mtf50,
         mtf50_std=mtf50_std,
-        angle=turn if mirrored == near_vertical else -turn,
-        near_vertical=near_vertical,
+        angle=spread.fit.angle(scatter),
+        near_vertical=scatter.near_vertical,
         position=spread.position,
         esf=spread.esf,
         lsf=spread.lsf,

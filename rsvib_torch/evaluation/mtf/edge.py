@@ -53,6 +53,9 @@ class Scatter:
     x: Tensor  # columns from the middle of the ROI, px
     y: Tensor  # rows from the middle of the ROI, px
     half: tuple[float, float]  # half width and half height of the ROI in px
+    columns: int  # of the turned ROI
+    near_vertical: bool  # whether the edge was near-vertical before the ROI was turned
+    mirrored: bool  # whether the ROI was mirrored
 
     def basis(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Legendre polynomials (..., 4) along the edge, and their slopes per px."""
@@ -84,6 +87,11 @@ class EdgeFit:
         """Columns per row in the middle of the edge."""
         return (scatter.basis(scatter.y.new_zeros(()))[1] * self.line).sum()
 
+    def angle(self, scatter: Scatter) -> float:
+        """Degrees between the edge and the nearest image axis in the middle of the edge, positive clockwise."""
+        turn = math.degrees(math.atan(float(self.slope(scatter))))
+        return turn if scatter.mirrored == scatter.near_vertical else -turn
+
     def distance(self, scatter: Scatter) -> tuple[Tensor, Tensor]:
         """Distance of every pixel along the normal, and its derivatives (N, 4) by the line."""
         values, slopes = scatter.basis(scatter.y)
@@ -100,12 +108,8 @@ class EdgeFit:
         return regressors @ self.sides.T, regressors
 
 
-def straighten(roi: Tensor) -> tuple[Scatter, int, bool, bool]:
-    """Turn a ROI so that its edge is near-vertical and brightens to the right.
-
-    Also returned are the columns of the turned ROI, whether the edge was near-vertical, and whether the ROI was
-    mirrored.
-    """
+def straighten(roi: Tensor) -> Scatter:
+    """Turn a ROI so that its edge is near-vertical and brightens to the right."""
     soft = torch.nn.functional.avg_pool2d(roi[None, None], 5, stride=1)[0, 0]
     across, down = soft.diff(dim=1).square().mean(), soft.diff(dim=0).square().mean()
     near_vertical = bool(across >= down)
@@ -118,11 +122,12 @@ def straighten(roi: Tensor) -> tuple[Scatter, int, bool, bool]:
     half = (0.5 * (width - 1), 0.5 * (height - 1))
     x, y = (torch.arange(n, dtype=roi.dtype, device=roi.device) - 0.5 * (n - 1) for n in (width, height))
     x, y = x.expand(height, width), y[:, None].expand(height, width)
-    return Scatter(roi.flatten(), x.flatten(), y.flatten(), half), width, near_vertical, mirrored
+    return Scatter(roi.flatten(), x.flatten(), y.flatten(), half, width, near_vertical, mirrored)
 
 
-def start_edge(scatter: Scatter, columns: int) -> EdgeFit:
+def _start_edge(scatter: Scatter) -> EdgeFit:
     """Start of the fit, from the sum of every row: robust to noise."""
+    columns = scatter.columns
     image = scatter.value.view(-1, columns)
     few = max(2, columns // 12)
     low, high = image[:, :few].mean(), image[:, -few:].mean()
@@ -159,8 +164,9 @@ def moved(fit: EdgeFit, step: Tensor) -> EdgeFit:
     return EdgeFit(fit.line + step[:4], sigma, fit.sides + step[5:].view(2, 3))
 
 
-def fit_edge(scatter: Scatter, fit: EdgeFit) -> EdgeFit:
+def fit_edge(scatter: Scatter, start: EdgeFit | None = None) -> EdgeFit:
     """Least-squares fit of edge, Gaussian blur and sides to all pixels (Levenberg-Marquardt)."""
+    fit = start or _start_edge(scatter)
     damping = 1e-3
     model, jacobian, _ = linearised(fit, scatter)
     residual = scatter.value - model
@@ -212,7 +218,7 @@ def check_roi(roi: Tensor) -> Tensor:
     return values
 
 
-def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float, float]) -> float:
+def check_edge(fit: EdgeFit, scatter: Scatter, limits: tuple[float, float] = (-math.inf, math.inf)) -> float:
     """Raise if the ROI does not contain one measurable slanted edge, of values within ``limits``.
 
     The result is the smallest distance in px between the edge and a border of the turned ROI beside it.
@@ -230,13 +236,13 @@ def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float
     if not 2.0 <= angle <= 40.0:
         problem = "not slanted enough" if angle < 2.0 else "too close to 45 degrees"
         raise ValueError(f"the edge is {problem}: {angle:.2f} degrees from the nearest image axis, expected 2 ... 40")
-    rows = len(scatter.value) // columns
+    rows = len(scatter.value) // scatter.columns
     if slope * rows < 1:
         raise ValueError(
             f"the edge crosses {slope * rows:.2f} px over {rows} px of length, expected at least 1: "
             "use a longer roi or a larger angle"
         )
-    rays = distance.view(rows, columns)
+    rays = distance.view(rows, scatter.columns)
     room = float(torch.minimum(-rays[:, 0].max(), rays[:, -1].min()))
     wanted = max(4.0, 3.0 * float(fit.width))
     if room < wanted:
@@ -244,7 +250,7 @@ def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float
             f"the edge comes within {max(room, 0.0):.1f} px of the border of the roi, expected at least {wanted:.1f} px"
         )
     _check_clipping(fit, scatter, distance, limits)
-    patches, noise = uneven_patches(fit, scatter, columns)
+    patches, noise = uneven_patches(fit, scatter)
     worst, contrast = float(patches.max()), float(fit.contrast)
     if worst > 0.1 * contrast + 6 * noise:
         row, column = divmod(int(patches.argmax()), patches.shape[1])
@@ -255,13 +261,13 @@ def check_edge(fit: EdgeFit, scatter: Scatter, columns: int, limits: tuple[float
     return room
 
 
-def uneven_patches(fit: EdgeFit, scatter: Scatter, columns: int) -> tuple[Tensor, float]:
+def uneven_patches(fit: EdgeFit, scatter: Scatter) -> tuple[Tensor, float]:
     """Absolute mean residual of the sides in patches of 5 x 5 px, and its standard deviation from noise."""
     model, _, distance = linearised(fit, scatter)
     beside = distance.abs() > 4 * fit.width + 2
-    outside = torch.where(beside, scatter.value - model, 0.0).view(-1, columns)
+    outside = torch.where(beside, scatter.value - model, 0.0).view(-1, scatter.columns)
     patches = torch.nn.functional.avg_pool2d(outside[None, None], 5, stride=1)[0, 0].abs()
-    steps = (scatter.value - model).view(-1, columns).diff(dim=1).abs()
+    steps = (scatter.value - model).view(-1, scatter.columns).diff(dim=1).abs()
     # 0.954: median absolute difference of two standard normal numbers
     return patches, float(steps.median()) / 0.954 / 5
 
@@ -295,7 +301,7 @@ def _check_clipping(fit: EdgeFit, scatter: Scatter, distance: Tensor, limits: tu
 def _exceeds(fit: EdgeFit, scatter: Scatter, side: int, extremes: list[float]) -> bool:
     """Whether a fit to the pixels that are not extreme exceeds the extreme value of a side by 5 % of the contrast."""
     free = (scatter.value != extremes[0]) & (scatter.value != extremes[1])
-    inner = Scatter(scatter.value[free], scatter.x[free], scatter.y[free], scatter.half)
+    inner = replace(scatter, value=scatter.value[free], x=scatter.x[free], y=scatter.y[free])
     # starts with more blur, as clipping sharpens the edge
     wider = fit_edge(inner, replace(fit, sigma=fit.sigma + 0.5 * fit.width))
     level = float(wider.sides[side, 0])

@@ -2,16 +2,17 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, as_tensor
-from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.checks import check_whole_number
 from rsvib_torch.evaluation.mtf.edge import (
     EdgeFit,
     Scatter,
@@ -19,11 +20,12 @@ from rsvib_torch.evaluation.mtf.edge import (
     check_edge,
     fit_edge,
     linearised,
-    start_edge,
     straighten,
     uneven_patches,
 )
 
+_Length = Annotated[int, Field(ge=16)]
+_Contrast = Annotated[float, Field(gt=0, le=1)]
 _Side = Literal["left", "right", "top", "bottom"]
 
 
@@ -72,7 +74,7 @@ class SlantedEdge:
 
 @checks_arguments
 def find_slanted_edges(
-    image: ArrayLike, *, min_length: int = 32, max_length: int = 160, min_contrast: float = 0.1
+    image: ArrayLike, *, min_length: _Length = 32, max_length: _Length = 160, min_contrast: _Contrast = 0.1
 ) -> list[SlantedEdge]:
     """Find ROIs for ``slanted_edge_mtf``: straight edges, 2 ... 30 degrees off an axis, between even sides.
 
@@ -101,21 +103,18 @@ def find_slanted_edges(
     grey = as_real("image", image)
     if grey.ndim != 2 or not grey.numel() or not bool(torch.isfinite(grey).all()):
         raise ValueError(f"image must be one finite grey image (H, W), got shape {tuple(grey.shape)}")
-    min_length = check_whole_number("min_length", min_length, at_least=16)
-    max_length = check_whole_number("max_length", max_length, at_least=min_length)
-    check_number("min_contrast", min_contrast, above=0.0, at_most=1.0)
+    check_whole_number("max_length", max_length, at_least=min_length)
     values = grey.detach().to(torch.float64)
     low, high = (values.flatten().kthvalue(max(1, int(q * (values.numel() - 1)) + 1)).values for q in (0.01, 0.99))
     least = min_contrast * float(high - low)
     if least == 0.0:
         return []
-    edges = []
-    for near_vertical in (True, False):
-        turned = values if near_vertical else values.mT
-        for line, rows in _lines(turned, (float(low), float(high)), min_length, max_length):
-            edge = _roi_around(turned, line, rows, near_vertical, least)
-            if edge is not None:
-                edges.append(edge)
+    found = [
+        _roi_around(turned, line, rows, turned is values, least)
+        for turned in (values, values.mT)
+        for line, rows in _lines(turned, float(low), float(high), min_length, max_length)
+    ]
+    edges = [edge for edge in found if edge is not None]
     edges.sort(key=lambda edge: -edge.contrast * (edge.height if edge.near_vertical else edge.width))
     kept: list[SlantedEdge] = []
     for edge in edges:
@@ -125,14 +124,13 @@ def find_slanted_edges(
 
 
 def _lines(
-    values: Tensor, limits: tuple[float, float], min_length: int, max_length: int, ends: int = 5
+    values: Tensor, low: float, high: float, min_length: int, max_length: int
 ) -> list[tuple[tuple[float, float], range]]:
     """Near-vertical lines, ``column = a + b row``, along edges, with the rows that they span.
 
-    The detector (von Gioi et al. 2010) has the image in 8 bits between ``limits``. ``ends`` px are removed at either
-    end, because of corners.
+    The detector (von Gioi et al. 2010) has the image in 8 bits between ``low`` and ``high``.
     """
-    low, high = limits
+    ends = 5  # px that are removed at either end, because of corners
     counts = ((values - low) * (255 / (high - low))).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
     segments = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE).detect(np.ascontiguousarray(counts))[0]
     lines = []
@@ -160,18 +158,17 @@ def _roi_around(
         roi = values[rows.start : rows.stop, begin:end]
         if not _plain_sides(roi, (line[0] + line[1] * rows.start - begin, line[1]), least):
             continue
-        scatter, columns, upright, mirrored = straighten(roi)
-        if not upright:
+        height, width = roi.shape
+        box = (rows.start, begin, height, width) if near_vertical else (begin, rows.start, width, height)
+        scatter = straighten(roi if near_vertical else roi.T)
+        if scatter.near_vertical != near_vertical:
             continue
-        fit = fit_edge(scatter, start_edge(scatter, columns))
-        if not _alone(fit, scatter, columns, least):
+        fit = fit_edge(scatter)
+        if not _alone(fit, scatter, least):
             continue
-        angle = float(fit.slope(scatter).atan().rad2deg())
         sides: tuple[_Side, _Side] = ("right", "left") if near_vertical else ("bottom", "top")
-        length, width = roi.shape
-        box = (rows.start, begin, length, width) if near_vertical else (begin, rows.start, width, length)
-        turned = angle if mirrored == near_vertical else -angle
-        return SlantedEdge(*box, turned, near_vertical, sides[int(mirrored)], float(fit.contrast))
+        side = sides[int(scatter.mirrored)]
+        return SlantedEdge(*box, fit.angle(scatter), near_vertical, side, float(fit.contrast))
     return None
 
 
@@ -194,10 +191,10 @@ def _plain_sides(roi: Tensor, line: tuple[float, float], least: float) -> bool:
     return step > 0.8 * least and max(uneven) < 0.09 * step
 
 
-def _alone(fit: EdgeFit, scatter: Scatter, columns: int, least: float) -> bool:
+def _alone(fit: EdgeFit, scatter: Scatter, least: float) -> bool:
     """Whether the edge explains 98.5 % of the variance of its ROI, and the sides are even to 1 % of the contrast."""
     try:
-        check_edge(fit, scatter, columns, (-torch.inf, torch.inf))
+        check_edge(fit, scatter)
     except ValueError:
         return False
     model, _, _ = linearised(fit, scatter)
@@ -205,7 +202,7 @@ def _alone(fit: EdgeFit, scatter: Scatter, columns: int, least: float) -> bool:
     contrast = float(fit.contrast)
     explained = 1 - float(residual.var() / scatter.value.var())
     tilt = float(fit.sides[:, 1:].abs().max())
-    patches, noise = uneven_patches(fit, scatter, columns)
+    patches, noise = uneven_patches(fit, scatter)
     uneven = float(patches.square().mean().sqrt())
     return contrast >= least and explained >= 0.985 and tilt < 0.5 * contrast and uneven < 0.01 * contrast + 1.5 * noise
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.splines import bspline_weights
 from rsvib_torch.evaluation.mtf.edge import EdgeFit, Scatter, edge_spread, linearised, moved
 
 _EDGE = 11  # parameters of ``EdgeFit``; all coefficients of the departure follow them
@@ -77,11 +78,9 @@ class Knots:
         """The four splines that are not zero at each distance (N,): indices, values and derivatives per px, (N, 4)."""
         position = (self.stretch * torch.asinh(distance / self.stretch) - self.place[0]) / self.step
         cell = position.floor()
-        t = (position - cell)[:, None]
         index = cell.long()[:, None] + torch.arange(-1, 3, device=distance.device)
-        s = 1 - t
-        value = torch.cat([s**3, 4 - 6 * t**2 + 3 * t**3, 4 - 6 * s**2 + 3 * s**3, t**3], dim=1) / 6
-        slope = torch.cat([-(s**2), (3 * t - 4) * t, (4 - 3 * s) * s, t**2], dim=1) / 2
+        value, quadratic = (bspline_weights(position - cell, degree) for degree in (3, 2))
+        slope = torch.nn.functional.pad(quadratic, (1, 0)) - torch.nn.functional.pad(quadratic, (0, 1))
         density = torch.rsqrt(1 + (distance / self.stretch).square()) / self.step
         inside = (index >= 0) & (index < len(self.place))
         return index.clamp(0, len(self.place) - 1), value * inside, slope * inside * density[:, None]

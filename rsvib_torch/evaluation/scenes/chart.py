@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_number, check_whole_number
+from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.evaluation.scenes.drawing import (
     FLOAT,
+    Blur,
     Canvas,
+    Size,
     bars,
     disc,
     edge,
@@ -23,7 +27,10 @@ _INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture o
 _Centre = tuple[float, float]
 
 
-def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int = 0, field: float = 230.0) -> Tensor:
+@checks_arguments
+def resolution_chart(
+    height: Size, width: Size, *, sigma: Blur = 0.6, seed: int = 0, field: Annotated[float, Field(ge=32)] = 230.0
+) -> Tensor:
     """Draw a resolution chart: slanted edges, hyperbolic wedges, bar groups, stars, rings and grey fields.
 
     A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals,
@@ -49,10 +56,6 @@ def resolution_chart(height: int, width: int, *, sigma: float = 0.6, seed: int =
         >>> chart.shape, bool(chart.min() > 0)
         (torch.Size([256, 320]), True)
     """
-    height = check_whole_number("height", height, at_least=64)
-    width = check_whole_number("width", width, at_least=64)
-    sigma = check_number("sigma", sigma, at_least=0.4)
-    field = check_number("field", field, at_least=32.0)
     generator = torch.Generator(device="cpu").manual_seed(seed)
     grain = fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
     texture = fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)

@@ -6,11 +6,14 @@ sums of such edges and exact; curved edges are nearly so.
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
+Size = Annotated[int, Field(ge=64)]  # rows or columns of a scene
+Blur = Annotated[float, Field(ge=0.4)]  # px; a narrower blur cannot be sampled
 FLOAT: Any = {
     "dtype": torch.float32,
     "device": "cpu",

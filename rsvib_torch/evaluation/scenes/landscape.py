@@ -2,15 +2,17 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.evaluation.scenes.drawing import FLOAT, edge, fractal_texture, rectangle, rotated, smoothed
+from rsvib_torch.core.arguments import checks_arguments
+from rsvib_torch.evaluation.scenes.drawing import FLOAT, Blur, Size, edge, fractal_texture, rectangle, rotated, smoothed
 
+_Seed = Annotated[int, Field(ge=0)]
 _FIELDS, _TOWN, _WORKS, _WOOD = range(4)
 # points of the ground per px along each axis, against aliasing; rms difference from 8 points: 1.0 % of full scale with
 # 1 point, 0.4 % with 2, 0.1 % with 4 in four times the time
@@ -45,7 +47,8 @@ class _Line(NamedTuple):
     half_width: float
 
 
-def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -> Tensor:
+@checks_arguments
+def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6) -> Tensor:
     """Draw towns and fields from above, with Gaussian optics.
 
     Fractal ground in districts of different direction: fields with furrows and hedges, streets with rows of small
@@ -69,10 +72,6 @@ def city_and_fields(height: int, width: int, seed: int, *, sigma: float = 0.6) -
         >>> scene.shape, bool(scene.min() >= 0 and scene.max() <= 1)
         (torch.Size([128, 96]), True)
     """
-    height = check_whole_number("height", height, at_least=64)
-    width = check_whole_number("width", width, at_least=64)
-    seed = check_whole_number("seed", seed, at_least=0)
-    sigma = check_number("sigma", sigma, at_least=0.4)
     generator = torch.Generator(device="cpu").manual_seed(seed)
     districts = _lay_out_districts(height, width, generator)
     lines = _lay_out_lines(height, width, generator)

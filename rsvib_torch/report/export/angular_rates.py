@@ -9,15 +9,16 @@ measures
 """
 
 import os
+from typing import Annotated
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.validation import Count
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -40,7 +41,7 @@ def write_gcsv(
     size: Size,
     num_frames: Count,
     *,
-    sample_rate: float | None = None,
+    sample_rate: Annotated[float, Field(ge=1, le=1e9)] | None = None,
 ) -> None:
     """Write the angular rates of the camera as ``.gcsv``, the gyroscope log that Gyroflow reads.
 
@@ -91,9 +92,7 @@ def write_gcsv(
         raise ValueError("motion has zoom, which angular rates do not contain; write_stmap exports it")
     starts = timing.frame_starts(num_frames)
     first, last = float(starts[0]), float(starts[-1]) + rows * timing.row_time + timing.exposure_time
-    rate = _LOWEST_RATE
-    if sample_rate is not None:
-        rate = check_number("sample_rate", sample_rate, at_least=1.0, at_most=1e9)
+    rate = sample_rate or _LOWEST_RATE
     index, counts, error = _sampled(motion, first, last, rate)
     while sample_rate is None and error > _LARGEST_ERROR:
         rate *= 2

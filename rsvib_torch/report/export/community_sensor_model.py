@@ -21,11 +21,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from rsvib_torch.core.arguments import checks_arguments
@@ -138,7 +139,7 @@ def write_isd(
     timing: SensorTiming,
     isd: Mapping[str, Any] | str | os.PathLike[str],
     *,
-    frame: int = 0,
+    frame: Annotated[int, Field(ge=0)] = 0,
     model: IsdModel = "auto",
     tolerance: Positive = 0.005,
 ) -> Literal["frame", "line-scan"]:
@@ -190,7 +191,6 @@ def write_isd(
         >>> len(json.loads(Path(path).read_text())["instrument_pointing"]["quaternions"])  # 480 rows and 4 around them
         488
     """
-    check_whole_number("frame", frame, at_least=0)
     if timing.scan_axis != -2:
         raise ValueError(
             "scan_axis must be -2: the lines of these sensor models are image rows, one exposure time each; transpose "

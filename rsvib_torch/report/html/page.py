@@ -308,7 +308,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     content = {
         "report": report,
         "title": report.title,
-        "mark": words.mark_of(result, report.verdict, restored),
+        "mark": words.overall_result(result, report.verdict, restored)[0],
         "verdict": sentences if restored else sentences[:1],
         "tried": tried,
         "frames_title": "Input and restored frame" if restored else "Input frame",

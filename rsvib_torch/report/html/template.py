@@ -1,7 +1,6 @@
 """Self-contained HTML pages: images as data URIs, and templates that escape all text."""
 
 import base64
-import io
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -12,12 +11,11 @@ import cv2
 import jinja2
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.report.plots import picture
+from rsvib_torch.report.plots import figure_png, picture
 
 GreyLevels = tuple[float, float]  # values that are drawn black and white, full scale 1
 PERCENTILES = (0.2, 99.8)  # of the values of the images; few saturated or dead pixels do not reduce the contrast
@@ -76,9 +74,7 @@ def data_uri(content: bytes, kind: str) -> str:
 
 def drawing(figure: Figure) -> Drawing:
     """Render a figure as PNG."""
-    file = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(file, dpi=140, facecolor="white", format="png")
-    return Drawing(file.getvalue(), round(100 * figure.get_figwidth()))
+    return Drawing(figure_png(figure, dpi=140), round(100 * figure.get_figwidth()))
 
 
 def _pixels(image: Tensor, longest: int | None = None) -> Any:

@@ -55,28 +55,21 @@ WINDOWS_RESTORED = (
 )
 
 
-def mark_of(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> Mark:
-    """Overall result, which selects the colour of the verdict."""
+def overall_result(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> tuple[Mark, str]:
+    """Overall result, which selects the colour of the verdict, and its sentence."""
     if not restored and verdict is None:
-        return "doubt"  # no vibration to remove
-    if not bool(result.reliable.any()) or not restored or (verdict is not None and verdict.overall == "worse"):
-        return "bad"
-    certain = bool(result.reliable.all()) and verdict is not None and verdict.overall == "helps"
-    return "good" if certain else "doubt"
-
-
-def _first_sentence(mark: Mark, restored: bool, verdict: RestorationVerdict | None) -> str:
-    if mark == "good":
-        return "The vibration of the camera was measured and removed; restoration improves the frames."
-    if not restored and verdict is None:
-        return "No vibration was detected that can be removed; the frames are unchanged."
+        return "doubt", "No vibration was detected that can be removed; the frames are unchanged."
     if not restored:
-        return "Restoration does not improve the frames; they are unchanged."
-    if mark == "bad":
-        return "The detected vibration is not reliable; inspect the restored frames before you use them."
-    if verdict is None or verdict.overall == "unknown":
-        return "The vibration was measured; these frames are not sufficient to determine whether restoration helps."
-    return "The vibration was measured and removed in part."
+        return "bad", "Restoration does not improve the frames; they are unchanged."
+    outcome = "unknown" if verdict is None else verdict.overall
+    if not bool(result.reliable.any()) or outcome == "worse":
+        return "bad", "The detected vibration is not reliable; inspect the restored frames before you use them."
+    if outcome == "unknown":
+        what = "these frames are not sufficient to determine whether restoration helps"
+        return "doubt", f"The vibration was measured; {what}."
+    if bool(result.reliable.all()) and outcome == "helps":
+        return "good", "The vibration of the camera was measured and removed; restoration improves the frames."
+    return "doubt", "The vibration was measured and removed in part."
 
 
 def _axis_sentences(result: DetectionResult, axis: int) -> list[str]:
@@ -132,7 +125,7 @@ def verdict_sentences(
 
     ``removed`` is the part of the detected vibration that was removed; ``left_alone`` has a reason for each other axis.
     """
-    sentences = [_first_sentence(mark_of(result, verdict, restored), restored, verdict)]
+    sentences = [overall_result(result, verdict, restored)[1]]
     for axis in range(result.vibration.num_axes):
         sentences += _axis_sentences(result, axis)
     removed = removed.translation()  # at the centre of the frame
