@@ -197,10 +197,6 @@ def _draw_grey_steps(canvas: Canvas, relief: Tensor, centre: _Centre, size: floa
             Canvas(relief[1], sigma).paint(middle, half, 0.1, patch)
 
 
-def _draw_small_star(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
-    _draw_star(canvas, centre, 0.36 * size, 36 if ring % 2 else 24)
-
-
 def _draw_needles(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
     """A fan of slanted lines of different width, and a disc."""
     sigma = canvas.sigma
@@ -223,7 +219,7 @@ _FIELDS: tuple[Callable[[Canvas, Tensor, _Centre, float, int], None], ...] = (
     _draw_rings,
     _draw_bar_groups,
     _draw_needles,
-    _draw_small_star,
+    lambda canvas, relief, centre, size, ring: _draw_star(canvas, centre, 0.36 * size, 36 if ring % 2 else 24),
     _draw_grey_steps,
 )
 

@@ -26,15 +26,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.checks import check_number, check_whole_number
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.text import quoted
-from rsvib_torch.core.validation import Positive, read_json
+from rsvib_torch.core.validation import Count, Number, Positive, read_json, validated
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
@@ -49,6 +48,7 @@ _PADDING = 4  # rows before and behind the frame, so that 8 quaternions surround
 _FIXED_POINT_STEPS = 10  # the displacement changes by less than 5 % over a pixel: 1e-13 px
 
 Array = NDArray[np.float64]
+_Row = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 @checks_arguments
@@ -258,21 +258,20 @@ class _Camera:
 
     def __init__(self, isd: dict[str, Any], source: str) -> None:
         self.isd, self.source = isd, source
-        lines, samples = (self._number(f"image_{name}", whole=True) for name in ("lines", "samples"))
-        self.size = (int(lines), int(samples))
-        self.focal_length = self._number("focal_length_model", "focal_length")
-        matrix = np.array([self._numbers(f"focal2pixel_{name}", 3) for name in ("lines", "samples")])
+        self.size: tuple[int, int] = (self.value(Count, "image_lines"), self.value(Count, "image_samples"))
+        self.focal_length = self.value(Number, "focal_length_model", "focal_length")
+        matrix = np.array([self.value(_Row, f"focal2pixel_{name}") for name in ("lines", "samples")])
         self.offset, self.matrix = matrix[:, 0], matrix[:, 1:]
         if abs(np.linalg.det(self.matrix)) < 1e-12 * np.abs(self.matrix).max() ** 2 or not self.focal_length > 0:
             raise ValueError(
                 f"{source}: focal2pixel_lines and focal2pixel_samples must be independent, and focal_length positive"
             )
-        self.summing = np.array([self._number(f"detector_{n}_summing") for n in ("line", "sample")])
-        self.start = np.array([self._number(f"starting_detector_{n}") for n in ("line", "sample")])
-        self.centre = np.array([self._number("detector_center", n) for n in ("line", "sample")])
+        self.summing = np.array([self.value(Number, f"detector_{n}_summing") for n in ("line", "sample")])
+        self.start = np.array([self.value(Number, f"starting_detector_{n}") for n in ("line", "sample")])
+        self.centre = np.array([self.value(Number, "detector_center", n) for n in ("line", "sample")])
         if self.isd.get("name_model") == _LINE_SCAN:  # the line of the scanner lies anywhere in its focal plane
             self.start[0], self.centre[0] = 0.0, 0.5 * self.size[0] * self.summing[0]
-        lens = self._table("optical_distortion")
+        lens = self.value(Mapping[str, Any], "optical_distortion")
         self.lens, coefficients = next(iter(lens.items())) if len(lens) == 1 else ("", {})
         self.distortion = coefficients.get("coefficients") if isinstance(coefficients, dict) else None
 
@@ -282,7 +281,8 @@ class _Camera:
         scale = abs(np.linalg.det(self.matrix)) / abs(np.prod(self.summing))
         return float(self.focal_length * np.sqrt(scale))
 
-    def _value(self, names: tuple[str, ...]) -> Any:
+    def value(self, kind: Any, *names: str) -> Any:
+        """The value at a key, if it is of a kind."""
         value: Any = self.isd
         for name in names:
             if not isinstance(value, Mapping) or name not in value:
@@ -290,29 +290,11 @@ class _Camera:
                     f"{self.source}: {'.'.join(names)}: missing key of an ISD; camera_isd builds a complete one"
                 )
             value = value[name]
-        return value
-
-    def _table(self, *names: str) -> dict[str, Any]:
-        value = self._value(names)
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{self.source}: {'.'.join(names)}: expected a table, got {quoted(value)}")
-        return dict(value)
-
-    def _number(self, *names: str, whole: bool = False) -> float:
-        value = self._value(names)
-        if whole:
-            return check_whole_number(f"{self.source}: {'.'.join(names)}", value, at_least=1)
-        return check_number(f"{self.source}: {'.'.join(names)}", value)
-
-    def _numbers(self, name: str, count: int) -> list[float]:
-        value = self._value((name,))
-        if not isinstance(value, list) or len(value) != count:
-            raise ValueError(f"{self.source}: {name}: expected {count} numbers, got {quoted(value)}")
-        return [check_number(f"{self.source}: {name}", number) for number in value]
+        return validated(f"{self.source}: {'.'.join(names)}", value, TypeAdapter(kind, config={"strict": True}), kind)
 
     def state(self, name: str, values: str, count: int) -> Array:
         """The entry (count,) of a table of states nearest to the middle of the frame."""
-        table, centre = self._table(name), self._number("center_ephemeris_time")
+        table, centre = self.value(Mapping[str, Any], name), self.value(Number, "center_ephemeris_time")
         try:
             states = np.array(table[values], dtype=float).reshape(-1, count)
             times = np.array(table.get("ephemeris_times", [0.0]), dtype=float)
@@ -418,7 +400,7 @@ def _as_line_scan(
     pointing = (turned.inv() * still).as_quat(scalar_first=True)
     same_side = np.sign((pointing[1:] * pointing[:-1]).sum(1))
     pointing[1:] *= np.cumprod(same_side)[:, None]  # continuous: q and -q are the same rotation
-    centre = camera._number("center_ephemeris_time")
+    centre = camera.value(Number, "center_ephemeris_time")
     # whole multiples of the resolution of float64 at these times: equal distances for the interpolation
     resolution = np.spacing(max(abs(centre), 1e-3))
     duration = max(round(timing.row_time / resolution), 1) * resolution
