@@ -183,8 +183,9 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         fit = with_unknown_errors(fitted.measurements, fitted.fit)
     else:
         fit = with_errors_of_blocks(fitted.measurements, fitted.fit)
-        fit = without_aliasing(fitted.measurements, fit, fitted.refined.aliasing)
-        fit = with_unknown_amplitudes(fit, intervals, timing.exposure_time)
+        aliasing = fitted.refined.aliasing
+        fit = without_aliasing(fitted.measurements, fit, aliasing)
+        fit = with_unknown_amplitudes(fit, aliasing, intervals, timing.exposure_time)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(
         fitted.measurements, fit, row_starts, number_is_known=options.tones is not None

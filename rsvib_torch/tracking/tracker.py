@@ -326,9 +326,8 @@ class VibrationTracker:
         fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
         if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
             return state.without_track("the rows are far from where the motion places them")
-        fit = with_unknown_amplitudes(
-            fit, np.diff(starts), self._rows.exposure_time, aliasing=table(scene.gradients.aliasing)
-        )
+        aliasing = table(scene.gradients.aliasing)
+        fit = with_unknown_amplitudes(fit, aliasing, np.diff(starts), self._rows.exposure_time, known=0)
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
         trusted = np.array([not against for against in tones.findings])

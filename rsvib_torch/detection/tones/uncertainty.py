@@ -54,14 +54,16 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 # 1.07; its median error fell by a quarter and a tenth
 _MEAN_BIAS = (-0.7, 0.0, 0.0), (0.0, 0.0, 0.0)
 _BIAS_STD = (0.7, 0.7, 0.7), (0.5, 0.3, 0.3)
-# Errors of amplitudes A in px of a tracker over the expected size of b: at most 3 A, and 1.2 / (1 + 2 A). In 60 axes
-# with one tone in 12 frames behind optics of 0.4 px, the rms error over the standard deviation was 2.1 (largest 12)
-# without this term, and is 1.0 (3.7); in 57 others it is 1.0 (3.4)
-_TRACKED_ALIASING = 3.0, 1.2
+# Errors of amplitudes A in px of a tracker, and of roll and zoom, over the expected size of b: at most 3 A, and
+# 1.2 / (1 + 2 A). In 60 axes with one tone that was tracked for 12 frames behind optics of 0.4 px, the rms error over
+# the standard deviation was 2.1 (largest 12) without this term, and is 1.0 (3.7); in 57 others it is 1.0 (3.4). Of 24
+# tones of roll it was 1.6 and is 1.3
+_UNKNOWN_ALIASING = 3.0, 1.2
 # px^-2, relative, per square of the path within an exposure, of x, y, roll and zoom: with paths of 4 to 7 px, errors
-# were 2e-4 to 8e-4; of roll with paths of 1.5 and 2.8 px at half the width 2.2e-3 and 8e-3, 3.4 and 5.8 standard
+# were 2e-4 to 8e-4 in textures and cities and up to 6e-3 in charts (29 tones, rms 2.2 standard deviations with half of
+# the value); of roll with paths of 1.5 and 2.8 px at half the width 2.2e-3 and 8e-3, 3.4 and 5.8 standard
 # deviations with the value of x and y
-_UNKNOWN_BLUR = 1.5e-5, 1.5e-5, 1e-3, 1e-3
+_UNKNOWN_BLUR = 3e-5, 3e-5, 1e-3, 1e-3
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
 # intervals of 150 simulated recordings with random tones contain the truth, with 0.2 fewer
 _PRIOR_SIZE = 0.5
@@ -211,24 +213,24 @@ def _unit_bias(measurements: Measurements, fit: ToneFit) -> Array:
 
 
 def with_unknown_amplitudes(
-    fit: ToneFit, intervals: Array, exposure_time: float, aliasing: Array | None = None
+    fit: ToneFit, aliasing: Array, intervals: Array, exposure_time: float, *, known: int = 2
 ) -> ToneFit:
     """The fit with errors of its amplitudes that the models of unequal blur and of aliasing do not contain.
 
     Args:
         fit: With its covariance.
+        aliasing: (B,) px, expected size of the bias by aliasing.
         intervals: (M,) s, times between the frames that are compared; errors of offsets are amplified by a small gain.
         exposure_time: T_e in seconds.
-        aliasing: (B,) px, expected size of the bias by aliasing; None if ``without_aliasing`` accounts for it.
+        known: Number of axes for which ``without_aliasing`` accounts for aliasing.
     """
     size = fit.amplitude  # (B, A, K)
     path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
     gain = np.maximum(offset_gain(fit.frequencies, intervals), 1e-3)
     error = np.array(_UNKNOWN_BLUR)[: size.shape[1], None] * np.square(path) * 2.0 / gain  # relative
-    if aliasing is not None:
-        small, large = _TRACKED_ALIASING
-        by_aliasing = aliasing[:, None, None] * np.minimum(small, large / (size + 2 * np.square(size) + 1e-300))
-        error = np.hypot(error, by_aliasing)
+    small, large = _UNKNOWN_ALIASING
+    by_aliasing = aliasing[:, None, None] * np.minimum(small, large / (size + 2 * np.square(size) + 1e-300))
+    error[:, known:] = np.hypot(error, by_aliasing)[:, known:]
     unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
     unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
     covariance, (axes, parameters) = fit.covariance.copy(), unknown.shape[1:]
