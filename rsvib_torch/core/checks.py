@@ -33,6 +33,12 @@ def described(value: object) -> str:
     return type(value).__name__
 
 
+def check_single(name: str, value: Any) -> None:
+    """Raise a ``ValueError`` if a result or a motion is a batch."""
+    if value.batch_shape:
+        raise ValueError(f"{name} is a batch of shape {tuple(value.batch_shape)}: pass one of them, {name}[0]")
+
+
 def check_number(
     name: str,
     value: object,

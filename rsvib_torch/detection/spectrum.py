@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.fourier import fourier_sums
 from rsvib_torch.core.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
 from rsvib_torch.core.tables import Array, table, tensor, unit_wave
@@ -144,10 +145,7 @@ def displacement_spectrum(
     Raises:
         ValueError: If the curve is a batch, or fewer than 8 offsets were measured.
     """
-    if curve.batch_shape:
-        raise ValueError(
-            f"a batch of shape {tuple(curve.batch_shape)} has no spectrum: select one, result[0].spectrum()"
-        )
+    check_single("result", curve)
     good = curve.good & (curve.quality > 0)
     if curve.std is not None:
         good &= (torch.isfinite(curve.std) & (curve.std > 0)).all(-1)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import check_pixels, checks_arguments
 from rsvib_torch.core.arrays import ArrayLike, as_tensor, channels_appear_last
+from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.fourier import extend_rows, fast_length
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.splines import bspline_coefficients
@@ -95,8 +96,7 @@ def simulate_frames(
         raise TypeError(f"noise must be a SensorNoise, got {type(noise).__name__}")
     if num_frames < 1:
         raise ValueError(f"num_frames must be at least 1, got {num_frames}")
-    if vibration.batch_shape:
-        raise ValueError("simulate_frames takes one vibration, not a batch")
+    check_single("vibration", vibration)
     height, width = map(min, frame_size or scene.shape[-2:], scene.shape[-2:])
     row_bytes = 400 * min(height, _CHUNK_ROWS) + 12 * height  # per column: spectra of a chunk, frames; measured
     if scene.device.type == "cpu":

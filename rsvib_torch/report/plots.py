@@ -21,8 +21,9 @@ from torch.nn import functional
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.figures import FIGURES
-from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS, Result
+from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import Count
 from rsvib_torch.detection import (
@@ -70,12 +71,6 @@ def figure_png(figure: Figure, dpi: int) -> bytes:
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_figure(picture, dpi=dpi, facecolor="white", format="png")
     return picture.getvalue()
-
-
-def _check_one(result: Result) -> None:
-    """Raise a ``ValueError`` for a batch."""
-    if result.batch_shape:
-        raise ValueError(f"a batch of shape {tuple(result.batch_shape)} cannot be drawn: select one, result[0]")
 
 
 def tones_text(result: DetectionResult, axis: int) -> list[str]:
@@ -205,7 +200,7 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
 
 def _offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Any]:
     """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
-    _check_one(result)
+    check_single("result", result)
     sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
     figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
     points: Any = None
@@ -340,7 +335,7 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
         >>> figure.axes[0].get_xlabel()
         'time (ms)'
     """
-    _check_one(motion)
+    check_single("motion", motion)
     if isinstance(motion, FreeMotion):
         first, last = motion.start, motion.end if last is None else last
     if last is None:
@@ -431,7 +426,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         >>> rsv.gain_figure(detection, timing).axes[-1].get_xlabel()
         'frequency (Hz)'
     """
-    _check_one(result)
+    check_single("result", result)
     vibration, std = result.vibration, result.std
     highest = max(1.35 * float((vibration.frequency * (vibration.amplitude > 0)).max()), 4.2 / timing.frame_period)
     frequency = np.linspace(0.0, highest, 2000)
@@ -486,7 +481,7 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Fig
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['displacement (px)', 'motion blur (px)']
     """
-    _check_one(vibration)
+    check_single("vibration", vibration)
     vibration = vibration.detached()
     starts = timing.row_starts(1, num_rows)[0]
     figure, panels = _panels(5.6, 4.6, 2, sharex=True)
@@ -517,7 +512,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
         >>> len(figure.axes)  # rows and exposures
         24
     """
-    _check_one(vibration)
+    check_single("vibration", vibration)
     vibration = vibration.detached()
     down, across = 3, 8
     rows = torch.linspace(0, num_rows - 1, down * across, dtype=torch.float32, device="cpu").round()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file, write_json
+from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.presentation import Result, plain_values
 from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import read_json
@@ -45,7 +46,7 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
         [111.0, 90.0]
     """
-    _check_one(result)
+    check_single("result", result)
     timing = timing or result.timing
     if timing is None:
         raise ValueError("timing unknown: pass timing=SensorTiming(...) of the frames")
@@ -109,11 +110,6 @@ def _equal(first: Any, second: Any) -> bool:
     return np.allclose(first, second, rtol=1e-9, atol=0.0)
 
 
-def _check_one(result: DetectionResult) -> None:
-    if result.batch_shape:
-        raise ValueError(f"result is a batch of shape {tuple(result.batch_shape)}; write one: result[0]")
-
-
 @checks_arguments
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
     """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
@@ -145,7 +141,7 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
         >>> columns[6:]
         ['fitted_x_px', 'fitted_y_px', 'residual_x_px', 'residual_y_px', 'quality']
     """
-    _check_one(result)
+    check_single("result", result)
     curve = result.offsets
     count = curve.times.shape[-1]
     columns = {

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_whole_number, described
+from rsvib_torch.core.checks import check_single, check_whole_number, described
 from rsvib_torch.core.chunking import gathered, runs
 from rsvib_torch.core.fourier import extend_rows, extended_length, phase_tables, spline_spectra
 from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
@@ -132,10 +132,7 @@ class FixedDewarp(nn.Module):
         super().__init__()
         check_timing(timing)
         check_two_axes(vibration, "FixedDewarp")
-        if vibration.batch_shape:
-            raise ValueError(
-                f"vibration must be one motion, got a batch {tuple(vibration.batch_shape)}; pass vibration[0]"
-            )
+        check_single("vibration", vibration)
         check_whole_number("num_frames", num_frames, at_least=1)
         sides = [check_whole_number("size", side, at_least=1, at_most=MAX_ROWS) for side in size]
         height, width = sides if timing.scan_axis == -2 else sides[::-1]

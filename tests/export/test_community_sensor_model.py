@@ -195,7 +195,7 @@ def test_models_are_refused_with_their_errors(tmp_path):
 @pytest.mark.parametrize(
     ("truth", "motion", "timing", "fields", "message"),
     [
-        (SLOW, lambda motion: motion.expanded(2), {}, {}, r"batch of shape \(2,\); export one of them"),
+        (SLOW, lambda motion: motion.expanded(2), {}, {}, r"batch of shape \(2,\): pass one of them"),
         (SLOW, None, {"scan_axis": "x"}, {}, "scan_axis must be -2"),
         (SLOW, None, {}, {"detector_center": {}}, r"isd: detector_center\.line: missing key"),
         (SLOW, None, {}, {"image_lines": 0}, "image_lines"),

@@ -108,7 +108,7 @@ def test_scene_too_small():
         (torch.full((99, 99), torch.nan), {}, ValueError, "scene must be finite, but pixel"),
         (torch.zeros(99, 99), {"num_frames": 0}, ValueError, "num_frames must be at least 1, got 0"),
         (torch.zeros(600, 99), {"frame_size": (400, 50)}, ValueError, "frame_rows=300 is less than the"),
-        (torch.zeros(99, 99), {"vibration": Vibration.still((2,))}, ValueError, "takes one vibration, not a batch"),
+        (torch.zeros(99, 99), {"vibration": Vibration.still((2,))}, ValueError, "vibration is a batch of shape"),
     ],
 )
 def test_bad_input(scene, options, error, message):

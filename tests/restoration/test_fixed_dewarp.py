@@ -65,7 +65,7 @@ def test_gradient_reaches_the_frames():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"vibration": VIBRATION.expanded(2)}, "vibration must be one motion"),
+        ({"vibration": VIBRATION.expanded(2)}, "vibration is a batch"),
         ({"vibration": rsv.Vibration([1.0, 1.0, 1e-3], [50.0] * 3)}, "roll, zoom or a camera"),
         ({"size": (0, 90)}, "size must be"),
         ({"size": (500, 90)}, "500"),

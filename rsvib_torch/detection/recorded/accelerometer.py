@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import as_tensor
+from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.presentation import AXIS_NAMES, Result, check_pixel_size
 from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.core.text import measured_text, text_table
@@ -165,8 +166,7 @@ def compare_accelerometer(
     if not (np.isfinite(stamps).all() and np.isfinite(values).all() and (np.diff(stamps) > 0).all()):
         raise ValueError("times and acceleration must be finite, and times must increase: remove the other samples")
     pixel_size = check_pixel_size(pixel_size)
-    if detection.batch_shape:
-        raise ValueError(f"detection is a batch of {detection.batch_shape[0]}: pass one of them, detection[0]")
+    check_single("detection", detection)
     found, std = detection.vibration, detection.std
     places = [(a, k) for a, k in found.amplitude[:2].nonzero().tolist() if detection.reliable[a]]
     if not places:

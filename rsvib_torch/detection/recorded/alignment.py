@@ -13,6 +13,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason
@@ -235,8 +236,8 @@ def align_motion(
             "recorded must be a FreeMotion (read_motion, FreeMotion.from_samples) or AngularRates (read_gyroscope), "
             f"got {type(recorded).__name__}"
         )
-    if isinstance(recorded, FreeMotion) and recorded.batch_shape:
-        raise ValueError("align_motion takes one motion, not a batch")
+    if isinstance(recorded, FreeMotion):
+        check_single("recorded", recorded)
     if isinstance(recorded, FreeMotion) and (options.camera is not None or options.fit_row_time):
         raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
     stack = grey_frames(frames, timing, options)

@@ -11,7 +11,7 @@ from typing import Literal, ParamSpec, Protocol
 from pydantic import Field
 
 from rsvib_torch.calibration import RowTimeCalibration
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.core.checks import check_number, check_single
 from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.validation import Number, Positive
@@ -133,8 +133,8 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         raise ValueError(f"exposure_time={exposure:g} s exceeds the frame period of {period:.6g} s; give it in seconds")
     if recorded is None and (options.offsets is not None or options.fit_gain):
         raise ValueError("offsets and fit_gain belong to a recorded motion: pass recorded")
-    if recorded is not None and recorded.batch_shape:
-        raise ValueError("recorded must be one motion, not a batch")
+    if recorded is not None:
+        check_single("recorded", recorded)
     # frames are converted with any row time: only scan axis and readout direction matter
     sensor = SensorTiming(1e-9, 1.0, 10.0 * 2**20, options.scan_axis)
     stack = grey_frames(frames, sensor, options, timed=False)
