@@ -11,7 +11,7 @@ from typing import ParamSpec, Protocol
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import described
+from rsvib_torch.core.checks import check_single, described
 from rsvib_torch.core.precision import full_precision, without_gradients
 from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult
 from rsvib_torch.core.reason import Reason
@@ -128,8 +128,9 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         raise TypeError(f"motion must be a Motion, got {described(motion)}")
     stack = grey_frames(frames, timing, options)
     timing = stack.timing
-    if stack.batched or motion.batch_shape:
-        raise ValueError("check_motion takes one stack and one motion, not a batch")
+    check_single("motion", motion)
+    if stack.batched:
+        raise ValueError("check_motion takes one stack, not a batch")
     rowwise, curve, _ = start_curve(stack, timing, options)
     measured = measurements_of_curve(curve, rowwise, options.band_step)
     turned = motion.to("cpu").to_row_order(timing)
