@@ -89,6 +89,7 @@ def test_the_track_of_the_clip_itself(place, tmp_path, capsys):
     assert shaking(tmp_path / "out" / "restored.mp4") < 0.15
     before, after = data["shaking"]["frame_to_frame"]
     assert 0 < after < 1.1 * before + 0.1
+    assert not (tmp_path / "out" / "windows.png").exists()  # it would be empty: no tones are searched for
 
 
 def test_rates_of_another_camera_are_refused(place, tmp_path, capsys):

@@ -301,7 +301,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     if not restored and report.windows is not None and report.windows.totals()["restored"]:
         sentences[0] = words.WINDOWS_RESTORED
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
-    if report.windows is not None:
+    if report.windows is not None and report.windows.gyroscope is None:  # no tones are searched for otherwise
         starts = [record.start_time for record in report.windows.windows]
         figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
