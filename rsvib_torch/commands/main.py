@@ -154,7 +154,7 @@ def _lines_of(error: Exception) -> Sequence[str]:
     if isinstance(error, (OSError, ValueError, TypeError, ModuleNotFoundError)):
         return [str(error) or type(error).__name__]
     if hasattr(error, "format_message"):  # a usage error of click, or of the parser that typer bundles
-        message = error.format_message().replace("Value error, ", "")  # added by some versions of typer
+        message = " ".join(error.format_message().split()).replace("Value error, ", "")  # of some versions of typer
         several = "; give a sequence of files as their folder" if "unexpected extra argument" in message else ""
         return [f"{message}{several}"]
     text = f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"

@@ -429,6 +429,7 @@ def test_usage_errors(capsys, tmp_path):
     )
     for arguments, message in (
         (("detect", "f.tif"), "Missing option '--out'"),
+        (("compare", "a.json", "b.csv"), "Missing option '--unit'. Choose from: g, m/s2"),
         ((*detect, "--exposure", "1ms"), undescribed),
         ((*detect, "--row-time", "20um"), "expected a time such as 14.5us, 1/500 or 2e-5"),
         ((*detect, "--exposure", "1/0"), "expected a time such as"),
