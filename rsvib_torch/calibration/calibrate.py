@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.calibration.flicker import Array, BandFit, Profiles, find_bands, row_profiles
+from rsvib_torch.calibration.flicker import MIN_PERIODS, Array, BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels
@@ -165,10 +165,10 @@ def calibrate_row_time(
         15.625
     """
     frequency = float(flicker_frequency)
-    if frame_rate is not None and frequency < 1.5 * frame_rate:
+    if frame_rate is not None and frequency < MIN_PERIODS * frame_rate:
         raise ValueError(
             f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
-            "1.5 periods fit into one; use a faster flicker"
+            f"{MIN_PERIODS:g} periods fit into one; use a faster flicker"
         )
     if on_fraction is not None and light_contrast is not None:
         raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")

@@ -19,7 +19,7 @@ from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 SceneModel = Literal["smooth", "fixed"]
 Array = NDArray[Any]
 _TINY = 1e-300  # smallest divisor
-_MIN_PERIODS = 1.5  # that a frame must contain
+MIN_PERIODS = 1.5  # that a frame must contain
 _MIN_PERIOD = 4.0  # rows; shorter bands may be aliases of longer ones
 
 
@@ -244,7 +244,7 @@ def _starts(brightness: Array) -> list[float]:
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(height) / height)
     power = (np.abs(np.fft.rfft(flat * window, n=padding * height)) ** 2).sum(0)
     frequencies = np.fft.rfftfreq(padding * height)
-    usable = (frequencies >= 0.8 * _MIN_PERIODS / height) & (frequencies <= 0.45)
+    usable = (frequencies >= 0.8 * MIN_PERIODS / height) & (frequencies <= 0.45)
     usable[1:-1] &= (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
     background = ndimage.median_filter(power, 16 * padding + 1, mode="mirror")
     places = np.flatnonzero(usable)
@@ -281,7 +281,7 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
     if not trusted:
         raise ValueError(
             "no flicker found: no bands of the same period across all columns exceed the texture of the scene; at "
-            f"least {_MIN_PERIODS:g} periods of the flicker must fit into a frame with visible contrast; two or more "
+            f"least {MIN_PERIODS:g} periods of the flicker must fit into a frame with visible contrast; two or more "
             "frames of a still scene eliminate its texture"
         )
     best, model = min(trusted, key=lambda item: item[0].period_std / item[0].period)
@@ -290,10 +290,10 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
             f"the bands repeat every {best.period:.2f} rows: flicker this fast is ambiguous; "
             f"use a flicker with bands of at least {_MIN_PERIOD:g} rows"
         )
-    if brightness.shape[1] / best.period < _MIN_PERIODS:
+    if brightness.shape[1] / best.period < MIN_PERIODS:
         raise ValueError(
             f"flicker is slower than a frame: {brightness.shape[1] / best.period:.2f} periods in its rows, at least "
-            f"{_MIN_PERIODS:g} are needed; use a faster flicker"
+            f"{MIN_PERIODS:g} are needed; use a faster flicker"
         )
     return best, model
 

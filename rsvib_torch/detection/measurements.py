@@ -104,6 +104,11 @@ class Measurements:
         return first.max(1) - first.min(1)
 
     @property
+    def interval(self) -> Array:
+        """(B,) mean seconds between the first two frames of a group."""
+        return (self.exposure_starts[:, :, 1] - self.exposure_starts[:, :, 0]).mean(1)
+
+    @property
     def weights(self) -> Array:
         """(B, N, 2) information of each axis alone."""
         return self.information.diagonal(axis1=-2, axis2=-1)

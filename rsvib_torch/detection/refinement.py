@@ -499,7 +499,7 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     residual = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
     exposure_starts = measurements.exposure_starts
     duration = (exposure_starts.max(1) - exposure_starts.min(1)).max(-1)[:, None]
-    interval = (exposure_starts[:, :, 1] - exposure_starts[:, :, 0]).mean(1)[:, None]
+    interval = measurements.interval[:, None]
     frequency = strongest_only(start).frequencies[..., 0]
     mirrored = 2 * (frequency * interval).round() / interval - frequency
     unresolved = (np.abs(mirrored - frequency) * duration < 0.35) & (mirrored > 0) & strongest.active[..., 0]

@@ -129,7 +129,7 @@ class TrackedFrame:
         robust = measurements.reweighted(residual_of(measurements, fit))
         weights = robust.weights / np.maximum(measurements.weights, 1e-300)
         curve, fitted = offset_curve(robust, fit, weights, [2], self.frame.images.device)
-        interval, scale = float(np.diff(measurements.exposure_starts).mean()), FieldScale(2, width, height)
+        interval, scale = float(measurements.interval.mean()), FieldScale(2, width, height)
         user_timing, findings = self.frame.image_timing, (self.tones.findings,)
         results = assembled(
             fit,

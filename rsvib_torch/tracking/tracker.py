@@ -350,7 +350,7 @@ class VibrationTracker:
             vibration,
             replace(std, displacement=tensor(known_std)),
             other_motion,
-            intervals=np.diff(measurements.exposure_starts).mean((1, 2)),
+            intervals=measurements.interval,
             displacement=tone_displacements(fit, starts, exposure_time).std(1),
             known_std=known_std,
             timing=self._rows,

@@ -114,25 +114,17 @@ def _tones_at(measurements: Measurements, frequencies: Array) -> Array:
     return attenuation * unit_wave(2 * math.pi * frequencies[:, None, None] * measurements.middles)
 
 
-def drift_response(measurements: Measurements, order: int) -> Array:
-    """Relative displacements (B, N, G, J) of unit drifts s^j / j!, averaged over the exposure."""
-    return measurements.drifts[..., :order]
-
-
-def model_displacements(measurements: Measurements, fit: ToneFit) -> Array:
-    """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
-    fit = fit.about(measurements.centre)
-    tones = fit.coefficients[:, None, None] * tone_response(measurements, fit.frequencies)
-    response = drift_response(measurements, fit.drift.shape[-1])
-    return tones.real.sum(-1) + np.einsum("bngj,baj->bnga", response, fit.drift)
-
-
 def displacements(measurements: Measurements, fit: ToneFit) -> Array:
     """Displacements (B, N, G, A) in px of the fitted motion at the measurements, up to a constant."""
     fit = fit.about(measurements.centre)
     tones = (fit.coefficients[:, None, None] * _tones_at(measurements, fit.frequencies)).real.sum(-1)
     powers = [measurements.middles[..., 0] ** order / order for order in range(1, fit.drift.shape[-1] + 1)]
     return sum((power * fit.drift[:, None, None, :, j] for j, power in enumerate(powers)), tones)
+
+
+def model_displacements(measurements: Measurements, fit: ToneFit) -> Array:
+    """Displacements (B, N, G, 2) in px that the fitted motion predicts at the measurements."""
+    return measurements.relative(displacements(measurements, fit))
 
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
@@ -231,7 +223,7 @@ class _Problem:
         place = np.arange(exists.shape[-1])
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
         self.free, self.linear = (self._of_free(these) for these in (exists, exists & ~self.is_frequency))  # (B, M)
-        drift = drift_response(measurements, order)[..., None, :]
+        drift = measurements.drifts[..., None, :order]
         self.drift_columns = np.repeat(drift, self.axes, -2)  # (B, N, G, A, J)
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 

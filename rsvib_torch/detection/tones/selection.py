@@ -77,23 +77,27 @@ def with_best_aliases(measurements: Measurements, fit: ToneFit) -> ToneFit:
     Returns:
         The fit, whose covariance has no meaning.
     """
-    if fit.model.harmonics > 1:
-        return fit
     size = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
-    starts, steps = measurements.exposure_starts, np.arange(-_ALIASES, _ALIASES + 1)
-    for axis in np.flatnonzero(((size > _WRONG_SIZE) & fit.active[..., 0]).any(0)):
-        (index,) = ((size[:, axis] > _WRONG_SIZE) & fit.active[:, axis, 0]).nonzero()
-        interval = (starts[index, :, 1] - starts[index, :, 0]).mean(1)
+    wrong = (size > _WRONG_SIZE) & fit.active[..., 0]
+    if fit.model.harmonics > 1 or not bool(wrong.any()):
+        return fit
+    parameters = fit.parameters[0].size
+    fit = replace(fit, covariance=np.zeros((len(size), parameters, parameters)))
+    steps = np.arange(-_ALIASES, _ALIASES + 1)
+    for axis in np.flatnonzero(wrong.any(0)):
+        # 1. The aliases of the tone of this axis, each fitted roughly.
+        (index,) = wrong[:, axis].nonzero()
         tried = np.repeat(index, len(steps))
         some, frequencies = take_stacks([measurements], tried), fit.frequencies[tried]
-        moved = frequencies[:, axis, 0] + (steps / interval[:, None]).ravel()
+        moved = frequencies[:, axis, 0] + (steps / measurements.interval[index, None]).ravel()
         frequencies[:, axis, 0] = np.where(moved > 0, moved, frequencies[:, axis, 0])
         others, residual = fit_roughly(some, frequencies, fit.active[tried], fit.model)
+        # 2. The best one, where it leaves half of the residual.
         sizes = without_nan(median(some.sizes(residual), 1), np.inf)[:, axis].reshape(len(index), -1)
         place, better = np.arange(len(size)), sizes.min(1) < 0.5 * size[index, axis]
         best = len(size) + np.arange(len(index)) * len(steps) + sizes.argmin(1)
         place[index[better]] = best[better]
-        fit = take_stacks([replace(fit, covariance=np.zeros((len(size), *others.covariance.shape[1:]))), others], place)
+        fit = take_stacks([fit, others], place)
     return fit
 
 
