@@ -57,7 +57,7 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
     within = torch.get_num_threads()
     allowed = allowed_threads()
     threads = min(allowed, len(items)) if device.type == "cpu" else 1
-    if threads == 1:
+    if threads <= 1:
         with torch.no_grad():
             return [work(item) for item in items]
     inference = torch.is_inference_mode_enabled()

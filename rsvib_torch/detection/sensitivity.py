@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.tables import pseudo_inverse, split_axis, table
+from rsvib_torch.core.tables import pseudo_inverse, split_axis, table, tables
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displacements
@@ -32,8 +32,8 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
 
     # 1. A record of all rows of all frames, and the fit at its middle.
     def record(stated: RowTiming) -> Measurements:
-        rows = table(stated.row_starts(num_frames, num_rows)[:, :: max(1, num_rows // 128)].T)
-        times = np.repeat(rows[None], batch, 0)  # (B, N, T)
+        rows = stated.row_time * np.arange(0, num_rows, max(1, num_rows // 128))
+        times = np.repeat((rows[:, None] + table(stated.frame_starts(num_frames)))[None], batch, 0)  # (B, N, T)
         information = np.broadcast_to(np.eye(axes), (*times.shape[:2], axes, axes))
         nothing = np.zeros((*times.shape, axes))
         return Measurements(times, nothing, np.ones_like(times), information, stated.exposure_time)
@@ -81,7 +81,9 @@ def assumptions(
 
     ``blur`` is the ratio of ``OtherMotion.blur`` and its standard deviation; None if it was not measured.
     """
-    if not bool((vibration.amplitude > 0).any()):
+    amplitude, frequency = tables(vibration.amplitude, vibration.frequency)
+    tones = [(axis, tone, float(frequency[axis, tone])) for axis, tone in np.argwhere(amplitude > 0)]
+    if not tones:
         return ()
     sentences = []
     if timing.frame_start_times is None:
@@ -101,25 +103,30 @@ def assumptions(
             "frames can"
         )
         name = "frame_rows" if timing.frame_start_times is None else "row_time"
-        sentences += _effects(name, vibration, sensitivity, getattr(timing, name))
-    sentences += _effects("exposure_rows", vibration, sensitivity, timing.exposure_rows)
+        sentences += _effects(name, tones, sensitivity, getattr(timing, name))
+    sentences += _effects("exposure_rows", tones, sensitivity, timing.exposure_rows)
     if blur is not None:
-        sentences += _exposure_range(vibration, timing, *blur)
+        sentences += _exposure_range(tones, timing, *blur)
     return tuple(sentences)
 
 
-def _effects(name: str, vibration: Vibration, sensitivity: TimingSensitivity, value: float) -> list[str]:
+_Tones = list[tuple[int, int, float]]  # axis, number and frequency in Hz of each tone
+
+
+def _effects(name: str, tones: _Tones, sensitivity: TimingSensitivity, value: float) -> list[str]:
     """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
     of_tones = []
-    for axis, tone in vibration.amplitude.nonzero().tolist():
-        changes = {of: float(getattr(sensitivity, f"{of}_by_{name}")[axis, tone]) for of in ("amplitude", "frequency")}
-        texts = [f"{of} {change:+.2g} %" for of, change in changes.items() if abs(change) > 0.1]
+    quantities = ("amplitude", "frequency")
+    changes = tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in quantities))
+    for axis, tone, frequency in tones:
+        of_tone = zip(quantities, (change[axis, tone] for change in changes), strict=True)
+        texts = [f"{of} {change:+.2g} %" for of, change in of_tone if abs(change) > 0.1]
         if texts:
-            of_tones.append(f"{AXIS_NAMES[axis]} {float(vibration.frequency[axis, tone]):.4g} Hz: {', '.join(texts)}")
+            of_tones.append(f"{AXIS_NAMES[axis]} {frequency:.4g} Hz: {', '.join(texts)}")
     return [f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []
 
 
-def _exposure_range(vibration: Vibration, timing: RowTiming, ratio: float, std: float) -> list[str]:
+def _exposure_range(tones: _Tones, timing: RowTiming, ratio: float, std: float) -> list[str]:
     """Sentence about the exposures that the blur of the frames agrees with, within two standard deviations.
 
     The rows determine ``A sinc(f T_e)`` (Eq. 2). There is no sentence if no amplitude changes by more than 1 %.
@@ -128,8 +135,7 @@ def _exposure_range(vibration: Vibration, timing: RowTiming, ratio: float, std: 
     low, high = (min(stated * math.sqrt(max(ratio + 2 * n * std, 0.0)), timing.frame_period) for n in (-1, 1))
     low, high = min(low, stated), max(high, stated)
     of_tones = []
-    for axis, tone in vibration.amplitude[:2].nonzero().tolist():
-        frequency = float(vibration.frequency[axis, tone])
+    for axis, _, frequency in (tone for tone in tones if tone[0] < 2):
         # an exposure of a period averages the tone out
         longest = min(high, 0.9 / frequency)
         changes = [100 * (np.sinc(frequency * stated) / np.sinc(frequency * time) - 1) for time in (low, longest)]

@@ -53,6 +53,8 @@ class FieldScale:
 
     def motion(self, fitted: Vibration) -> Vibration:
         """The vibration with roll in rad and relative zoom, of one whose components are all in px."""
+        if self.same_for_all_columns:
+            return fitted
         return replace(fitted.scaled(self.units(fitted.amplitude)), camera=self.camera)
 
     def free_motion(self, fitted: FreeMotion) -> FreeMotion:
@@ -62,6 +64,8 @@ class FieldScale:
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
         """The same for standard deviations."""
+        if self.same_for_all_columns:
+            return fitted
         factor = self.units(fitted.amplitude)
         return replace(
             fitted,

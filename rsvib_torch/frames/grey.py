@@ -111,7 +111,7 @@ def grey_frames(
 
 def without_mosaic(images: Tensor) -> Tensor:
     """Grey frames (B, T, H, W), of colour mosaics without the pattern of the colours, which does not move."""
-    mosaic = torch.stack([is_mosaic(stack[0]) for stack in images])
+    mosaic = is_mosaic(images[:, 0])
     if not bool(mosaic.any()):
         return images
     return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)

@@ -68,21 +68,21 @@ def _smoothed(images: Tensor, weights: tuple[float, ...]) -> Tensor:
     return functional.conv2d(rows, taps[None, None, :, None]).view(images.shape)
 
 
-def is_mosaic(image: Tensor, *, block: int = 16, least: float = 3.0) -> Tensor:
-    """Whether an image (H, W) is a mosaic of colours: () bool.
+def is_mosaic(images: Tensor, *, block: int = 16, least: float = 3.0) -> Tensor:
+    """Whether images (B, H, W) are mosaics of colours: (B,) bool.
 
     Chequered differences of a mosaic have the same sign where the colour is the same. Their mean square over blocks,
     relative to that of a white spectrum near 1/2 cycle per px, is 7 to 35 in mosaics (three photographs, drawn scenes,
     one with a tenth of the colour) and at most 0.9 in grey images (nine photographs, drawn scenes, noise).
     """
-    if min(image.shape) < block + 2:
-        return torch.zeros((), dtype=torch.bool, device=image.device)
-    high = image.diff(n=2, dim=-1).diff(n=2, dim=-2)
-    row, column = (torch.arange(size, device=image.device) for size in high.shape)
-    signed = high * (1 - 2 * ((row[:, None] + column) % 2))
-    blocks = functional.avg_pool2d(signed[None, None], block)
+    if min(images.shape[-2:]) < block + 2:
+        return torch.zeros(len(images), dtype=torch.bool, device=images.device)
+    high = images.diff(n=2, dim=-1).diff(n=2, dim=-2)
+    row, column = (torch.arange(size, device=images.device) for size in high.shape[-2:])
+    blocks = functional.avg_pool2d(high * (1 - 2 * ((row[:, None] + column) % 2)), block)
     white = (8 / 3 / block) ** 2  # mean square of blocks of white noise
-    return blocks.square().mean() > least * white * high.square().mean()
+    of_blocks, of_pixels = (values.square().mean((-2, -1)) for values in (blocks, high))
+    return of_blocks > least * white * of_pixels
 
 
 def mosaic_free(images: Tensor) -> Tensor:

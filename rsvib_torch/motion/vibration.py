@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Self
@@ -211,6 +212,29 @@ class Vibration(
         return cls(zeros, zeros, zeros, zeros[..., 0], zeros[..., 0], zeros[..., 0])
 
     @classmethod
+    def from_parameters(cls, parameters: Tensor) -> Self:
+        """A batch of vibrations from one tensor, without checks and without another order of the tones.
+
+        Args:
+            parameters: (B, A, 3 K + 3) float64: amplitudes, frequencies and phases of the K tones, largest first, then
+                image motion, image acceleration and image shift.
+        """
+        tones = (parameters.shape[-1] - 3) // 3
+        *of_tones, polynomial = parameters.split([tones, tones, tones, 3], -1)
+        vibration = cls.__new__(cls)
+        for name, values in zip(_LIMITS, (*of_tones, *polynomial.unbind(-1)), strict=True):
+            object.__setattr__(vibration, name, values)
+        object.__setattr__(vibration, "camera", None)
+        return vibration
+
+    def _changed(self, **values: Tensor | Camera | None) -> Self:
+        """The vibration with some values replaced, without checks."""
+        changed = copy(self)
+        for name, value in values.items():
+            object.__setattr__(changed, name, value)
+        return changed
+
+    @classmethod
     def stacked(cls, vibrations: Sequence["Vibration"]) -> "Vibration":
         """Vibrations with the same shape and camera as a batch; the new dimension is the first.
 
@@ -242,7 +266,7 @@ class Vibration(
             [3.1, 5.2]
         """
         tones = {name: getattr(self, name)[..., :2, :] for name in _QUANTITIES}
-        return Vibration(**tones, **{name: getattr(self, name)[..., :2] for name in _POLYNOMIAL})
+        return self._changed(**tones, **{name: getattr(self, name)[..., :2] for name in _POLYNOMIAL}, camera=None)
 
     def summary(self) -> str:
         """The tones of each axis as a table."""
@@ -361,10 +385,10 @@ class Vibration(
         axes = list(order)
         phase = self.phase[..., axes, :]
         opposite = torch.remainder(phase + 2 * math.pi, 2 * math.pi) - math.pi
-        return type(self)(
-            self.amplitude[..., axes, :],
-            self.frequency[..., axes, :],
-            torch.where(sign[:, None] < 0, opposite, phase),
+        return self._changed(
+            amplitude=self.amplitude[..., axes, :],
+            frequency=self.frequency[..., axes, :],
+            phase=torch.where(sign[:, None] < 0, opposite, phase),
             **{name: getattr(self, name)[..., axes] * sign for name in _POLYNOMIAL},
             camera=None if self.camera is None else self.camera.with_axes(order, signs),
         )

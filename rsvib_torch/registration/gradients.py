@@ -18,8 +18,9 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import get_ident
 from typing import Protocol
 
 import torch
@@ -28,6 +29,7 @@ from torch.nn import functional
 
 from rsvib_torch.core.chunking import chunks
 from rsvib_torch.core.fourier import fast_length
+from rsvib_torch.core.parallel import in_parallel
 from rsvib_torch.registration.row_spectra import (
     combined,
     differences,
@@ -54,6 +56,8 @@ class _WarpedRows(Protocol):
 
     @property
     def frequencies(self) -> Tensor: ...  # (U,) cycles/px
+
+    def runs(self, count: int, arrays: int) -> list[slice]: ...
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None: ...
 
@@ -93,7 +97,7 @@ class RowGradients:
 
 def row_gradients(
     spectra: _WarpedRows,
-    warped: Iterable[tuple[slice, Tensor]],
+    warp: Callable[[slice], Tensor],
     rows: Tensor,
     shift: Tensor,
     visible: Tensor,
@@ -104,7 +108,8 @@ def row_gradients(
 
     Args:
         spectra: The frames of a group.
-        warped: Runs of the S rows of the scene with the frames warped to them, (B, G, s, U) from ``RowSpectra.warped``.
+        warp: Function from a slice of the S rows of the scene to the frames warped to them, (B, G, s, U), as
+            ``RowSpectra.warped``. Threads call it.
         rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
@@ -115,20 +120,21 @@ def row_gradients(
         The gradients.
     """
     length, width = spectra.length, spectra.width
-    compared = FrameComparison.of(warped, visible)
+    compared = FrameComparison.of(warp, spectra.runs(rows.shape[-1], 2), visible)
     detail, across, aliasing = scene_detail(compared, spectra.frequencies)
     along = (2j * math.pi * spectra.frequencies).to(detail.dtype)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
     valid = spectra.warped_valid(rows, shift)
     parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), rows.device, multiple=BLOCK)
     regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
-    memory = inner.new_empty(
-        len(rows), parts[0].stop, regressors + (1 if rows.shape[1] == 2 else rows.shape[1]), length
-    )
+    images_of_row = regressors + (1 if rows.shape[1] == 2 else rows.shape[1])
+    memory: dict[int, Tensor] = {}  # of each thread, used again
 
     def pixels(part: slice) -> _Rows:
         of_scene, part_visible = detail[:, part].contiguous(), visible[:, :, part]
-        planes = memory[:, : of_scene.shape[1]]
+        if get_ident() not in memory:
+            memory[get_ident()] = inner.new_empty(len(rows), parts[0].stop, images_of_row, length)
+        planes = memory[get_ident()][:, : of_scene.shape[1]]
         planes[:, :, 0], planes[:, :, 1] = (
             torch.fft.irfft(one, n=length) for one in (of_scene * along, across[:, part])
         )
@@ -145,20 +151,21 @@ def row_gradients(
 
     edges = [width * number // 4 for number in range(1, 4)]
     images = inner.new_empty(len(rows), rows.shape[-1], regressors, length)
-    fits, blocks = [], []
-    for part in parts:
-        fit, block = _fit_rows(pixels(part), edges, images[:, part])
-        fits.append(fit)
-        blocks.append(block)
+    fitted = in_parallel(lambda part: _fit_rows(pixels(part), edges, images[:, part]), parts, rows.device)
+    fits, blocks = ([part[place] for part in fitted] for place in (0, 1))
     block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
-    reweighted = (block_weight < 1).any(-1).any(0).tolist()
-    for place, part in enumerate(parts):  # the fit is repeated where blocks lost weight
-        within = slice(part.start // BLOCK, -(-part.stop // BLOCK))
-        if any(reweighted[within]):
-            some = pixels(part)
-            spread = block_weight[:, within].repeat_interleave(BLOCK, 1).repeat_interleave(BLOCK, 2)
-            weight = some.weight * spread[:, : some.weight.shape[1], :length]
-            fits[place], _ = _fit_rows(replace(some, weight=weight), edges, images[:, part])
+    within = [slice(part.start // BLOCK, -(-part.stop // BLOCK)) for part in parts]
+    lost = (block_weight < 1).any(-1).any(0).tolist()
+    reweighted = [place for place in range(len(parts)) if any(lost[within[place]])]
+
+    def fit_again(place: int) -> tuple[Tensor, ...]:
+        some = pixels(parts[place])
+        spread = block_weight[:, within[place]].repeat_interleave(BLOCK, 1).repeat_interleave(BLOCK, 2)
+        weight = some.weight * spread[:, : some.weight.shape[1], :length]
+        return _fit_rows(replace(some, weight=weight), edges, images[:, parts[place]])[0]
+
+    for place, fit in zip(reweighted, in_parallel(fit_again, reweighted, rows.device), strict=True):
+        fits[place] = fit
     sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
     products, right = _products(sums.sum(2))
     means = _means(products)
@@ -172,19 +179,24 @@ def row_gradients(
     )
 
 
-def residual_products(warped: Iterable[tuple[slice, Tensor]], gradients: RowGradients, visible: Tensor) -> Tensor:
+def residual_products(
+    warp: Callable[[slice], Tensor], runs: list[slice], gradients: RowGradients, visible: Tensor
+) -> Tensor:
     """Products (B, S, A + 1, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
 
     Args:
-        warped: As in ``row_gradients``, one run after the other.
+        warp: As in ``row_gradients``.
+        runs: Slices of the rows to process at a time.
         gradients: Gradients of the scene, from a similar motion.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
     """
-    length, parts = gradients.images.shape[-1], []
-    for part, run in warped:
-        pixels = torch.fft.irfft(differences(run, visible[:, :, part]).transpose(1, 2), n=length)
-        parts.append(torch.matmul(gradients.images[:, part], pixels.transpose(-2, -1)))
-    return torch.cat(parts, 1).double()
+    length = gradients.images.shape[-1]
+
+    def of_run(rows: slice) -> Tensor:
+        pixels = torch.fft.irfft(differences(warp(rows), visible[:, :, rows]).transpose(1, 2), n=length)
+        return torch.matmul(gradients.images[:, rows], pixels.transpose(-2, -1))
+
+    return torch.cat(in_parallel(of_run, runs, visible.device), 1).double()
 
 
 def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) -> tuple[Tensor, Tensor]:
@@ -376,34 +388,33 @@ class FrameComparison:
     differences: Tensor
 
     @classmethod
-    def of(cls, warped: Iterable[tuple[slice, Tensor]], visible: Tensor) -> "FrameComparison":
+    def of(cls, warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> "FrameComparison":
         """Compare frames warped to the scene.
 
         Args:
-            warped: Runs of the S rows with the frames warped to them, (B, G, s, U), each processed while in the cache.
+            warp: As in ``row_gradients``.
+            runs: Slices of the S rows, each processed while in the cache.
             visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
         """
-        whole: list[Tensor] = []
-        count = visible.shape[2]
-        counts = (fast_length(count), fast_length(count), count)
-        for rows, run in warped:
-            part_visible = visible[:, :, rows]
-            different = differences(run, part_visible)
+
+        def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+            warped, part_visible = warp(rows), visible[:, :, rows]
+            different = differences(warped, part_visible)
             # half the difference of two frames has the noise of their mean
             noise = (
                 different[:, 0, :, ::_NOISE_STEP]
-                if run.shape[1] == 2
-                else _noise_of_mean(run[..., ::_NOISE_STEP], part_visible)
+                if warped.shape[1] == 2
+                else _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
             )
-            of_run = (mean_over_frames(run, part_visible), noise, different)
-            if not whole:
-                sizes = zip(of_run, counts, strict=True)
-                whole = [one.new_empty(*one.shape[:-2], size, one.shape[-1]) for one, size in sizes]
-            for all_rows, one in zip(whole, of_run, strict=True):
-                all_rows[..., rows, :] = one
-        for all_rows in whole:
-            all_rows[..., count:, :] = 0
-        return cls(*whole)
+            return mean_over_frames(warped, part_visible), noise, different
+
+        means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
+        missing = fast_length(visible.shape[2]) - visible.shape[2]
+        mean, noise = (
+            torch.cat([*parts, parts[0].new_zeros(len(visible), missing, parts[0].shape[-1])], 1)
+            for parts in (means, noises)
+        )
+        return cls(mean, noise, torch.cat(different, 2))
 
 
 def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -234,7 +234,7 @@ def _bands_of_pairs(
     sigma = torch.ones(1, 2, dtype=grey.dtype, device="cpu")  # px; from numbers Kornia makes it on the default device
     grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
-    # Pairs at a time: their transforms (2.5 MB each), and below their windows, stay in the cache of a CPU.
+    # Pairs at a time: their transforms (2.5 MB each) stay in the cache of a CPU.
     parts = chunks(num_frames - 1, batch * 2**21, grey.device)
     coarse = torch.cat([_coarse_offsets(grey[:, pair.start : pair.stop + 1]) for pair in parts], 1).flatten(0, 1)
     bytes_of_pair = len(tops) * (band_rows + 2 * search) * (width + 2 * search) * grey.element_size() * 4
@@ -243,8 +243,7 @@ def _bands_of_pairs(
     overlap = width - coarse[:, 0].abs() - 2 * template_margin(search)
     coarse = torch.where((overlap < search)[:, None], 0, coarse)
     quarter = 4 * coarse[:, 0].abs() // width
-    # 16 MiB of windows on a CPU; 128 MiB take 2.3 times as long
-    together = at_once(bytes_of_pair, grey.device, cpu_bytes=2**24)
+    together = at_once(bytes_of_pair, grey.device, cpu_bytes=2**27)
     offsets = grey.new_full((len(first), len(tops), 2), torch.nan, dtype=torch.float64)
     quality = offsets.new_zeros(offsets.shape[:2])
     for pairs in [part for value in quarter.unique() for part in (quarter == value).nonzero()[:, 0].split(together)]:
@@ -267,7 +266,10 @@ def _without_row_means(images: Tensor) -> Tensor:
 
 
 def _coarse_offsets(frames: Tensor) -> Tensor:
-    """Offsets of whole frames of any size, to about two pixels of frames reduced to 256 px along the longer side.
+    """Offsets of whole frames of any size, to about two pixels of reduced frames.
+
+    Frames of 1024 px and more are reduced to 256 px along the longer side, smaller ones by up to 4 to at least 128 px:
+    of 448 pairs of photographs of 256 to 900 px as many are wrong as with 256 px, in half the time.
 
     The phase correlation of the reduced frames gives four candidates, each with its periodic images. The candidate
     with the largest correlation of the overlapping parts is taken, up to shifts of 70 % of the frame.
@@ -279,7 +281,8 @@ def _coarse_offsets(frames: Tensor) -> Tensor:
         (B, T - 1, 2) int64 px, axes (x, y): displacement in each frame minus that in the one before.
     """
     height, width = frames.shape[-2:]
-    factor = max(1, round(max(height, width) / 256))
+    longer = max(height, width)
+    factor = max(1, round(longer / 256), min(4, longer // 128))
     whole = frames[..., : height // factor * factor, : width // factor * factor]
     reduced = _standardised(functional.avg_pool2d(whole, factor))
     rows, columns = reduced.shape[-2:]

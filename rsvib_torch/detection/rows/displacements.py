@@ -236,12 +236,11 @@ def measure_group(
     positions = _Positions.of(group.starts_of_groups, spectra.height, timing, motion)
     visible = positions.visible(spectra.height, BLOCK_ROWS)
     warp = _warp_to_scene(spectra, positions, timing, motion)
-    warped = ((run, warp(run)) for run in spectra.runs(positions.rows.shape[-1], 2))
     if gradients is None:
-        gradients = row_gradients(spectra, warped, positions.rows, positions.shift, visible)
+        gradients = row_gradients(spectra, warp, positions.rows, positions.shift, visible)
         products = gradients.residual_products
     else:
-        products = residual_products(warped, gradients, visible)
+        products = residual_products(warp, spectra.runs(positions.rows.shape[-1], 2), gradients, visible)
     return _measured(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
 
 
@@ -254,12 +253,14 @@ class _JoinedRows:
         length: Of the transforms along the rows.
         frequencies: (U,) cycles/px.
         valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
+        runs: That of the spectra of the strips.
     """
 
     width: int
     length: int
     frequencies: Tensor
     valid: Tensor | None
+    runs: Callable[[int, int], list[slice]]
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """``valid``: the strips have been warped."""
@@ -307,18 +308,17 @@ def measure_strips(
         spectrum: Tensor = torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
         return spectrum
 
-    warped = ((run, joined(run)) for run in spectra.runs(positions.rows.shape[-1], 2))
     if gradients is None:
         valid = spectra.warped_valid(positions.rows, positions.shift)
         whole = None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999
         frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=positions.rows.device)
-        shape = _JoinedRows(strips.frame_width, length, frequencies, whole)
+        shape = _JoinedRows(strips.frame_width, length, frequencies, whole, spectra.runs)
         x = torch.arange(length, device=frequencies.device) - 0.5 * (strips.frame_width - 1)
         x = x - over_strips(positions.columns)[:, 0]  # (B, 1, L)
         y = over_strips(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
         gradients = row_gradients(
             shape,
-            warped,
+            joined,
             over_strips(positions.rows)[:, 0],
             over_strips(positions.shift).abs().amax(1)
             * (visible > 0),  # a lens may displace invisible rows by any amount
@@ -327,7 +327,7 @@ def measure_strips(
         )
         products = gradients.residual_products
     else:
-        products = residual_products(warped, gradients, visible)
+        products = residual_products(joined, spectra.runs(positions.rows.shape[-1], 2), gradients, visible)
     starts = over_strips(positions.exposure_starts).mean(1)
     return _measured(group, timing, motion, starts, visible, gradients, products), gradients
 
@@ -570,16 +570,14 @@ def _second_moments(paths: Tensor, weights: Tensor) -> Tensor:
     return torch.einsum("bgsni,bgsnj,n->bgsij", paths, paths, weights)
 
 
-def _different(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> Tensor:
-    """(B,) bool, whether exposures that start at ``exposure_starts`` (B, G, S) blur the same scene row differently."""
-    paths, weights = _paths(exposure_starts[..., ::8], timing, motion)
+def _different(paths: Tensor, weights: Tensor) -> Tensor:
+    """(B,) bool, whether exposures with paths from ``_paths`` blur the same scene row differently."""
+    paths = paths[:, :, ::8]
     third = torch.einsum("bgsn,bgsni->bgsi", paths.square().sum(-1) * weights, paths)
-
-    def spread(values: Tensor) -> Tensor:
-        return (values.amax(1) - values.amin(1)).flatten(1).amax(1)
-
+    moments = torch.cat([paths.flatten(-2), _second_moments(paths, weights).flatten(-2), third], -1)
     # px, px^2 and px^3; third moments of this size displace fine detail by 0.001 px
-    return (spread(paths) > 0.5) | (spread(_second_moments(paths, weights)) > 0.03) | (spread(third) > 0.0024)
+    limits = moments.new_tensor([0.5] * 2 * len(weights) + [0.03] * 4 + [0.0024] * 2)
+    return ((moments.amax(1) - moments.amin(1)) > limits).flatten(1).any(1)
 
 
 _SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
@@ -667,8 +665,8 @@ def blur_ratio(
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> Tensor:
     """(B,) bool, whether frames of ``height`` rows that start at ``starts`` (B, G) in s are blurred differently."""
-    rows = torch.arange(height, dtype=torch.float64, device=starts.device)
-    return _different(starts[..., None] + rows * timing.row_time, timing, motion)
+    rows = torch.arange(0, height, 8, dtype=torch.float64, device=starts.device)
+    return _different(*_paths(starts[..., None] + rows * timing.row_time, timing, motion))
 
 
 def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away: Tensor) -> tuple[Tensor, Tensor]:
@@ -685,23 +683,16 @@ def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away
     starts = (positions.exposure_starts - positions.rows * timing.row_time)[..., :1]
     positions_of_rows = _Positions.of_rows(first + steps_of_rows, positions.columns, starts, timing, motion)
     place = away + (positions.scene_rows - first)[..., None]
-    row = place.floor()
-    t = place - row
-    weights = torch.stack(
-        [
-            -t * (t - 1) * (t - 2) / 6,
-            (t + 1) * (t - 1) * (t - 2) / 2,
-            -(t + 1) * t * (t - 2) / 2,
-            (t + 1) * t * (t - 1) / 6,
-        ]
-    )
-    index = row.long().flatten(2)
-
-    def at(values: Tensor) -> Tensor:
-        neighbours = torch.stack([values.gather(2, index + step) for step in (-1, 0, 1, 2)])
-        return (weights * neighbours.view_as(weights)).sum(0)
-
-    return at(positions_of_rows.rows), at(positions_of_rows.shift)
+    cell = place.floor()
+    # the cubic polynomials (columns) by powers (rows) that are 1 at one of the places -1, 0, 1, 2 and 0 at the others
+    cubic = place.new_tensor([[0, 6, 0, 0], [-2, -3, 6, -1], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+    powers = torch.arange(4, device=away.device)
+    weights = (place - cell)[..., None] ** powers @ cubic  # (B, G, S, N, 4)
+    index = (cell.long()[..., None] + (powers - 1)).flatten(2)
+    values = torch.stack([positions_of_rows.rows, positions_of_rows.shift])  # (2, B, G, R)
+    near = values.gather(3, index.expand(2, -1, -1, -1)).view(2, *weights.shape)
+    rows, shift = (near * weights).sum(-1).unbind(0)
+    return rows, shift
 
 
 def _warp_to_scene(
@@ -726,12 +717,13 @@ def _warp_to_scene(
     Returns:
         Function from a slice of the scene rows to warped spectra (B, G, s, U).
     """
-    different = torch.zeros(len(positions.rows), dtype=torch.bool, device=positions.rows.device)
+    with_equal_blur = False
     if positions.rows.shape[1] == 2:
-        different = _different(positions.exposure_starts, timing, motion)
-    if not bool(different.any()):
+        paths, weights = _paths(positions.exposure_starts, timing, motion)
+        different = _different(paths, weights)
+        with_equal_blur = bool(different.any())
+    if not with_equal_blur:
         return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
-    paths, weights = _paths(positions.exposure_starts, timing, motion)
     paths = paths * different[:, None, None, None, None]
     real = spectra.values.real.dtype
     moment_slope = 0.5 * torch.gradient(_second_moments(paths, weights), dim=2)[0].to(real)[..., None]
@@ -744,13 +736,14 @@ def _warp_to_scene(
 
     def warped(part: slice) -> Tensor:
         first, last, _ = part.indices(count)
-        index = torch.arange(first - 2, last + 2, device=y.device).clamp(0, count - 1)  # two neighbours, see below
+        index = torch.arange(first - 2, last + 2, device=y.device).clamp_(0, count - 1)  # two neighbours, see below
         shape = (*y.shape[:2], len(index), len(by_x))
-        mean, moment = (spectra.values.new_zeros(shape) for _ in range(2))  # mean of the copies; and of y times them
+        totals = spectra.values.new_zeros(2, *shape)
+        mean, moment = totals  # of the copies, and of y times them
+        of_numbers = torch.view_as_real(totals)
         copies = spectra.warped_copies(node_rows[..., index], node_shift[..., index])
         for copy, of_node in zip(copies, factors[..., index, :, :], strict=True):
-            for total, factor in zip((mean, moment), of_node, strict=True):
-                torch.view_as_real(total).addcmul_(torch.view_as_real(copy), factor)
+            of_numbers.addcmul_(torch.view_as_real(copy), of_node)
 
         def neighbour(step: int) -> Tensor:
             return moment[:, :, 2 + step : len(index) - 2 + step]

@@ -526,9 +526,10 @@ def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration
     if fit.drift.shape[-1] > 1:  # speed at the time origin instead of the middle of the record
         acceleration = fit.drift[..., 1]
         motion = motion - acceleration * centre[..., 0]
-    values = (fit.amplitude, frequency, phase, motion, acceleration)
-    tones, frequencies, phases, image_motion, image_acceleration = (tensor(part).to(device) for part in values)
-    return Vibration(tones, frequencies, phases, image_motion, image_acceleration)
+    order = (-fit.amplitude).argsort(-1, stable=True)
+    tones = [np.take_along_axis(values, order, -1) for values in (fit.amplitude, frequency, phase)]
+    drift = np.stack([motion, acceleration, np.zeros_like(motion)], -1)
+    return Vibration.from_parameters(tensor(np.concatenate([*tones, drift], -1)).to(device))
 
 
 def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
