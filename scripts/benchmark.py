@@ -59,6 +59,7 @@ SECTIONS: dict[str, Section] = {  # in the order of the page
     "gpu": Section("Batches and devices"),
     "streaming": Section("Long stacks"),
     "slanted_edge": Section("Slanted-edge MTF"),
+    "orbit": Section("Vibrations measured in orbit"),
     "verdict": Section("Verdict on restorations", by_default=False),
     "honesty": Section("Reliable results that are wrong", by_default=False),
     "timing": Section("Mistakes of the timing", by_default=False),

@@ -1,7 +1,13 @@
 #!/usr/bin/env bash
 # Creates or updates .venv with the tested versions of all packages; does nothing if it is up to date.
+# "setup.sh user" installs only what users need: the package with video and scientific formats.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+case "${1:-}" in
+  "") extras='test,benchmark,docs' ;;
+  user) extras='video,formats' ;;
+  *) echo "setup: unknown argument '$1'; the only one is user" >&2; exit 2 ;;
+esac
 python=${PYTHON:-}
 if [ -z "$python" ]; then
   for candidate in python3.11 python3 python3.12 python3.13; do
@@ -16,9 +22,11 @@ if [ -z "$python" ]; then
   exit 2
 fi
 stamp=$(cat pyproject.toml scripts/constraints.txt | cksum)
-if [ "$(cat .venv/installed 2>/dev/null)" != "$stamp" ] || ! .venv/bin/rsvib --version >/dev/null 2>&1; then
+installed=$(cat .venv/installed 2>/dev/null || true)
+case "$installed" in "$stamp $extras" | "$stamp test,benchmark,docs") current=true ;; *) current=false ;; esac
+if ! $current || ! .venv/bin/rsvib --version >/dev/null 2>&1; then
   echo "setup: installing into .venv (a few minutes the first time)"
   [ -x .venv/bin/python ] || "$python" -m venv .venv
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e '.[test,benchmark,docs]'
-  printf '%s' "$stamp" > .venv/installed
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e ".[$extras]"
+  printf '%s' "$stamp $extras" > .venv/installed
 fi

@@ -196,7 +196,8 @@ _TONES = {
         "use frames at other or unequal intervals[; its frequency equals {multiple}the frame rate of {frame_rate:.5g} "
         "Hz, which a wrong frame_rows also causes: check that frame_rows counts the blanking rows and is not the image "
         "height]",
-        "offset gain of a tone, below 0.1",
+        "offset gain of a tone, below 0.1; in two frames below 0.3, where an image motion and another tone explain the "
+        "rows as well",
     ),
     "tones_alias": ReasonKind(
         "tones of {value:.5g} and {limit:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "

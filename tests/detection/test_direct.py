@@ -309,7 +309,7 @@ def test_side_tones_of_a_blind_tone_are_not_reported_as_tones(paper_camera, meth
     result = detect_vibration(frames, paper_camera, method=method)
     assert result.reliable.tolist() == [False, True]
     (reason,) = (reason for reason in result.findings[0] if reason.code == "tone_blind")
-    assert reason.value < reason.limit == 0.1
+    assert reason.value < reason.limit == 0.3  # two frames
     assert abs(float(result.vibration.frequency[0, 0]) - blind) < 1.0
     assert (result.vibration.amplitude[0] > 0).sum() == 1
 

@@ -230,3 +230,13 @@ def test_tensors_and_arrays_of_numbers():
         curve.at(1.2)
     with pytest.raises(ValueError, match=r"within 0 \.\.\. 1 cycles/px"):
         curve.at(torch.tensor([0.2, -0.1]))
+
+
+def test_edge_that_a_vibration_has_torn_apart_is_refused():
+    generator = torch.Generator().manual_seed(99)
+    y, x = torch.meshgrid(torch.arange(24) - 12.0, torch.arange(20) - 10.0, indexing="ij")
+    size, rate, phase = torch.rand(3, generator=generator).tolist()
+    shift = (2 + 4 * size) * torch.sin(y * (0.1 + 0.4 * rate) + 6 * phase)
+    roi = torch.sigmoid((x + 0.15 * y + shift) / 0.5) + 0.01 * torch.randn(24, 20, generator=generator)
+    with pytest.raises(ValueError, match="do not follow one edge"):
+        rsv.slanted_edge_mtf(roi)

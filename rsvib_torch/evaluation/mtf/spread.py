@@ -298,6 +298,8 @@ def fit_spread(fit: EdgeFit, scatter: Scatter, room: float) -> Spread:
         step = result.mean[:_EDGE]
         step[_SLOPES] -= fit.sides[:, 1]
         before, fit = fit, moved(fit, step)
+        if not float(fit.contrast) > 0:  # that of an edge that a vibration has torn apart, for example
+            raise ValueError("the pixels do not follow one edge between a dark and a bright side; choose another roi")
     assert result is not None
     return _sampled(before, result, knots, scatter, noise)
 
