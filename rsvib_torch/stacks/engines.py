@@ -1,7 +1,6 @@
 """Parallel processing of windows: threads of this process, or Dask workers."""
 
 import logging
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -47,6 +46,24 @@ def results_in_order(
         yield waiting.popleft().result()
 
 
+def in_threads(
+    work: Callable[..., _Result], items: Generator[tuple[Any, ...], None, None], *, at_once: int, threads: int
+) -> Generator[_Result, None, None]:
+    """Results of ``work(*item)`` in the order of the items, from threads of this process, while one more item is made.
+
+    Each of the ``at_once`` threads uses a number of ``threads`` of PyTorch.
+    """
+    share_one_heap()
+    default_threads = torch.get_num_threads()
+    pool = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
+    try:
+        with closing(items):
+            yield from results_in_order(items, lambda item: pool.submit(work, *item), lambda: at_once + 1, deque())
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        torch.set_num_threads(default_threads)  # the default of threads that start later
+
+
 def compute_here(
     job: StackJob,
     windows: Sequence[Window],
@@ -54,29 +71,13 @@ def compute_here(
     *,
     at_once: int,
 ) -> Generator[_Result, None, None]:
-    """Compute windows in threads of this process, ``at_once`` at a time, while one more is read.
-
-    ``finish`` is called with a result and its frames in the thread that computed it. Its results are in the order of
-    the windows.
-    """
-    share_one_heap()
-    default_threads = torch.get_num_threads()
-    threads = 1 if _one_thread_each(windows) else default_threads
-    pool = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
-    stopped = threading.Event()
+    """Compute windows in this process; ``finish`` gets a result and its frames in the thread that computed it."""
 
     def compute(window: Window, pixels: WindowFrames) -> _Result:
-        if stopped.is_set():
-            raise RuntimeError("stopped")
         return finish(job.compute(window, pixels), pixels)
 
-    try:
-        with closing(read_windows(job, windows)) as read:
-            yield from results_in_order(read, lambda item: pool.submit(compute, *item), lambda: at_once + 1, deque())
-    finally:
-        stopped.set()
-        pool.shutdown(wait=True, cancel_futures=True)
-        torch.set_num_threads(default_threads)  # the default of threads that start later
+    threads = 1 if _one_thread_each(windows) else torch.get_num_threads()
+    return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:

@@ -106,10 +106,6 @@ class StackManifest(Result, file_format="rsvib stack"):
             if record.window != number:
                 raise ValueError(f"windows[{number}].window: expected {number}, got {record.window}")
 
-    def header(self) -> dict[str, Any]:
-        """Everything that was determined before the first window, as made by ``manifest_header``."""
-        return {name: getattr(self, name) for name in ("input", "settings", "versions", "output")}
-
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
         vibration, restoration = self.lines()

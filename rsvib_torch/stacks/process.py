@@ -19,8 +19,7 @@ from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progres
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
 from rsvib_torch.stacks.manifest import manifest_header, manifest_text
-from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
-from rsvib_torch.stacks.run_folder import RunFolder, check_space, disk_errors_named, work_folder
+from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, manifest_path, run_to_file, work_folder
 from rsvib_torch.stacks.windows import Window
 
 _UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
@@ -215,14 +214,8 @@ def _store_windows(
             except ValueError:
                 folder.remove()
                 raise
-            names = [f"{window.index:06d}.npy"] if stored.frames else []
-            with disk_errors_named(folder):
-                for name in names:
-                    stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
-                    with folder.create(name) as file:
-                        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
-                        file.write(stack.data)  # errors of np.save do not contain the reason
-                folder.add(stored.record, names)
+            # channels may be stored last
+            folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
             done += window.kept
             if progress is not None:
                 progress(done, total)

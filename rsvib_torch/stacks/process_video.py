@@ -32,8 +32,14 @@ from rsvib_torch.stacks.engines import results_in_order
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
-from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
-from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
+from rsvib_torch.stacks.run_folder import (
+    RunFolder,
+    StackReport,
+    disk_errors_named,
+    manifest_path,
+    run_to_file,
+    work_folder,
+)
 from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, RestoredFrame, VideoRestorer
 from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
 from rsvib_torch.tracking import Margins
@@ -170,10 +176,7 @@ class _Encoder:
         assert self._writer is not None
         self._writer.close()
         self._writer = None
-        names = self._names(record["window"])
-        with self._folder.create(names[1]) as file:
-            np.save(file, last)
-        self._folder.add(record, names)
+        self._folder.add(record, [self._names(record["window"])[0]], np.ascontiguousarray(last))
 
     def last_frame(self, part: int) -> Frame | None:
         """The frame that a part ends with; None for the part before the first one."""
