@@ -11,18 +11,18 @@ Item = TypeVar("Item")
 _END: Any = object()
 
 
-def prefetched(items: Generator[Item, None, None], count: int) -> Generator[Item, None, None]:
+def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1) -> Generator[Item, None, None]:
     """Yield the items of a generator, which a thread makes while earlier ones are used; ``count`` of them wait.
 
-    The thread uses one thread of PyTorch. It ends with the generator, or when this one is closed. Errors are raised
-    behind the items before them.
+    The thread uses a number of ``threads`` of PyTorch. It ends with the generator, or when this one is closed. Errors
+    are raised behind the items before them.
 
     Example:
         >>> list(prefetched((letter for letter in "abc"), 2))
         ['a', 'b', 'c']
     """
-    threads = torch.get_num_threads()
-    pool = ThreadPoolExecutor(1, "rsvib-ahead", initializer=torch.set_num_threads, initargs=(1,))
+    before = torch.get_num_threads()
+    pool = ThreadPoolExecutor(1, "rsvib-ahead", initializer=torch.set_num_threads, initargs=(threads,))
     try:
         waiting = deque(pool.submit(next, items, _END) for _ in range(count))
         while (item := waiting.popleft().result()) is not _END:
@@ -31,4 +31,4 @@ def prefetched(items: Generator[Item, None, None], count: int) -> Generator[Item
     finally:
         pool.shutdown(cancel_futures=True)
         items.close()
-        torch.set_num_threads(threads)  # the default of threads that start later
+        torch.set_num_threads(before)  # the default of threads that start later

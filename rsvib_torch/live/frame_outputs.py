@@ -1,7 +1,6 @@
 """Outputs of video frames: files, pipes and a window."""
 
 from contextlib import suppress
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -10,6 +9,9 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.checks import needed_package
+from rsvib_torch.io.stack_format import H264
+from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.video import CONTAINERS, add_video, picture_of, presentation_times
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
@@ -64,13 +66,11 @@ class VideoOutput:
     """
 
     def __init__(self, path: Path, frame_rate: float, *, overwrite: bool = False) -> None:
-        if path.suffix.lower() not in (".mp4", ".mov", ".m4v", ".mkv"):
+        if path.suffix.lower() not in CONTAINERS:
             raise ValueError(f"{path}: a live video is written to .mp4, .mov, .m4v or .mkv; or to a pipe with --out -")
         self._av = needed_package("av", "writing video", "video")
-        self._rate = Fraction(frame_rate).limit_denominator(1001)
-        self._path, self._overwrite = path, overwrite
+        self._path, self._rate, self._overwrite = path, frame_rate, overwrite
         self._container: Any = None
-        self._stream: Any = None
 
     def write(self, frame: Frame, index: int) -> None:
         """Encode a frame.
@@ -79,14 +79,14 @@ class VideoOutput:
             FileExistsError: If it is the first frame, and the file exists.
             OSError: If it cannot be written; the file has the frames before.
         """
-        grey = frame.ndim == 2
+        pixels = frame if frame.ndim == 2 else np.moveaxis(frame, -1, 0)
         if self._container is None:
-            self._create(frame.shape[0], frame.shape[1], grey=grey)
-        picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="gray" if grey else "rgb24")
-        picture.pts, picture.time_base = index, 1 / self._rate
+            self._create(pixels.shape)
+        picture = picture_of(pixels, self._path, self._info)
+        picture.pts, picture.time_base = index, self._unit
         self._encode(picture)
 
-    def _create(self, height: int, width: int, *, grey: bool) -> None:
+    def _create(self, shape: tuple[int, ...]) -> None:
         if self._overwrite:
             self._path.unlink(missing_ok=True)  # a link is replaced, not the file behind it
         try:
@@ -94,14 +94,13 @@ class VideoOutput:
         except FileExistsError as error:
             raise FileExistsError(f"{self._path} was created by another program; choose another name") from error
         sync(self._path.absolute().parent)
-        lossy = self._path.suffix.lower() != ".mkv"
+        lossy = self._path.suffix.lower() in H264
+        self._info = StackInfo((2, *shape), "uint8", 255.0, frame_rate=self._rate)  # of any number of frames
+        self._unit, _ = presentation_times(self._info)
         self._container = self._av.open(str(self._path), "w", options=_FRAGMENTS if lossy else _CLUSTERS)
         # ultrafast keeps up with a camera; the other presets make smaller files of the same quality
-        options = {"crf": "16", "preset": "ultrafast"} if lossy else {"level": "3", "g": "1"}
-        self._stream = self._container.add_stream("libx264" if lossy else "ffv1", self._rate, options=options)
-        self._stream.height, self._stream.width = height, width
-        self._stream.pix_fmt = "yuv420p" if lossy else "gray" if grey else "bgr0"
-        self._stream.codec_context.time_base = 1 / self._rate
+        options = {"crf": "16", "preset": "ultrafast"} if lossy else {}
+        self._stream = add_video(self._container, self._path, self._info, None, **options)
 
     def _encode(self, picture: Any) -> None:
         """Encode and write a frame; None for those that the encoder has not yet returned."""

@@ -20,7 +20,7 @@ from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment,
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import FrameError
 from rsvib_torch.io.stack_reading import open_stack
-from rsvib_torch.io.video_parts import planes_of
+from rsvib_torch.io.video_parts import PlaneReader, planes_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.sampling import recorded_offsets
@@ -69,15 +69,12 @@ class VideoPasses:
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
+    planes: PlaneReader | None  # how planes are stored, if frames are planes
 
     @property
     def parts(self) -> int:
         """Number of parts."""
         return -(-len(self.starts) // PART_FRAMES)
-
-    def ends_part(self, index: int) -> bool:
-        """Whether a frame is the last one of a part."""
-        return index % PART_FRAMES == PART_FRAMES - 1 or index == len(self.starts) - 1
 
     def decoded(self) -> Generator[Frame | str, None, None]:
         """Every frame, or why it cannot be read; decoded ahead in a thread."""

@@ -300,7 +300,8 @@ def test_signals_end_a_session(tmp_path, number):
         saved.append(rsv.read_stack(tmp_path / "video.mkv"))
 
     report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
-    assert report.frames == len(saved[0]) == 6
+    assert report.frames == len(saved[0])
+    assert 6 <= report.frames <= 8  # at most two frames are tracked ahead of the written one
     assert signal.getsignal(number) == before
 
 
