@@ -26,23 +26,15 @@ Scope = Literal["file", "image", "stack"]
 
 @dataclass(frozen=True)
 class Tag:
-    """An entry in the header of a TIFF file.
+    """An entry in the header of a TIFF file."""
 
-    Attributes:
-        code: Number of the tag.
-        dtype: Number of its data type in TIFF.
-        count: Number of values.
-        value: A number, text, bytes, or a tuple of numbers.
-        first_page: Whether only the first page has it.
-        scope: What it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``:
-            for the same number of them in the same data type only; ``"file"``: for any frames.
-    """
-
-    code: int
-    dtype: int
-    count: int
-    value: Any
-    first_page: bool
+    code: int  # number of the tag
+    dtype: int  # number of its data type in TIFF
+    count: int  # number of values
+    value: Any  # a number, text, bytes, or a tuple of numbers
+    first_page: bool  # whether only the first page has it
+    # what it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``: for the same
+    # number of them in the same data type only; ``"file"``: for any frames
     scope: Scope
 
 

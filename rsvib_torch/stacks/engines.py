@@ -3,9 +3,9 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -19,14 +19,6 @@ from rsvib_torch.stacks.windows import Window
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
-
-
-def _one_thread_each(windows: Sequence[Window]) -> bool:
-    """Whether to compute every window on one thread, which is the case if there are several windows.
-
-    Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
-    """
-    return not all(window.alone for window in windows)
 
 
 def results_in_order(
@@ -76,7 +68,8 @@ def compute_here(
     def compute(window: Window, pixels: WindowFrames) -> _Result:
         return finish(job.compute(window, pixels), pixels)
 
-    threads = 1 if _one_thread_each(windows) else torch.get_num_threads()
+    # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
+    threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
     return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
@@ -105,25 +98,19 @@ def _device_of_worker() -> str:
     return f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0"
 
 
-@contextmanager
-def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
+def _dask_client(scheduler: str, workers: int) -> Any:
+    """A client of the scheduler at an address, or of a number of workers on this machine, which end with it."""
     distributed = needed_package("distributed", "the Dask engine", "distributed")
-    if scheduler != "local":
-        try:
-            client = distributed.Client(scheduler, timeout=30, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise OSError(f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}") from error
-        with client:
-            yield client
-        return
-    options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
-    with ExitStack() as opened:
-        try:
-            cluster = opened.enter_context(distributed.LocalCluster(**options, processes=True, memory_limit=0))
-            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
-        except (OSError, RuntimeError) as error:
-            raise OSError(f"Dask workers cannot be started: {' '.join(str(error).split())}") from error
-        yield client
+    options: dict[str, Any] = {"address": scheduler, "timeout": 30}
+    if scheduler == "local":
+        options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
+        options |= {"dashboard_address": None, "silence_logs": logging.ERROR}
+    try:
+        return distributed.Client(**options, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        failed = f"no Dask scheduler answers at {scheduler}"
+        failed = "Dask workers cannot be started" if scheduler == "local" else failed
+        raise OSError(f"{failed}: {' '.join(str(error).split())}") from error
 
 
 @dataclass(frozen=True)
@@ -173,7 +160,7 @@ def compute_with_dask(
     scheduler ``"local"`` starts a number of workers on this machine.
     """
     job = replace(job, source=job.source.absolute())
-    one_thread = _one_thread_each(windows)
+    one_thread = not all(window.alone for window in windows)
     with _dask_client(scheduler, workers) as client:
 
         def submit(window: Window) -> _DaskResult:

@@ -15,7 +15,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.presentation import Summarised, plain_values
+from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
@@ -27,6 +27,7 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
+from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -43,7 +44,7 @@ from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.stacks.followed_window import WARM_UP, follow_window
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
-from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
+from rsvib_torch.stacks.windows import Window, cut_windows, window_record, window_timing
 
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
 
@@ -116,6 +117,14 @@ class StackJob:
     device: str = "cpu"  # device for the computation
     window: int = StackOptions.window  # maximum number of frames of a window
     follow: bool = False  # whether the vibration is followed from frame to frame
+
+    def open(self) -> FrameReader:
+        """Open the stack, which must not have changed."""
+        reader = open_stack(self.source)
+        if reader.info != self.info:
+            reader.close()
+            raise ValueError(f"{self.source} has changed since it was first opened; start again")
+        return reader
 
     @property
     def joined(self) -> bool:
@@ -256,26 +265,30 @@ class StackJob:
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
-        verdict = None if restoration is None else restoration.verdict
-        return {
-            "window": window.index,
-            "first": window.first,
-            "last": window.last,
-            "start_time": float(self.timing.frame_starts(window.first + 1)[-1]),
-            "written": written,
-            "frames": "restored" if result.restored else "as taken",
-            "detection": plain_values(result.detection and DetectedVibration.of(result.detection)),
-            "left_alone": [] if restoration is None else plain_values(restoration.left_alone),
-            "outcome": None if verdict is None else verdict.overall,
-            "summary": None if verdict is None else verdict.sentence,
-            "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            "error": result.error,
-            "bad_frames": {str(index): reason for index, reason in result.bad_frames.items()},
-            "middle": result.middle,
-            "restored_frames": result.restored * len(set(result.indices) - {*result.unchanged})
-            if self.follow
-            else None,
-        }
+        restored_frames = result.restored * len(set(result.indices) - {*result.unchanged}) if self.follow else None
+        return window_record(
+            None if restoration is None else restoration.verdict,
+            result.bad_frames,
+            restored=result.restored,
+            window=window.index,
+            first=window.first,
+            last=window.last,
+            start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
+            written=written,
+            detection=result.detection and DetectedVibration.of(result.detection),
+            left_alone=() if restoration is None else restoration.left_alone,
+            error=result.error,
+            middle=result.middle,
+            restored_frames=restored_frames,
+        )
+
+
+def stored_frame(reader: FrameReader, index: int) -> NDArray[Any] | str:
+    """Pixels of a frame as stored, or why it cannot be read."""
+    try:
+        return reader.frame(index)
+    except FrameError as error:
+        return " ".join(str(error).split())
 
 
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
@@ -283,18 +296,11 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
 
     The frames that neighbours share are read once.
     """
-    with closing(open_stack(job.source)) as reader:
-        if reader.info != job.info:
-            raise ValueError(f"{job.source} has changed since it was first opened; start again")
+    with closing(job.open()) as reader:
         last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
         shared = 1 + (WARM_UP if job.follow else 0)
         for window in windows:
-            frames: WindowFrames = []
-            for index in window.frames:
-                try:
-                    frames.append(last[index] if index in last else reader.frame(index))
-                except FrameError as error:
-                    frames.append(" ".join(str(error).split()))
+            frames = [last[index] if index in last else stored_frame(reader, index) for index in window.frames]
             last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
             yield window, frames
 

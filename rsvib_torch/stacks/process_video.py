@@ -250,6 +250,8 @@ def _encode_part(
             writer = PartWriter(folder.create(name), sink, content, video.planes)
         opened.callback(writer.abandon)
         for track, frame, restored in frames:
+            if tracks:
+                progress()  # the frame before is complete
             before = _without_gaps(restored, before, layout, border)
             final = layout.frame(_cut(before, margins))
             with disk_errors_named(folder):
@@ -260,13 +262,13 @@ def _encode_part(
             if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
                 follows = bool(pair) and pair[-1][0].index == track.index - 1
                 pair = [*pair, (track, frame)] if follows else [(track, frame)]
-            progress()
         with disk_errors_named(folder):
             writer.close()
     assert before is not None
     verdict = video.verdict(pair) if len(pair) == 2 else None
     record = video.record(part, tracks, motion, verdict, written)
     folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
+    progress()
 
 
 def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:

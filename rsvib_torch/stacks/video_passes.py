@@ -12,14 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.prefetch import prefetched
-from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
+from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.tables import Array, tensor
 from rsvib_torch.detection.recorded.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.stack_info import FrameError
-from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.io.video_parts import PlaneReader, planes_of
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.gyroscope_rates import AngularRates
@@ -28,9 +26,10 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.stacks.job import StackJob
+from rsvib_torch.stacks.job import StackJob, stored_frame
 from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer
 from rsvib_torch.stacks.window_restoration import pair_verdict
+from rsvib_torch.stacks.windows import window_record
 from rsvib_torch.tracking import Margins
 from rsvib_torch.tracking.camera_path import CameraPath, Tone, camera_path, shake
 from rsvib_torch.tracking.recorded_rotation import RecordedRotation
@@ -81,18 +80,10 @@ class VideoPasses:
         return prefetched(self._decoded(), _AHEAD)
 
     def _decoded(self) -> Generator[Frame | str, None, None]:
-        reader = open_stack(self.job.source)
-        try:
-            if reader.info != self.job.info:
-                raise ValueError(f"{self.job.source} has changed since it was first opened; start again")
-            source: Any = planes_of(reader) or reader if self.layout.planar else reader
+        with closing(self.job.open()) as reader:
+            source: Any = planes_of(reader) if self.layout.planar else reader
             for index in range(len(self.starts)):
-                try:
-                    yield source.frame(index)
-                except FrameError as error:
-                    yield " ".join(str(error).split())
-        finally:
-            reader.close()
+                yield stored_frame(source, index)
 
     # First pass: the motion
 
@@ -233,29 +224,25 @@ class VideoPasses:
         """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
         path = motion.path
         detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
-        faults = {str(track.index): track.fault for track in tracks if track.fault is not None}
-        moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
         left = [
             Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
             for name, why in zip(AXIS_NAMES, detection.reasons if detection else (), strict=False)
             if why
         ]
-        return {
-            "window": part,
-            "first": tracks[0].index,
-            "last": tracks[-1].index,
-            "start_time": tracks[0].time,
-            "written": len(tracks),
-            "frames": "restored" if moved else "as taken",
-            "detection": detection and plain_values(detection),
-            "left_alone": plain_values(left),
-            "outcome": None if verdict is None else verdict.overall,
-            "summary": None if verdict is None else verdict.sentence,
-            "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            "error": None,
-            "bad_frames": faults,
-            "shaking": self.shaking(motion, tracks[0].index, first_frames),
-        }
+        return window_record(
+            verdict,
+            {track.index: track.fault for track in tracks if track.fault is not None},
+            restored=any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None),
+            window=part,
+            first=tracks[0].index,
+            last=tracks[-1].index,
+            start_time=tracks[0].time,
+            written=len(tracks),
+            detection=detection,
+            left_alone=left,
+            error=None,
+            shaking=self.shaking(motion, tracks[0].index, first_frames),
+        )
 
     def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
         """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
