@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.io.stack_format import H264, VIDEO
+from rsvib_torch.io.formats import H264, VIDEO
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import camera_name
 

@@ -6,11 +6,12 @@ between (``FrameCounter``).
 """
 
 import math
+import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol, get_args
@@ -23,6 +24,7 @@ from rsvib_torch.io import open_stack, read_stack_info, timing_from_first_frame
 from rsvib_torch.motion.timing import SensorTiming
 
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
+_CHECK = 0.05  # s between checks whether the source has ended, or the session
 _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 
 
@@ -212,25 +214,15 @@ def _channels_first(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 class FrameReader:
-    """Frames of a source, read in a thread: the source never waits, and the oldest waiting frames are dropped.
+    """Frames of a source, read in a thread; up to a number of them wait.
 
-    Args:
-        source: The source.
-        waiting: Largest number of frames that wait.
-        drops: Whether frames are dropped; if not, the source waits.
-
-    Attributes:
-        dropped: Number of frames that were dropped.
-        stopped_at: s of ``time.perf_counter``, when ``stop`` was called; None before.
+    If frames may be dropped, the source never waits, and the oldest waiting frames are dropped and counted.
     """
 
     def __init__(self, source: FrameSource, waiting: int = 64, *, drops: bool = True) -> None:
-        self._source, self._limit, self._drops = source, check_whole_number("waiting", waiting, at_least=1), drops
-        self._frames: deque[TimedFrame] = deque()
-        self._changed, self._ended = threading.Condition(), False
+        self._source, self._drops, self._stopped, self.dropped = source, drops, False, 0
+        self._frames: queue.Queue[TimedFrame] = queue.Queue(check_whole_number("waiting", waiting, at_least=1))
         self._error: Exception | None = None
-        self.dropped = 0
-        self.stopped_at: float | None = None
         self._thread = threading.Thread(target=self._read, name="rsvib-read", daemon=True)
 
     def start(self) -> None:
@@ -240,40 +232,38 @@ class FrameReader:
     def _read(self) -> None:
         try:
             for frame in self._source.frames():
-                with self._changed:
-                    while not self._drops and len(self._frames) >= self._limit and self.stopped_at is None:
-                        self._changed.wait()
-                    if self.stopped_at is not None:
+                while not self._put(frame):
+                    if self._stopped:
                         return
-                    if len(self._frames) >= self._limit:
-                        self._frames.popleft()
-                        self.dropped += 1
-                    self._frames.append(frame)
-                    self._changed.notify_all()
+                    if self._drops:
+                        with suppress(queue.Empty):
+                            self._frames.get_nowait()
+                            self.dropped += 1
         except Exception as error:  # raised again in the thread that takes the frames
             self._error = error
-        finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify_all()
+
+    def _put(self, frame: TimedFrame) -> bool:
+        """Whether there was room for a frame; waits for it if no frames may be dropped."""
+        try:
+            self._frames.put(frame, block=not self._drops, timeout=_CHECK)
+        except queue.Full:
+            return False
+        return True
 
     def __iter__(self) -> Iterator[TimedFrame]:
-        while self.stopped_at is None:
-            with self._changed:
-                if not self._frames and self._ended:
+        while not self._stopped:
+            ended = not self._thread.is_alive()
+            try:
+                yield self._frames.get(block=not ended, timeout=_CHECK)
+            except queue.Empty:
+                if ended:
                     break
-                if not self._frames:
-                    self._changed.wait(0.5)  # s; ``stop`` is noticed in between
-                    continue
-                frame = self._frames.popleft()
-                self._changed.notify_all()
-            yield frame
         if self._error is not None:
             raise self._error
 
     def stop(self) -> None:
         """End the iteration; may be called by a signal handler, because it waits for no other thread."""
-        self.stopped_at = self.stopped_at or time.perf_counter()
+        self._stopped = True
 
     def close(self) -> None:
         """Stop reading. The thread itself releases the source, because libraries crash if another one does so.
@@ -281,6 +271,4 @@ class FrameReader:
         A thread that waits for a source longer than ``_LONGEST_READ`` ends with the process.
         """
         self.stop()
-        with self._changed:
-            self._changed.notify_all()
         self._thread.join(_LONGEST_READ)

@@ -19,6 +19,7 @@ from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
+from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.full_scale import (
     check_dtype,
@@ -27,7 +28,6 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
-from rsvib_torch.io.stack_format import FrameReader
 from rsvib_torch.io.stack_info import FrameError, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -41,9 +41,15 @@ from rsvib_torch.options import (
     StackOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
-from rsvib_torch.stacks.followed_window import WARM_UP, follow_window
 from rsvib_torch.stacks.memory import windows_at_once
-from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
+from rsvib_torch.stacks.window_restoration import (
+    WARM_UP,
+    RestoredFrames,
+    follow_window,
+    frame_fault,
+    restore_trusted,
+    without_data,
+)
 from rsvib_torch.stacks.windows import Window, cut_windows, window_record, window_timing
 
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read

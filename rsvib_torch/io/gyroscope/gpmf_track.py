@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.io.gyroscope.gcsv_log import check_orientation, oriented
-from rsvib_torch.io.gyroscope.rates_table import angular_rates
+from rsvib_torch.io.gyroscope.text_logs import angular_rates, check_orientation, oriented
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 Array = NDArray[np.float64]

@@ -9,9 +9,8 @@ from typing import Literal, get_args
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.reading import check_regular
-from rsvib_torch.io.gyroscope.gcsv_log import is_gcsv, read_gcsv
 from rsvib_torch.io.gyroscope.gpmf_track import is_mp4, read_gpmf
-from rsvib_torch.io.gyroscope.rates_table import read_rates_table
+from rsvib_torch.io.gyroscope.text_logs import is_gcsv, read_gcsv, read_rates_table
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import check_times
 from rsvib_torch.options import TimeUnit
