@@ -80,21 +80,13 @@ def check_space(path: Path, needed: int) -> None:
 class RunFolder:
     """The work folder of a run, locked until it is closed.
 
-    Args:
-        sink: The output of the run.
-        header: Input, settings and versions of the run: it is resumed only if they are unchanged.
-        resume: Whether to continue an interrupted run.
-
-    Raises:
-        BlockingIOError: If another run writes the same output.
-        FileExistsError: If there is an interrupted run and ``resume`` is False, or the folder was not made by a run.
-        OSError: If the folder cannot be created.
-        ValueError: If the header differs from that of the run to resume, or the journal was changed.
+    A run is resumed only if its ``header`` is unchanged: input, settings and versions. A folder that no run has made,
+    or in which another run writes, is refused.
     """
 
     def __init__(self, sink: Path, header: Mapping[str, Any], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
-        self._windows: dict[int, tuple[int, int]] = {}  # of each finished window, place in the journal and frames
+        self._windows: dict[int, tuple[int, int, int]] = {}  # finished: place and size of the line; frames
         self._digest = b""  # of the last line of the journal
         make_folder(self.path.parent)
         while not self._open():
@@ -103,7 +95,8 @@ class RunFolder:
             opened.callback(os.close, self._folder)
             names = self._checked_names()
             flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | _SAFELY
-            self._journal = opened.enter_context(os.fdopen(os.open(_JOURNAL, flags, 0o600, dir_fd=self._folder), "rb"))
+            self._journal = os.open(_JOURNAL, flags, 0o600, dir_fd=self._folder)
+            opened.callback(os.close, self._journal)
             self._read_journal(dict(header), names, resume=resume)
             self._opened = opened.pop_all()
 
@@ -166,18 +159,19 @@ class RunFolder:
         """Find the windows whose files are as they were written; a journal without windows begins anew."""
         start_over = f"delete {self.path} to start over"
         stored, end = None, 0
-        for line in self._journal:
-            if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
-                break
-            digest, _, body = line[:-1].partition(b" ")
-            if digest != _keyed(body, self._digest):
-                raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
-            entry = json.loads(body)
-            if end == 0:
-                stored = entry
-            else:
-                self._windows[entry["record"]["window"]] = end, entry["record"]["written"]
-            self._digest, end = digest, end + len(line)
+        with self.open(_JOURNAL) as lines:
+            for line in lines:
+                if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
+                    break
+                digest, _, body = line[:-1].partition(b" ")
+                if digest != _keyed(body, self._digest):
+                    raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
+                entry = json.loads(body)
+                if end == 0:
+                    stored = entry
+                else:
+                    self._windows[entry["record"]["window"]] = end, len(line), entry["record"]["written"]
+                self._digest, end = digest, end + len(line)
         if end == 0 and set(names) > {_JOURNAL}:
             raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
         if not self._windows:
@@ -189,7 +183,7 @@ class RunFolder:
             )
         elif difference := _difference(stored, header):
             raise ValueError(f"{self.sink}: cannot resume: {difference}; {start_over}")
-        os.ftruncate(self._journal.fileno(), end)
+        os.ftruncate(self._journal, end)
         if not self._windows:
             self._append(header)
             os.fsync(self._folder)
@@ -206,20 +200,20 @@ class RunFolder:
 
     def _entry(self, window: int) -> dict[str, Any]:
         """The line of a window, which is not kept in memory."""
-        self._journal.seek(self._windows[window][0])
-        entry: dict[str, Any] = json.loads(self._journal.readline().partition(b" ")[2])
+        place, size, _ = self._windows[window]
+        entry: dict[str, Any] = json.loads(os.pread(self._journal, size, place).partition(b" ")[2])
         return entry
 
-    def _append(self, entry: Mapping[str, Any]) -> int:
-        """Write a line of the journal, which is on the disk when the function returns; its place."""
-        journal = self._journal.fileno()
-        body = json.dumps(entry, allow_nan=False).encode()
+    def _append(self, entry: Mapping[str, Any]) -> tuple[int, int]:
+        """Write a line of the journal, which is on the disk when the function returns; its place and size."""
+        body = json.dumps(entry).encode()
         self._digest = _keyed(body, self._digest)
-        place, line = os.fstat(journal).st_size, memoryview(self._digest + b" " + body + b"\n")
-        while line:
-            line = line[os.write(journal, line) :]
-        os.fsync(journal)
-        return place
+        line = self._digest + b" " + body + b"\n"
+        place, remaining = os.fstat(self._journal).st_size, memoryview(line)
+        while remaining:
+            remaining = remaining[os.write(self._journal, remaining) :]
+        os.fsync(self._journal)
+        return place, len(line)
 
     def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
         with self.open(name) as file:
@@ -251,7 +245,7 @@ class RunFolder:
                     file.write(array.data)  # errors of np.save do not contain the reason
             digests = {name: self._digest_of(name, synchronised=True) for name in names}
             os.fsync(self._folder)  # their names
-            self._windows[record["window"]] = self._append({"record": record, "files": digests}), record["written"]
+            self._windows[record["window"]] = *self._append({"record": record, "files": digests}), record["written"]
 
     def __contains__(self, window: int) -> bool:
         return window in self._windows
@@ -264,7 +258,7 @@ class RunFolder:
     @property
     def written(self) -> int:
         """Number of their frames."""
-        return sum(frames for _, frames in self._windows.values())
+        return sum(frames for *_, frames in self._windows.values())
 
     def records(self) -> Iterator[dict[str, Any]]:
         """Records of the finished windows in order."""
