@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.formats import FrameReader
-from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame
+from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
 
 Read = Callable[[int, int], NDArray[Any]]
 

@@ -4,57 +4,19 @@ The table is data. The module that reads and writes a format is imported when a 
 or written (``packaged_format``).
 """
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from numpy.typing import NDArray
 
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import quoted
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
 
 Frame = NDArray[Any]
-
-# Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
-H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
-READ_ONLY_VIDEO = (".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
-VIDEO = (*FFV1, *H264, *READ_ONLY_VIDEO)
-
-
-class FrameReader(Protocol):
-    """An open stack; frames are read one at a time, in any order."""
-
-    info: StackInfo
-
-    def frame(self, index: int) -> Frame:
-        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
-
-    def close(self) -> None:
-        """Close the file, if it is open between frames."""
-        return
-
-
-_RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
-
-
-def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
-    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them.
-
-    Example:
-        >>> split_range(Path("clip.mp4[100:200]"))
-        (PosixPath('clip.mp4'), (100, 200))
-        >>> split_range(Path("clip.mp4"))
-        (PosixPath('clip.mp4'), None)
-    """
-    found = _RANGE.fullmatch(path.name)
-    if found is None or path.exists():
-        return path, None
-    name, start, end = found.groups()
-    return path.with_name(name), (int(start or 0), int(end) if end else None)
 
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or

@@ -17,9 +17,9 @@ from rsvib_torch.core.arrays import FramesLike
 from rsvib_torch.core.free_memory import check_fits
 from rsvib_torch.core.progress import steps
 from rsvib_torch.io.blocks import part_reader
-from rsvib_torch.io.formats import FrameReader, find_format, split_range
+from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import FrameReader, StackInfo, split_range
 
 PathLike = str | os.PathLike[str]
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.io.formats import H264, VIDEO
-from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
+from rsvib_torch.io.stack_info import H264, VIDEO, FrameError, StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import camera_name
 
 CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.io.formats import H264, FrameReader
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import H264, FrameReader, StackInfo
 from rsvib_torch.io.video import (
     CONTAINERS,
     Sound,

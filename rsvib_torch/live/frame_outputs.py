@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.io.formats import H264
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import H264, StackInfo
 from rsvib_torch.io.video import CONTAINERS, add_video, picture_of, presentation_times
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB

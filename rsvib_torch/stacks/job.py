@@ -19,7 +19,6 @@ from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
-from rsvib_torch.io.formats import FrameReader
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
 from rsvib_torch.io.full_scale import (
     check_dtype,
@@ -28,7 +27,7 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming

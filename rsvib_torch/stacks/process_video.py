@@ -17,9 +17,8 @@ from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.validation import fields_of
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment
 from rsvib_torch.frames.entry_points import file_options
-from rsvib_torch.io.formats import split_range
 from rsvib_torch.io.gyroscope.read_gyroscope import read_gyroscope
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS
