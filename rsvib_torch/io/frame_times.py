@@ -42,31 +42,21 @@ class TimingWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class _Spacing:
-    """Spacing of the frames of a file.
+    """Spacing of the frames of a file."""
 
-    Attributes:
-        numbers: Number of intervals from the first frame to each frame, more than one where frames were dropped, (T,).
-        interval: Interval without dropped frames in s: of a straight line, or the median if the rate is variable.
-        shortest: Shortest interval in s if the rate is variable, otherwise ``interval``.
-        longest: Longest interval in s if the rate is variable, otherwise ``interval``.
-        error: Error of ``interval`` in s due to the error of the times.
-        equal: Whether the times are whole numbers of intervals apart, to within their error, 2 % of an interval (clock
-            of a telephone or camera), and a quarter of an interval.
-    """
-
-    numbers: NDArray[np.float64]
-    interval: float
-    shortest: float
-    longest: float
-    error: float
+    numbers: NDArray[np.float64]  # (T,) intervals from the first frame to each, more than one where frames were dropped
+    interval: float  # s, without dropped frames: of a straight line, or the median if the rate is variable
+    shortest: float  # s, shortest interval if the rate is variable, otherwise ``interval``
+    longest: float  # s, longest interval if the rate is variable, otherwise ``interval``
+    error: float  # s, of ``interval`` due to the error of the times
+    # whether times are whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one
     equal: bool
 
 
 def _spacing(info: StackInfo) -> _Spacing | None:
     """Spacing according to the times or the frame rate of a file; None if it states neither.
 
-    Raises:
-        ValueError: If times do not increase, or they or the rate are not those of a camera.
+    Impossible ones are refused.
     """
     few = info.frame_times is None or len(info.frame_times) < 2
     if few and info.frame_rate is None:
@@ -162,11 +152,7 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
 
 
 def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
-    """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced.
-
-    Warns:
-        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
-    """
+    """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced."""
     if timing.frame_start_times is not None:
         return timing
     _warn_of_rate(info, timing)

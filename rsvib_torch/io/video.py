@@ -113,17 +113,11 @@ def _frames(container: Any) -> Generator[Any, None, None]:
 
 @dataclass(frozen=True)
 class Picture:
-    """How the pixels of a video are stored.
+    """How the pixels of a video are stored."""
 
-    Attributes:
-        layout: Name of the pixel format in FFmpeg.
-        colorspace: Matrix of luma and chroma, code of FFmpeg.
-        color_range: Range of the counts, code of FFmpeg: 2 is full, others are limited.
-    """
-
-    layout: str
-    colorspace: int
-    color_range: int
+    layout: str  # name of the pixel format in FFmpeg
+    colorspace: int  # matrix of luma and chroma, code of FFmpeg
+    color_range: int  # range of the counts, code of FFmpeg: 2 is full, others are limited
 
 
 def _time_of(frame: Any, stream: Any) -> Fraction | None:
@@ -333,12 +327,7 @@ def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: 
 
 
 class Sound:
-    """Sound of another video, copied between the frames of a video without encoding it.
-
-    Args:
-        output: The open container to write; streams are added to it.
-        source: The open container with the sound; None for none.
-    """
+    """Sound of another open video (None: none), copied between the frames of an open video to write."""
 
     def __init__(self, output: Any, source: Any) -> None:
         streams = source.streams.audio if source is not None else ()

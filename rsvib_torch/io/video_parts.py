@@ -42,15 +42,9 @@ def planes_of(reader: FrameReader) -> "PlaneReader | None":
 
 
 class PlaneReader:
-    """Frames of a 4:2:0 video as their planes: (3 H / 2, W) uint8, Y above U and V.
+    """Frames of an open 4:2:0 video as their planes: (3 H / 2, W) uint8, Y above U and V.
 
-    Args:
-        reader: The open video.
-
-    Attributes:
-        picture: How the pixels are stored.
-        black: Count of black in Y.
-        white: Count of white in Y.
+    ``picture`` states how pixels are stored, ``black`` and ``white`` are those counts in Y.
     """
 
     def __init__(self, reader: VideoReader) -> None:
@@ -60,11 +54,7 @@ class PlaneReader:
         self.black, self.white = (0.0, 255.0) if full else (16.0, 235.0)
 
     def frame(self, index: int) -> Frame:
-        """Planes of a frame as stored.
-
-        Raises:
-            FrameError: If it cannot be decoded.
-        """
+        """Planes of a frame as stored."""
         planes: Frame = self._reader.decoded(index).to_ndarray()
         return planes
 
@@ -76,13 +66,10 @@ class PlaneReader:
 
 
 class PartWriter:
-    """A file with consecutive frames of a video; only ``join_parts`` gives them their times.
+    """A new file with consecutive frames of a video; only ``join_parts`` gives them their times.
 
-    Args:
-        file: The new file.
-        video: Name of the video, whose ending selects container and codec.
-        info: Content of the video.
-        planes: The source, if frames are its planes; None for pixels (H, W) or (C, H, W).
+    The ending of ``video`` selects container and codec. Frames are the planes of a source, or pixels (H, W) or (C, H,
+    W).
     """
 
     def __init__(self, file: BinaryIO, video: Path, info: StackInfo, planes: PlaneReader | None) -> None:

@@ -122,11 +122,7 @@ class _DaskResult:
     window: Window
 
     def result(self) -> Any:
-        """Wait for the result.
-
-        Raises:
-            OSError: If the workers of the window died repeatedly, there are none, or the scheduler does not answer.
-        """
+        """Wait for the result, as long as there are workers and a scheduler."""
         distributed = needed_package("distributed", "the Dask engine", "distributed")
         last_seen = time.monotonic()
         while True:

@@ -92,38 +92,26 @@ class FrameLayout:
 
 @dataclass(frozen=True, eq=False)
 class RestoredFrame:
-    """A restored frame.
+    """A restored frame."""
 
-    Attributes:
-        planes: Its planes.
-        visible: For each plane, the pixels (H, W) that the sensor recorded; None if it recorded all.
-        fault: Why the frame could not be used; its planes are then those of the frame as taken, if there are any.
-    """
-
-    planes: list[Frame] | None
-    visible: list[NDArray[np.bool_]] | None
-    fault: str | None = None
+    planes: list[Frame] | None  # those of the frame as taken if it could not be used, if there are any
+    visible: list[NDArray[np.bool_]] | None  # of each plane, the pixels (H, W) that the sensor recorded; None: all
+    fault: str | None = None  # why the frame could not be used
 
 
 @dataclass(frozen=True, eq=False)
 class VideoRestorer:
     """Restores the frames of a video one by one.
 
-    Args:
-        layout: Layout of the frames.
-        timing: The sensor.
-        options: Method of ``restore`` and its options. ``"dewarp"`` interpolates once, in the frame as stored. Of other
-            methods, the vibration is undone first, and then the frame is moved; chroma of half the resolution is only
-            dewarped, because its blur is half as wide.
-        device: Device for the computation.
-        masks: Whether ``RestoredFrame.visible`` is needed.
+    ``"dewarp"`` interpolates once, in the frame as stored. Of other methods, the vibration is undone first, and then
+    the frame is moved; chroma of half the resolution is only dewarped, because its blur is half as wide.
     """
 
     layout: FrameLayout
     timing: SensorTiming
     options: RestorationOptions
     device: str = "cpu"
-    masks: bool = True
+    masks: bool = True  # whether ``RestoredFrame.visible`` is needed
 
     def restored(self, frame: Frame | str, track: FrameTrack) -> RestoredFrame:
         """Restore a frame as stored, or the reason why it cannot be read."""

@@ -179,14 +179,9 @@ def follow_window(
 ) -> tuple[DetectedVibration, int, RestoredFrames | None, tuple[int, ...]] | None:
     """Follow the vibration through a window and the frames before it, and restore the frames of the window.
 
-    Args:
-        frames: The usable frames, (T, H, W) or (T, C, H, W), full scale 1.
-        indices: Their indices in the stack.
-        times: Their exposure starts in s from the start of the window.
-        window: The window.
-        timing: The sensor.
-        restoration: Options of ``restore``; None for detection only.
-        force: Whether to return restored frames even if they are judged worse than the raw ones.
+    ``frames`` are the usable ones, (T, H, W) or (T, C, H, W), full scale 1, ``indices`` theirs in the stack, and
+    ``times`` their exposure starts in s from the start of the window. Without options of ``restoration``, nothing is
+    restored.
 
     Returns:
         Vibration of the frame nearest to the middle of the window of those whose motion is known, with the time origin

@@ -86,27 +86,16 @@ def _packets(path: Path) -> Iterator[_Packet]:
 
 @dataclass(frozen=True)
 class _Part:
-    """Samples of one packet.
+    """Samples of one packet."""
 
-    Attributes:
-        rates: (N, 3) rad/s.
-        start: Time of the packet in s.
-        duration: Its duration in s.
-        stamp: Time of the first sample in s on the clock of the camera (STMP); None if the packet does not state it.
-        earliest: The earliest time that any stream of the packet states; None if none states one.
-        total: Samples up to the end of the packet that it states; None if it states none.
-        orientation: Axes in the order of the file; empty if they are not stated.
-        stabilised: Whether the images are turned against the camera.
-    """
-
-    rates: Array
-    start: float
-    duration: float
-    stamp: float | None
-    earliest: float | None
-    total: int | None
-    orientation: str
-    stabilised: bool = False
+    rates: Array  # (N, 3) rad/s
+    start: float  # s, time of the packet
+    duration: float  # s
+    stamp: float | None  # s, time of the first sample on the clock of the camera (STMP); None: not stated
+    earliest: float | None  # s, the earliest time that any stream of the packet states
+    total: int | None  # samples up to the end of the packet that it states
+    orientation: str  # axes in the order of the file; empty if they are not stated
+    stabilised: bool = False  # whether the images are turned against the camera
 
 
 def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:

@@ -22,18 +22,14 @@ RateUnit = Literal["rad/s", "deg/s"]
 class _GyroscopeFormat:
     """A format of gyroscope files.
 
-    Attributes:
-        name: Name in messages.
-        matches: Whether the first 64 bytes of a file are those of this format.
-        read: Function that reads a file of this format: its times in s, and its rates in rad/s. It refuses files that
-            are damaged with a one-line ``ValueError``; time and memory are linear in the size of the file.
-        has_units: Whether the format states its units.
+    ``read`` refuses damaged files with a one-line ``ValueError``; its time and memory are linear in the size of the
+    file.
     """
 
-    name: str
-    matches: Callable[[bytes], bool]
-    read: Callable[[Path, RateUnit | None, TimeUnit | None], AngularRates]
-    has_units: bool = True
+    name: str  # in messages
+    matches: Callable[[bytes], bool]  # whether the first 64 bytes of a file are those of this format
+    read: Callable[[Path, RateUnit | None, TimeUnit | None], AngularRates]  # times in s and rates in rad/s
+    has_units: bool = True  # whether the format states its units
 
 
 # A new format is one module and one line. The first that matches is used: CSV has no mark and comes last.
