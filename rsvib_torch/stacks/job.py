@@ -1,7 +1,7 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -288,10 +288,10 @@ class StackJob:
         )
 
 
-def stored_frame(reader: FrameReader, index: int) -> NDArray[Any] | str:
-    """Pixels of a frame as stored, or why it cannot be read."""
+def stored_frame(read: Callable[[int], NDArray[Any]], index: int) -> NDArray[Any] | str:
+    """A frame as stored, or why it cannot be read."""
     try:
-        return reader.frame(index)
+        return read(index)
     except FrameError as error:
         return " ".join(str(error).split())
 
@@ -305,7 +305,7 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
         last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
         shared = 1 + (WARM_UP if job.follow else 0)
         for window in windows:
-            frames = [last[index] if index in last else stored_frame(reader, index) for index in window.frames]
+            frames = [last[index] if index in last else stored_frame(reader.frame, index) for index in window.frames]
             last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
             yield window, frames
 

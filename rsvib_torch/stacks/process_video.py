@@ -21,8 +21,7 @@ from rsvib_torch.io.gyroscope.read_gyroscope import read_gyroscope
 from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
-from rsvib_torch.io.video import CONTAINERS
-from rsvib_torch.io.video_parts import PartWriter, join_parts, planes_of
+from rsvib_torch.io.video import CONTAINERS, PartWriter, VideoReader, join_parts
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
@@ -188,18 +187,18 @@ def _planned(
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     with closing(open_stack(source)) as reader:
-        planes = planes_of(reader)
+        picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
     method = RestorationOptions(**given)
     white = None
     if isinstance(method.saturation, float):
-        black, full = (0.0, job.full_scale or 1.0) if planes is None else (planes.black, planes.white)
+        black, full = (0.0, job.full_scale or 1.0) if picture is None else picture.levels
         white = black + method.saturation * (full - black)
-    scale = 255.0 if planes is not None else job.full_scale
-    layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
+    scale = 255.0 if picture is not None else job.full_scale
+    layout = FrameLayout(job.info.shape[1:], picture, scale, white, np.dtype(job.info.dtype))
     restorer = VideoRestorer(layout, job.timing, method, job.device, masks=options.border != "mirror")
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
-    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit, rates, planes), at_once
+    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit, rates), at_once
 
 
 def _restored_parts(
@@ -246,7 +245,7 @@ def _encode_part(
             before = layout.planes(np.load(file, allow_pickle=False))
     with ExitStack() as opened:
         with disk_errors_named(folder):
-            writer = PartWriter(folder.create(name), sink, content, video.planes)
+            writer = PartWriter(folder.create(name), sink, content, layout.picture)
         opened.callback(writer.abandon)
         for track, frame, restored in frames:
             if tracks:

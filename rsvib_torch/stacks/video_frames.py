@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.io.video import Picture
 from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -41,10 +42,15 @@ class FrameLayout:
     """How the pixels of a frame are stored."""
 
     shape: tuple[int, ...]  # (H, W) or (C, H, W) of the pixels
-    planar: bool  # whether a frame is the planes Y, U and V of a 4:2:0 video (``PlaneReader``), instead of pixels
+    picture: Picture | None  # if a frame is the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
     full_scale: float | None  # count that corresponds to 1.0; None for floats
     white: float | None  # count from which pixels are saturated; None for none
     dtype: np.dtype[Any]  # data type of the counts
+
+    @property
+    def planar(self) -> bool:
+        """Whether a frame is the planes of a video instead of pixels."""
+        return self.picture is not None
 
     @property
     def size(self) -> tuple[int, int]:

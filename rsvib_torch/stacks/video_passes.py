@@ -18,7 +18,7 @@ from rsvib_torch.core.tables import Array, tensor
 from rsvib_torch.detection.recorded.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.video_parts import PlaneReader, planes_of
+from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.sampling import recorded_offsets
@@ -68,7 +68,6 @@ class VideoPasses:
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
-    planes: PlaneReader | None  # how planes are stored, if frames are planes
 
     @property
     def parts(self) -> int:
@@ -81,9 +80,9 @@ class VideoPasses:
 
     def _decoded(self) -> Generator[Frame | str, None, None]:
         with closing(self.job.open()) as reader:
-            source: Any = planes_of(reader) if self.layout.planar else reader
+            read = reader.planes if self.layout.planar and isinstance(reader, VideoReader) else reader.frame
             for index in range(len(self.starts)):
-                yield stored_frame(source, index)
+                yield stored_frame(read, index)
 
     # First pass: the motion
 
