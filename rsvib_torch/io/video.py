@@ -5,7 +5,7 @@ applied; the videos that are written state it.
 """
 
 import math
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -306,33 +306,72 @@ def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
     return layout, "yuv420p" if lossy else "gray" if grey else "bgr0", 255.0
 
 
-def add_video(output: Any, path: Path, info: StackInfo, source: Any, **options: str) -> Any:
-    """Add a video stream to an open container, with the metadata of ``source``, an open video or None.
+class VideoEncoder:
+    """Encodes frames into a container that is open for writing; the ending of ``path`` selects the codec.
 
-    The ending of ``path`` selects the codec; ``options`` are those of the encoder in addition.
+    Frames are pixels (H, W) or (C, H, W), or planes as in a ``picture``. The metadata are those of ``source``, an open
+    video or None; ``options`` are those of the codec in addition. ``ticks`` are the presentation times of the frames in
+    units of ``unit`` s, and ``step`` is their usual interval.
     """
-    lossy = path.suffix.lower() in H264
-    unit, ticks = presentation_times(info)
-    rate = 1 / (unit * int(np.median(np.diff(ticks)))) if len(ticks) > 1 else Fraction(_DEFAULT_RATE)
-    codec, usual = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
-    video = output.add_stream(codec, rate=rate, options=usual | options)
-    video.height, video.width = info.shape[-2:]
-    video.pix_fmt = _encoded_as(path, info)[1]
-    video.codec_context.time_base = video.time_base = unit
-    if info.orientation != 1:
-        a, b, c, d = _MATRICES[info.orientation]
-        one = 1 << 16  # fixed-point numbers
-        video.set_display_matrix([a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30])
-    if lossy:
-        video.codec_context.colorspace, video.codec_context.color_range = _BT709, _LIMITED_RANGE
-    if source is None:
-        return video
-    output.metadata.update(source.metadata)
-    taken, encoder = source.streams.best("video").codec_context, video.codec_context
-    encoder.color_primaries, encoder.color_trc = taken.color_primaries, taken.color_trc
-    if taken.sample_aspect_ratio:
-        encoder.sample_aspect_ratio = taken.sample_aspect_ratio
-    return video
+
+    def __init__(
+        self,
+        container: Any,
+        path: Path,
+        info: StackInfo,
+        source: Any,
+        picture: Picture | None = None,
+        options: Mapping[str, str] = {},
+    ) -> None:
+        self._container, self._info, self._picture, lossy = container, info, picture, path.suffix.lower() in H264
+        self._layout, self._encoded, self._full_scale = _encoded_as(path, info)
+        self.unit, self.ticks = presentation_times(info)
+        self.step = int(np.median(np.diff(self.ticks))) if len(self.ticks) > 1 else 1
+        rate = 1 / (self.unit * self.step) if len(self.ticks) > 1 else Fraction(_DEFAULT_RATE)
+        codec, usual = ("libx264", _H264_OPTIONS) if lossy else ("ffv1", _FFV1_OPTIONS)
+        self._stream = video = container.add_stream(codec, rate=rate, options={**usual, **options})
+        video.height, video.width = info.shape[-2:]
+        video.pix_fmt, encoder = self._encoded, video.codec_context
+        encoder.time_base = video.time_base = self.unit
+        if info.orientation != 1:
+            a, b, c, d = _MATRICES[info.orientation]
+            one = 1 << 16  # fixed-point numbers
+            video.set_display_matrix([a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30])
+        if lossy:
+            encoder.colorspace, encoder.color_range = _BT709, _LIMITED_RANGE
+        if source is not None:
+            container.metadata.update(source.metadata)
+            taken = source.streams.best("video").codec_context
+            encoder.color_primaries, encoder.color_trc = taken.color_primaries, taken.color_trc
+            if taken.sample_aspect_ratio:
+                encoder.sample_aspect_ratio = taken.sample_aspect_ratio
+        if picture is not None:
+            video.pix_fmt, encoder.colorspace = "yuv420p", picture.colorspace
+            encoder.color_range = _FULL_RANGE if picture.levels[1] == 255.0 else picture.color_range
+
+    def write(self, frame: NDArray[Any], tick: int) -> None:
+        """Encode a frame with a presentation time."""
+        encoded = self._converted(frame)
+        encoded.pts, encoded.time_base = tick, self.unit
+        self._container.mux(self._stream.encode(encoded))
+
+    def _converted(self, frame: NDArray[Any]) -> Any:
+        """A frame of FFmpeg."""
+        if self._picture is not None:
+            return _av().VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="yuv420p")
+        counts = np.moveaxis(frame, 0, -1) if frame.shape[:-2] == (3,) else frame.reshape(frame.shape[-2:])
+        if self._full_scale != self._info.full_scale:
+            relative = counts / (self._info.full_scale or 1.0)  # the full scale of floats is 1
+            counts = np.rint(self._full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
+        counts = np.ascontiguousarray(counts, dtype=np.uint8 if self._full_scale <= 255 else np.uint16)
+        converted = _av().VideoFrame.from_ndarray(counts, format=self._layout)
+        if self._encoded != self._layout:
+            converted = converted.reformat(format=self._encoded, dst_colorspace="ITU709", interpolation=_conversion())
+        return converted
+
+    def finish(self) -> None:
+        """Write the frames that the codec has not yet returned."""
+        self._container.mux(self._stream.encode())
 
 
 class Sound:
@@ -383,20 +422,6 @@ def check_video(path: Path, info: StackInfo) -> None:
                 raise ValueError(f"{path}: {ending} cannot hold the audio ({name}) of {info.path}; write .mkv")
 
 
-def picture_of(pixels: NDArray[Any], path: Path, info: StackInfo) -> Any:
-    """A frame of FFmpeg for the encoder of a video, from its pixels (H, W) or (C, H, W)."""
-    layout, encoded, full_scale = _encoded_as(path, info)
-    counts = np.moveaxis(pixels, 0, -1) if pixels.shape[:-2] == (3,) else pixels.reshape(pixels.shape[-2:])
-    if full_scale != info.full_scale:
-        relative = counts / (info.full_scale or 1.0)  # the full scale of floats is 1
-        counts = np.rint(full_scale * np.clip(np.nan_to_num(relative), 0.0, 1.0))
-    counts = np.ascontiguousarray(counts, dtype=np.uint8 if full_scale <= 255 else np.uint16)
-    frame = _av().VideoFrame.from_ndarray(counts, format=layout)
-    if encoded != layout:
-        frame = frame.reformat(format=encoded, dst_colorspace="ITU709", interpolation=_conversion())
-    return frame
-
-
 def open_output(path: Path, opened: ExitStack) -> Any:
     """The container of a video to write, closed with ``opened``; equal content gives equal bytes."""
     options = {"fflags": "+bitexact"}
@@ -405,17 +430,14 @@ def open_output(path: Path, opened: ExitStack) -> Any:
 
 def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
     """Write a video frame by frame; arguments as in ``StackFormat.write``."""
-    unit, ticks = presentation_times(info)
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)
-        video = add_video(output, path, info, source)
+        encoder = VideoEncoder(output, path, info, source)
         sound = Sound(output, source)
-        for tick, pixels in zip(ticks, frames, strict=True):
-            sound.write(tick * unit)
-            frame = picture_of(pixels, path, info)
-            frame.pts, frame.time_base = tick, unit
-            output.mux(video.encode(frame))
-        output.mux(video.encode())
+        for tick, pixels in zip(encoder.ticks, frames, strict=True):
+            sound.write(tick * encoder.unit)
+            encoder.write(pixels, tick)
+        encoder.finish()
         sound.write()
 
 
@@ -431,33 +453,22 @@ class PartWriter:
     """
 
     def __init__(self, file: BinaryIO, video: Path, info: StackInfo, picture: Picture | None) -> None:
-        self._video, self._info, self._picture, ending = video, info, picture, video.suffix.lower()
-        self._opened = ExitStack()
+        ending, self._count, self._opened = video.suffix.lower(), 0, ExitStack()
         self._opened.enter_context(file)
         source = open_source(info, self._opened)
-        self._output = self._opened.enter_context(_av().open(file, "w", format=CONTAINERS[ending]))
-        self._stream = add_video(self._output, video, info, source, **(_PART_OPTIONS if ending in H264 else {}))
-        if picture is not None:
-            self._stream.pix_fmt, encoder = "yuv420p", self._stream.codec_context
-            encoder.colorspace = picture.colorspace
-            encoder.color_range = _FULL_RANGE if picture.levels[1] == 255.0 else picture.color_range
-        self._unit, ticks = presentation_times(info)
-        self._step, self._count = int(np.median(np.diff(ticks))) if len(ticks) > 1 else 1, 0
+        output = self._opened.enter_context(_av().open(file, "w", format=CONTAINERS[ending]))
+        options = _PART_OPTIONS if ending in H264 else {}
+        self._encoder = VideoEncoder(output, video, info, source, picture, options)
 
     def write(self, frame: NDArray[Any]) -> None:
-        """Encode a frame: pixels (H, W) or (C, H, W), or its planes."""
-        if self._picture is not None:
-            encoded = _av().VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="yuv420p")
-        else:
-            encoded = picture_of(frame, self._video, self._info)
-        encoded.pts, encoded.time_base = self._count * self._step, self._unit
-        self._output.mux(self._stream.encode(encoded))
+        """Encode a frame."""
+        self._encoder.write(frame, self._count * self._encoder.step)
         self._count += 1
 
     def close(self) -> None:
         """Finish the file."""
         try:
-            self._output.mux(self._stream.encode())
+            self._encoder.finish()
         finally:
             self._opened.close()
 

@@ -1,6 +1,7 @@
 """Outputs of video frames: files, pipes and a window."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.checks import needed_package
 from rsvib_torch.io.stack_info import H264, StackInfo
-from rsvib_torch.io.video import CONTAINERS, add_video, picture_of, presentation_times
+from rsvib_torch.io.video import CONTAINERS, VideoEncoder
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
@@ -81,9 +82,8 @@ class VideoOutput:
         pixels = frame if frame.ndim == 2 else np.moveaxis(frame, -1, 0)
         if self._container is None:
             self._create(pixels.shape)
-        picture = picture_of(pixels, self._path, self._info)
-        picture.pts, picture.time_base = index, self._unit
-        self._encode(picture)
+        with self._errors_named():
+            self._encoder.write(pixels, index * self._encoder.step)
 
     def _create(self, shape: tuple[int, ...]) -> None:
         if self._overwrite:
@@ -94,17 +94,17 @@ class VideoOutput:
             raise FileExistsError(f"{self._path} was created by another program; choose another name") from error
         sync(self._path.absolute().parent)
         lossy = self._path.suffix.lower() in H264
-        self._info = StackInfo((2, *shape), "uint8", 255.0, frame_rate=self._rate)  # of any number of frames
-        self._unit, _ = presentation_times(self._info)
+        info = StackInfo((2, *shape), "uint8", 255.0, frame_rate=self._rate)  # of any number of frames
         self._container = self._av.open(str(self._path), "w", options=_FRAGMENTS if lossy else _CLUSTERS)
         # ultrafast keeps up with a camera; the other presets make smaller files of the same quality
         options = {"crf": "16", "preset": "ultrafast"} if lossy else {}
-        self._stream = add_video(self._container, self._path, self._info, None, **options)
+        self._encoder = VideoEncoder(self._container, self._path, info, None, options=options)
 
-    def _encode(self, picture: Any) -> None:
-        """Encode and write a frame; None for those that the encoder has not yet returned."""
+    @contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        """State the file in errors of FFmpeg, after which nothing more is written."""
         try:
-            self._container.mux(self._stream.encode(picture))
+            yield
         except self._av.error.FFmpegError as error:
             with suppress(self._av.error.FFmpegError):
                 self._container.close()
@@ -114,7 +114,8 @@ class VideoOutput:
     def close(self) -> None:
         """Finish the file."""
         if self._container is not None:
-            self._encode(None)
+            with self._errors_named():
+                self._encoder.finish()
             self._container.close()
             sync(self._path)
 

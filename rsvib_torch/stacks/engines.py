@@ -4,9 +4,9 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
@@ -21,21 +21,21 @@ _Result = TypeVar("_Result")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
 
 
-def results_in_order(
-    items: Iterable[_Item], submit: Callable[[_Item], Any], capacity: Callable[[], int], waiting: deque[Any]
-) -> Generator[Any, None, None]:
-    """Results of items in their order.
-
-    ``submit`` starts the computation of one and returns an object with ``result()``; as many as ``capacity()`` are
-    computed or wait, in ``waiting``.
-    """
+def _in_order(
+    items: Iterable[Any],
+    submit: Callable[[Any], _Item],
+    capacity: Callable[[], int],
+    result: Callable[[_Item], _Result],
+    waiting: deque[_Item],
+) -> Generator[_Result, None, None]:
+    """Results of items in their order; as many as ``capacity()`` are computed or wait, in ``waiting``."""
     remaining = iter(items)
     while True:
         while len(waiting) < capacity() and (item := next(remaining, None)) is not None:
             waiting.append(submit(item))
         if not waiting:
             return
-        yield waiting.popleft().result()
+        yield result(waiting.popleft())
 
 
 def in_threads(
@@ -50,7 +50,9 @@ def in_threads(
     pool = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
     try:
         with closing(items):
-            yield from results_in_order(items, lambda item: pool.submit(work, *item), lambda: at_once + 1, deque())
+            yield from _in_order(
+                items, lambda item: pool.submit(work, *item), lambda: at_once + 1, Future.result, deque()
+            )
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         torch.set_num_threads(default_threads)  # the default of threads that start later
@@ -113,38 +115,29 @@ def _dask_client(scheduler: str, workers: int) -> Any:
         raise OSError(f"{failed}: {' '.join(str(error).split())}") from error
 
 
-@dataclass(frozen=True)
-class _DaskResult:
-    """The result of a window that Dask workers compute."""
-
-    client: Any
-    future: Any
-    window: Window
-
-    def result(self) -> Any:
-        """Wait for the result, as long as there are workers and a scheduler."""
-        distributed = needed_package("distributed", "the Dask engine", "distributed")
-        last_seen = time.monotonic()
-        while True:
-            try:
-                return self.future.result(timeout=1.0)
-            except (distributed.TimeoutError, UnboundLocalError):  # of distributed, if its own wait is cancelled
-                if self.future.done():
-                    return self.future.result()  # or its error
-                if self.client.scheduler_info(n_workers=-1)["workers"]:
-                    last_seen = time.monotonic()
-                elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
-                    raise OSError(
-                        f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
-                    ) from None
-            except distributed.KilledWorker as error:
+def _wait(client: Any, future: Any, window: Window) -> Any:
+    """The result of a window that Dask workers compute, as long as there are workers and a scheduler."""
+    distributed = needed_package("distributed", "the Dask engine", "distributed")
+    last_seen = time.monotonic()
+    while True:
+        try:
+            return future.result(timeout=1.0)
+        except (distributed.TimeoutError, UnboundLocalError):  # of distributed, if its own wait is cancelled
+            if future.done():
+                return future.result()  # or its error
+            if client.scheduler_info(n_workers=-1)["workers"]:
+                last_seen = time.monotonic()
+            elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
                 raise OSError(
-                    f"Dask workers died {error.allowed_failures + 1} times while they computed window "
-                    f"{self.window.index} (frames {self.window.first} to {self.window.last}); check their memory, "
-                    "and resume the run"
+                    f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
                 ) from None
-            except CancelledError as error:
-                raise OSError("the connection to the Dask scheduler was lost; resume the run") from error
+        except distributed.KilledWorker as error:
+            raise OSError(
+                f"Dask workers died {error.allowed_failures + 1} times while they computed window {window.index} "
+                f"(frames {window.first} to {window.last}); check their memory, and resume the run"
+            ) from None
+        except CancelledError as error:
+            raise OSError("the connection to the Dask scheduler was lost; resume the run") from error
 
 
 def compute_with_dask(
@@ -157,19 +150,19 @@ def compute_with_dask(
     """
     job = replace(job, source=job.source.absolute())
     one_thread = not all(window.alone for window in windows)
+    waiting: deque[tuple[Any, Window]] = deque()
     with _dask_client(scheduler, workers) as client:
 
-        def submit(window: Window) -> _DaskResult:
+        def submit(window: Window) -> tuple[Any, Window]:
             # the job is sent with every task: scattered data are lost with the worker that holds them
             task = client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
-            return _DaskResult(client, task, window)
+            return task, window
 
         def two_per_worker() -> int:
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
-        waiting: deque[Any] = deque()
         try:
-            yield from results_in_order(windows, submit, two_per_worker, waiting)
+            yield from _in_order(windows, submit, two_per_worker, lambda pair: _wait(client, *pair), waiting)
         finally:
             with suppress(Exception):
-                client.cancel([result.future for result in waiting])
+                client.cancel([task for task, _ in waiting])

@@ -245,27 +245,28 @@ class StackJob:
         A frame that cannot be read is stored as NaN, or 0 for integers, unless bad frames are omitted.
         """
         dtype = np.dtype(self.info.dtype)
+
+        def counts(images: Tensor) -> NDArray[Any]:
+            return frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
+
         if result.restored and not result.indices:
-            frames = list(frames_to_counts(result.frames, dtype, self.full_scale, self.info.nodata))
+            frames = list(counts(result.frames))
             return StoredWindow(frames, self.record(result, len(frames)))
         written = list(result.window.written)
         restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
         frames = []
         for index in [written[len(written) // 2]] if self.joined else written:
             if index in restored and index not in result.unchanged:
-                frames.append(frames_to_counts(restored[index], dtype, self.full_scale, self.info.nodata))
+                frames.append(counts(restored[index]))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                same = self.scale == 1 and self.mosaic is None
-                frames.append(frame if same else self._unchanged_counts(frame))
+                if self.scale != 1 or self.mosaic is not None:  # the shape of restored ones
+                    taken = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
+                    frame = counts(self._unchanged(taken)[0])
+                frames.append(frame)
         return StoredWindow(frames, self.record(result, len(frames)))
-
-    def _unchanged_counts(self, frame: NDArray[Any]) -> NDArray[Any]:
-        """A frame as stored, in the shape of restored ones."""
-        counts = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
-        return frames_to_counts(self._unchanged(counts)[0], frame.dtype, self.full_scale, self.info.nodata)
 
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""

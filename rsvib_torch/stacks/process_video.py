@@ -36,7 +36,7 @@ from rsvib_torch.stacks.run_folder import (
     run_to_file,
     work_folder,
 )
-from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, RestoredFrame, VideoRestorer
+from rsvib_torch.stacks.video_frames import FrameTrack, RestoredFrame, VideoFrames
 from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
 from rsvib_torch.tracking import Margins
 
@@ -99,7 +99,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         recording = split_range(source)[0]
     rates = None if recording is None else read_gyroscope(recording)
     video, at_once = _planned(source, timing, options, rates)
-    job = video.job
+    job = video.frames.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
     target = manifest_path(sink, options)
@@ -188,17 +188,10 @@ def _planned(
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     with closing(open_stack(source)) as reader:
         picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
-    method = RestorationOptions(**given)
-    white = None
-    if isinstance(method.saturation, float):
-        black, full = (0.0, job.full_scale or 1.0) if picture is None else picture.levels
-        white = black + method.saturation * (full - black)
-    scale = 255.0 if picture is not None else job.full_scale
-    layout = FrameLayout(job.info.shape[1:], picture, scale, white, np.dtype(job.info.dtype))
-    restorer = VideoRestorer(layout, job.timing, method, job.device, masks=options.border != "mirror")
+    frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
-    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit, rates), at_once
+    return VideoPasses(frames, starts, options.steady, options.crop_limit, rates), at_once
 
 
 def _restored_parts(
@@ -215,9 +208,9 @@ def _restored_parts(
                     progress()
 
     def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
-        return track, frame, video.restorer.restored(frame, track)
+        return track, frame, video.frames.restored(frame, track)
 
-    threads = 1 if video.job.device == "cpu" else torch.get_num_threads()
+    threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
     with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
         yield from groupby(frames, lambda one: one[0].index // PART_FRAMES)
 
@@ -235,7 +228,7 @@ def _encode_part(
     progress: Callable[[], None],
 ) -> None:
     """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
-    layout, name = video.layout, f"{part:06d}{sink.suffix.lower()}"
+    layout, name = video.frames, f"{part:06d}{sink.suffix.lower()}"
     tracks: list[FrameTrack] = []
     written: list[Frame] = []  # the first frames
     pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames without fault
@@ -269,7 +262,7 @@ def _encode_part(
     progress()
 
 
-def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:
+def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: VideoFrames, border: str) -> Planes:
     """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
     planes = restored.planes
     if planes is None or (restored.fault is not None and before is not None):
