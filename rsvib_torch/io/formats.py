@@ -85,8 +85,8 @@ def packaged_format(
 ) -> StackFormat:
     """A format whose functions are imported when they are called: reading a TIFF file imports no other format.
 
-    ``tests/test_imports.py`` reads the names of the modules in the calls of this function as imports. ``open``,
-    ``write`` and ``check`` name the functions of ``StackFormat`` in the ``module``.
+    ``open``, ``write`` and ``check`` name functions of ``StackFormat`` in the ``module``. ``tests/test_imports.py``
+    reads these calls as imports.
     """
 
     def imported(function: str) -> Callable[..., Any]:
@@ -168,12 +168,7 @@ def register_format(form: StackFormat) -> None:
 
 
 def find_format(path: Path) -> StackFormat:
-    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images.
-
-    Raises:
-        FileNotFoundError: If it does not exist.
-        ValueError: If the ending is not registered, or the path is a pipe, a socket or a device.
-    """
+    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     check_regular(path)
@@ -187,11 +182,7 @@ def find_format(path: Path) -> StackFormat:
 
 
 def target_format(path: Path) -> StackFormat:
-    """The format in which a path is written, by its ending only.
-
-    Raises:
-        ValueError: If the ending is not registered.
-    """
+    """The format in which a path is written, by its ending only."""
     if path.suffix.lower() in FORMATS:
         return FORMATS[path.suffix.lower()]
     known = ", ".join(ending for ending in FORMATS if ending)

@@ -129,10 +129,6 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are
     returned as they are if their error is less than a tenth of a period.
 
-    Args:
-        info: What the file states.
-        timing: The sensor.
-
     Example:
         >>> info = StackInfo((4, 8, 8), "uint8", 255.0, (0.0, 0.033, 0.067, 0.2), time_error=0.001)
         >>> timing = SensorTiming(row_time=1 / 30000, exposure_rows=100, frame_rows=1000)
@@ -197,12 +193,7 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
 
 
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
-    """Sentences about an orientation, dropped frames and unequal intervals that a file states.
-
-    Args:
-        info: What the file states.
-        timing: The sensor, without the times of the file; None if it is not known.
-    """
+    """Sentences about an orientation, dropped frames and unequal intervals that a file states."""
 
     def missing_frames(count: int) -> str:
         return f"{number_of(count, 'frame')} {'is' if count == 1 else 'are'} missing"

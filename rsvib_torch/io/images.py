@@ -72,11 +72,7 @@ def _png_info(image: Any, head: bytes, file_size: int) -> StackInfo:
 
 
 def decode_image(path: Path) -> NDArray[Any]:
-    """Pixels of a PNG or JPEG file as stored, without its orientation: (H, W), or (C, H, W) in RGB or RGBA.
-
-    Raises:
-        ValueError: If the file is damaged.
-    """
+    """Pixels of a PNG or JPEG file as stored, without its orientation: (H, W), or (C, H, W) in RGB or RGBA."""
     is_png = path.suffix.lower() == ".png"
     with readable_stack(path, "PNG" if is_png else "JPEG"):
         data = path.read_bytes()

@@ -61,18 +61,9 @@ def open_stack(path: PathLike) -> FrameReader:
 
 @checks_arguments
 def read_stack_info(path: PathLike) -> StackInfo:
-    """Read shape, data type and full scale of a stack without its pixels.
+    """Read what a file states about its stack: shape, data type and full scale, without its pixels.
 
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        What the file states; unknown values are None.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack.
+    Arguments and errors are those of ``open_stack``; unknown values are None.
 
     Example:
         >>> info = read_stack_info("frames.tif")  # doctest: +SKIP

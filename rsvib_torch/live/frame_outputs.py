@@ -32,11 +32,7 @@ class FrameOutput(Protocol):
 
 
 class PipeOutput:
-    """Raw frames, 8 bits per channel, grey or RGB, one behind the other.
-
-    Args:
-        stream: The pipe, without a buffer.
-    """
+    """Raw frames, 8 bits per channel, grey or RGB, one behind the other, in a pipe without a buffer."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -54,15 +50,8 @@ class PipeOutput:
 class VideoOutput:
     """A video file: H.264 for .mp4, .mov and .m4v, FFV1 (without loss) for .mkv.
 
-    The file is created with the first frame, and can be played from then on, however the process ends.
-
-    Args:
-        path: The file.
-        frame_rate: Frames per second.
-        overwrite: Whether a file that exists when the first frame is written is replaced.
-
-    Raises:
-        ValueError: If the file ending is another one.
+    The file is created with the first frame, and can be played from then on, however the process ends. A file that
+    exists then is replaced only to ``overwrite`` it.
     """
 
     def __init__(self, path: Path, frame_rate: float, *, overwrite: bool = False) -> None:
@@ -73,12 +62,7 @@ class VideoOutput:
         self._container: Any = None
 
     def write(self, frame: Frame, index: int) -> None:
-        """Encode a frame.
-
-        Raises:
-            FileExistsError: If it is the first frame, and the file exists.
-            OSError: If it cannot be written; the file has the frames before.
-        """
+        """Encode a frame; after an error, the file has the frames before."""
         pixels = frame if frame.ndim == 2 else np.moveaxis(frame, -1, 0)
         if self._container is None:
             self._create(pixels.shape)
@@ -121,11 +105,7 @@ class VideoOutput:
 
 
 class PreviewOutput:
-    """A window of OpenCV.
-
-    Raises:
-        ValueError: If the installed OpenCV has no windows.
-    """
+    """A window of OpenCV, if the installed one has windows."""
 
     def __init__(self) -> None:
         import cv2  # noqa: PLC0415

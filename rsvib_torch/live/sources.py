@@ -30,29 +30,18 @@ _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the sour
 
 @dataclass(frozen=True, eq=False)
 class TimedFrame:
-    """A frame of a source.
+    """A frame of a source."""
 
-    Attributes:
-        pixels: (H, W) or (3, H, W) counts, or floats whose full scale is 1.
-        time: s from the first frame.
-        arrived: s of ``time.perf_counter``, when it was read.
-    """
-
-    pixels: NDArray[Any]
-    time: float
-    arrived: float
+    pixels: NDArray[Any]  # (H, W) or (3, H, W) counts, or floats whose full scale is 1
+    time: float  # s from the first frame
+    arrived: float  # s of ``time.perf_counter``, when it was read
 
 
 class FrameSource(Protocol):
-    """A source of frames.
+    """A source of frames."""
 
-    Attributes:
-        full_scale: Count that means 1.0; None for floats.
-        lost: Frames that the source did not deliver, by its clock.
-    """
-
-    full_scale: float | None
-    lost: int
+    full_scale: float | None  # count that means 1.0; None for floats
+    lost: int  # frames that the source did not deliver, by its clock
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; called once, in the thread that reads. A generator releases the source in its ``finally``."""
@@ -66,9 +55,6 @@ class FrameCounter:
     one: the times behind a lost frame are later than before by whole periods. Arrival is therefore compared with the
     least delay of the last frames: with random delays of 3 to 10 ms at 30 frames/s, 0 to 6 frames in five minutes are
     counted as lost by mistake; with the intervals between frames, 30 to 850 were.
-
-    Args:
-        period: s, frame period.
     """
 
     _FRAMES = 300  # of which the least delay is taken; the clock of a camera deviates by less than 0.1 periods in them
@@ -78,12 +64,7 @@ class FrameCounter:
         self._delays: deque[float] = deque(maxlen=self._FRAMES)  # periods
 
     def number(self, arrived: float, stamp: float) -> int:
-        """Number of the next frame.
-
-        Args:
-            arrived: s, when it was read.
-            stamp: s, its time in the stream.
-        """
+        """Number of the next frame, from the time when it was read and that in the stream, both in s."""
         if self._number < 0:
             self._first = self._before = arrived, stamp
         by_arrival, by_stamp = (arrived - self._first[0]) / self._period, (stamp - self._first[1]) / self._period
@@ -102,12 +83,7 @@ class FrameCounter:
 
 
 class CameraSource:
-    """A camera of OpenCV.
-
-    Args:
-        camera: Index, or URL.
-        timing: The sensor.
-    """
+    """A camera of OpenCV, by its index or URL."""
 
     full_scale: float | None = 255.0
 
@@ -115,11 +91,7 @@ class CameraSource:
         self._camera, self._period, self.lost = camera, timing.frame_period, 0
 
     def frames(self) -> Iterator[TimedFrame]:
-        """The frames; times are whole frame periods apart.
-
-        Raises:
-            OSError: If the camera cannot be opened.
-        """
+        """The frames; times are whole frame periods apart."""
         import cv2  # noqa: PLC0415
 
         level = cv2.utils.logging.getLogLevel()
@@ -144,14 +116,7 @@ class CameraSource:
 
 
 class PipeSource:
-    """Raw frames one behind the other in a pipe.
-
-    Args:
-        stream: The pipe.
-        size: (height, width) in px.
-        pixel_format: Layout of the pixels.
-        timing: The sensor.
-    """
+    """Raw frames of a size (height, width) one behind the other in a pipe."""
 
     def __init__(
         self, stream: BinaryIO, size: tuple[int, int], pixel_format: PixelFormat, timing: SensorTiming
@@ -181,13 +146,10 @@ class PipeSource:
 
 
 class FileSource:
-    """A file, as ``open_stack`` reads it.
+    """A file, as ``open_stack`` reads it, with its frame times.
 
-    Args:
-        path: The stack.
-        timing: The sensor; the frame times of the file are used, as in ``read_stack``.
-        full_scale: Count that means 1.0, if the file does not state it.
-        realtime: Whether frames come at the times of the file, instead of as fast as they are processed.
+    Frames come as fast as they are processed, or with ``realtime`` at the times of the file. ``full_scale`` is the
+    count that means 1.0, if the file does not state it.
     """
 
     def __init__(
