@@ -3,8 +3,8 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import closing, suppress
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -12,50 +12,13 @@ from typing import Any, TypeVar
 import torch
 
 from rsvib_torch.core.checks import needed_package
+from rsvib_torch.core.prefetch import in_order, in_threads
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows
 from rsvib_torch.stacks.windows import Window
 
-_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
-
-
-def _in_order(
-    items: Iterable[Any],
-    submit: Callable[[Any], _Item],
-    capacity: Callable[[], int],
-    result: Callable[[_Item], _Result],
-    waiting: deque[_Item],
-) -> Generator[_Result, None, None]:
-    """Results of items in their order; as many as ``capacity()`` are computed or wait, in ``waiting``."""
-    remaining = iter(items)
-    while True:
-        while len(waiting) < capacity() and (item := next(remaining, None)) is not None:
-            waiting.append(submit(item))
-        if not waiting:
-            return
-        yield result(waiting.popleft())
-
-
-def in_threads(
-    work: Callable[..., _Result], items: Generator[tuple[Any, ...], None, None], *, at_once: int, threads: int
-) -> Generator[_Result, None, None]:
-    """Results of ``work(*item)`` in the order of the items, from threads of this process, while one more item is made.
-
-    Each of the ``at_once`` threads uses a number of ``threads`` of PyTorch.
-    """
-    share_one_heap()
-    default_threads = torch.get_num_threads()
-    pool = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
-    try:
-        with closing(items):
-            yield from _in_order(
-                items, lambda item: pool.submit(work, *item), lambda: at_once + 1, Future.result, deque()
-            )
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        torch.set_num_threads(default_threads)  # the default of threads that start later
 
 
 def compute_here(
@@ -70,6 +33,7 @@ def compute_here(
     def compute(window: Window, pixels: WindowFrames) -> _Result:
         return finish(job.compute(window, pixels), pixels)
 
+    share_one_heap()
     # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
     threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
     return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
@@ -162,7 +126,7 @@ def compute_with_dask(
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
         try:
-            yield from _in_order(windows, submit, two_per_worker, lambda pair: _wait(client, *pair), waiting)
+            yield from in_order(windows, submit, two_per_worker, lambda pair: _wait(client, *pair), waiting)
         finally:
             with suppress(Exception):
                 client.cancel([task for task, _ in waiting])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.prefetch import in_threads
 from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.validation import fields_of
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment
@@ -25,7 +26,7 @@ from rsvib_torch.io.video import CONTAINERS, PartWriter, VideoReader, join_parts
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
-from rsvib_torch.stacks.engines import in_threads
+from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
 from rsvib_torch.stacks.run_folder import (
@@ -210,6 +211,7 @@ def _restored_parts(
     def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
         return track, frame, video.frames.restored(frame, track)
 
+    share_one_heap()
     threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
     with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
         yield from groupby(frames, lambda one: one[0].index // PART_FRAMES)
