@@ -101,24 +101,6 @@ def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
     return spacing.shortest - tolerance <= period <= spacing.longest + tolerance
 
 
-def _warn_of_rate(info: StackInfo, timing: SensorTiming) -> None:
-    """Warn if the frame rate of a file is not that of the sensor, with both values and the remedy."""
-    spacing = _spacing(info)
-    if spacing is None or _same_rate(info, timing):
-        return
-    exact = info.frame_times is not None and info.time_error == 0.0
-    used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
-    warnings.warn(
-        f"{info.path or 'the file'}: {1.0 / spacing.interval:.5g} frames per second according to its "
-        f"{info.time_source}, but {timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
-        f"row_time={timing.row_time:g} s); {used}. If the file is right, set the frame rate to "
-        f"{1.0 / spacing.interval:.6g} (frame_rows={spacing.interval / timing.row_time:.6g}) or correct row_time; if "
-        "the sensor is right (slow motion), nothing needs to be changed",
-        TimingWarning,
-        stacklevel=2,
-    )
-
-
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
@@ -151,18 +133,27 @@ def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced."""
     if timing.frame_start_times is not None:
         return timing
-    _warn_of_rate(info, timing)
-    times = exposure_times(info, timing)
-    if times is None:
-        if info.frame_times is not None and len(info.frame_times) > 1 and _same_rate(info, timing):
-            warnings.warn(
-                f"{info.path or 'the file'}: the {info.time_source} are irregular and have errors of up to "
-                f"{1e3 * info.time_error:.3g} ms; equal intervals are assumed, set frame_start_times if they are not",
-                TimingWarning,
-                stacklevel=2,
-            )
-        return timing
-    if info.time_error and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period:
+    name, spacing, times = info.path or "the file", _spacing(info), exposure_times(info, timing)
+    if spacing is not None and not _same_rate(info, timing):
+        exact = info.frame_times is not None and info.time_error == 0.0
+        used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
+        warnings.warn(
+            f"{name}: {1.0 / spacing.interval:.5g} frames per second according to its {info.time_source}, but "
+            f"{timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
+            f"row_time={timing.row_time:g} s); {used}. If the file is right, set the frame rate to "
+            f"{1.0 / spacing.interval:.6g} (frame_rows={spacing.interval / timing.row_time:.6g}) or correct row_time; "
+            "if the sensor is right (slow motion), nothing needs to be changed",
+            TimingWarning,
+            stacklevel=2,
+        )
+    elif times is None and info.frame_times is not None and len(info.frame_times) > 1:
+        warnings.warn(
+            f"{name}: the {info.time_source} are irregular and have errors of up to {1e3 * info.time_error:.3g} ms; "
+            "equal intervals are assumed, set frame_start_times if they are not",
+            TimingWarning,
+            stacklevel=2,
+        )
+    if times is None or (info.time_error and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period):
         return timing
     return replace(timing, frame_start_times=times)
 
