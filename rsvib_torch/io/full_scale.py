@@ -37,7 +37,9 @@ def required_full_scale(full_scale: float | None, dtype: np.dtype[Any], name: ob
             f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. full_scale=4095 for 12-bit counts "
             "(commands: --full-scale 4095)"
         )
-    return known_full_scale(dtype, full_scale) or 0.0
+    known = known_full_scale(dtype, full_scale)
+    assert known is not None  # of integers
+    return known
 
 
 def beyond_full_scale(largest: int, full_scale: float) -> str:

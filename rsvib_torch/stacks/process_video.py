@@ -5,7 +5,7 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from itertools import count, groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -51,6 +51,15 @@ _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_
 Frame = NDArray[Any]
 Planes = list[Frame]
 _Restored = tuple[FrameTrack, Frame | str, RestoredFrame]  # a frame as stored, or why it cannot be read, and restored
+
+
+class _Output(NamedTuple):
+    """The video to write."""
+
+    path: Path
+    info: StackInfo
+    border: str  # as in ``process_video``
+    margins: Margins | None  # that are cut off
 
 
 @file_options(ProcessVideoOptions)
@@ -132,11 +141,14 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             options.progress(0, len(video.starts))
         motion = video.motion(progress)
         margins = video.margins(motion) if border == "crop" else None
-        content = _cut_content(content, margins)
+        if margins is not None:
+            kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
+            content = replace(content, shape=(*content.shape[:-2], *kept))
         check_info_target(sink, content, check_folder=False)
+        output = _Output(sink, content, border, margins)
         with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
             for part, frames in parts:
-                _encode_part(video, motion, folder, part, frames, sink, content, border, margins, progress)
+                _encode_part(video, motion, folder, part, frames, output, progress)
         _check_shaking(folder)
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
@@ -157,14 +169,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         write=write,
         not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
     )
-
-
-def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
-    """The content of the video without the margins."""
-    if margins is None:
-        return content
-    kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
-    return replace(content, shape=(*content.shape[:-2], *kept))
 
 
 def _check_shaking(folder: RunFolder) -> None:
@@ -223,14 +227,11 @@ def _encode_part(
     folder: RunFolder,
     part: int,
     frames: Iterator[_Restored],
-    sink: Path,
-    content: StackInfo,
-    border: str,
-    margins: Margins | None,
+    output: _Output,
     progress: Callable[[], None],
 ) -> None:
     """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
-    layout, name = video.frames, f"{part:06d}{sink.suffix.lower()}"
+    layout, name = video.frames, f"{part:06d}{output.path.suffix.lower()}"
     tracks: list[FrameTrack] = []
     written: list[Frame] = []  # the first frames
     pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames without fault
@@ -240,13 +241,13 @@ def _encode_part(
             before = layout.planes(np.load(file, allow_pickle=False))
     with ExitStack() as opened:
         with disk_errors_named(folder):
-            writer = PartWriter(folder.create(name), sink, content, layout.picture)
+            writer = PartWriter(folder.create(name), output.path, output.info, layout.picture)
         opened.callback(writer.abandon)
         for track, frame, restored in frames:
             if tracks:
                 progress()  # the frame before is complete
-            before = _without_gaps(restored, before, layout, border)
-            final = layout.frame(_cut(before, margins))
+            before = _without_gaps(restored, before, layout, output.border)
+            final = layout.frame(_cut(before, output.margins))
             with disk_errors_named(folder):
                 writer.write(final)
             if len(tracks) < CHECKED_FRAMES:
