@@ -194,13 +194,13 @@ class FrameReader:
     def _read(self) -> None:
         try:
             for frame in self._source.frames():
-                while not self._put(frame):
-                    if self._stopped:
-                        return
+                while not self._stopped and not self._put(frame):
                     if self._drops:
                         with suppress(queue.Empty):
                             self._frames.get_nowait()
                             self.dropped += 1
+                if self._stopped:
+                    return
         except Exception as error:  # raised again in the thread that takes the frames
             self._error = error
 

@@ -71,6 +71,14 @@ def test_the_oldest_waiting_frames_are_dropped_and_counted():
     assert source.closed
 
 
+@pytest.mark.parametrize("drops", [True, False])
+def test_a_reader_that_is_stopped_releases_the_source_with_the_next_frame(drops):
+    reader = FrameReader(source := Numbers(10**9), waiting=10**6, drops=drops)
+    reader.start()
+    reader.close()
+    assert source.closed
+
+
 def test_a_source_that_may_wait_loses_no_frame():
     reader = FrameReader(Numbers(), waiting=8, drops=False)
     reader.start()
