@@ -102,15 +102,14 @@ def times_of_attributes(attributes: Mapping[str, Any], count: int) -> dict[str, 
 def _seconds_of_date(text: object, fraction: object = "") -> float | None:
     """Seconds since 1970 of a date of TIFF and EXIF with a fraction of a second; None without a fraction."""
     digits = str(fraction).strip("\0 ")
-    date = str(text).strip("\0 ").replace("T", " ")
+    date = str(text).strip("\0 ")
     if "." not in date and digits.isdecimal():
         date = f"{date}.{digits}"
-    for layout in ("%Y:%m:%d %H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f"):
-        try:
-            return datetime.strptime(date[:26], layout).replace(tzinfo=UTC).timestamp()
-        except ValueError:
-            continue
-    return None
+    try:
+        moment = datetime.fromisoformat(date[:10].replace(":", "-") + date[10:26])
+    except ValueError:
+        return None
+    return moment.replace(tzinfo=UTC).timestamp() if "." in date else None
 
 
 def exif_fields(data: bytes) -> dict[str, Any]:
