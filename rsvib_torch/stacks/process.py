@@ -19,7 +19,7 @@ from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progres
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
 from rsvib_torch.stacks.manifest import manifest_header, manifest_text
-from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, manifest_path, run_to_file, work_folder
+from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, run_to_file
 from rsvib_torch.stacks.windows import Window
 
 _UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
@@ -141,8 +141,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
     out = job.content(out, timing)
     form = check_info_target(sink, out, compression, check_folder=False)
-    target = manifest_path(sink, options)
-    check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))
     first: WindowResult | None = None
 
     def finish(result: WindowResult, pixels: WindowFrames) -> StoredWindow:
@@ -172,10 +170,10 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     report = run_to_file(
         sink,
-        target,
+        options,
         manifest_header(job, sink.name, compression),
+        inputs=stack_files(source),
         windows=len(windows),
-        resume=options.resume,
         compute=compute,
         write=write,
         not_kept=lambda count: metadata_not_kept(job.info, sink, (count, *out.shape[1:])),

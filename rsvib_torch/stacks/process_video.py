@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.prefetch import in_threads
 from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.validation import fields_of
@@ -33,9 +32,7 @@ from rsvib_torch.stacks.run_folder import (
     RunFolder,
     StackReport,
     disk_errors_named,
-    manifest_path,
     run_to_file,
-    work_folder,
 )
 from rsvib_torch.stacks.video_frames import FrameTrack, RestoredFrame, VideoFrames
 from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
@@ -112,9 +109,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     job = video.frames.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
-    target = manifest_path(sink, options)
-    inputs = [*stack_files(source), *([] if recording is None else [recording])]
-    check_outputs([sink, work_folder(sink), target], inputs)
     content = job.content(job.info, timing)
     if border != "crop":
         check_info_target(sink, content, check_folder=False)
@@ -161,10 +155,10 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     return run_to_file(
         sink,
-        target,
+        options,
         header,
+        inputs=[*stack_files(source), *([] if recording is None else [recording])],
         windows=video.parts,
-        resume=options.resume,
         compute=compute,
         write=write,
         not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),

@@ -40,8 +40,10 @@ from rsvib_torch.core.atomic import (
     whole_file,
 )
 from rsvib_torch.core.free_memory import size_text
+from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import number_of, one_line
+from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.options import RunOptions
 from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import manifest_text, read_manifest
@@ -365,28 +367,25 @@ class StackReport(Summarised):
         return "\n".join(lines)
 
 
-def manifest_path(sink: Path, options: RunOptions) -> Path:
-    """Path of the manifest of a run."""
-    return sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
-
-
 def run_to_file(
     sink: Path,
-    manifest: Path,
+    options: RunOptions,
     header: dict[str, Any],
     *,
+    inputs: Iterable[Path],
     windows: int,
-    resume: bool,
     compute: Callable[[RunFolder], dict[str, Any]],
     write: Callable[[RunFolder], None],
     not_kept: Callable[[int], Sequence[str]],
 ) -> StackReport:
-    """Compute the windows of a run that are not finished, and write the output and its manifest.
+    """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.
 
     ``compute`` adds the missing windows to the folder and returns further keys of the manifest; ``write`` writes the
     output from the folder; ``not_kept`` names the metadata that an output of a number of frames does not contain.
     """
     start = time.perf_counter()
+    manifest = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
+    check_outputs([*stack_files(sink), work_folder(sink), manifest], inputs)
 
     def report(windows_done: Iterable[Mapping[str, Any]], resumed: int, lost: Sequence[str]) -> StackReport:
         records = list(windows_done)
@@ -403,7 +402,7 @@ def run_to_file(
             not_kept=tuple(lost),
         )
 
-    if resume and not work_folder(sink).exists() and sink.exists() and manifest.exists():
+    if options.resume and not work_folder(sink).exists() and sink.exists() and manifest.exists():
         complete = read_manifest(manifest)
         difference = _difference({name: getattr(complete, name) for name in header}, header)
         if difference:
@@ -411,7 +410,7 @@ def run_to_file(
         for path in (sink, manifest):
             remove_abandoned(path)
         return report(map(vars, complete.windows), windows, complete.not_kept)
-    folder = RunFolder(sink, header, resume=resume)
+    folder = RunFolder(sink, header, resume=options.resume)
     try:
         resumed = folder.count
         results = compute(folder)
