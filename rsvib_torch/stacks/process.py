@@ -163,7 +163,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         for stored in _watched(results, windows, remaining, errors, options.progress, folder.remove):
             # channels may be stored last
             folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
-        return {}
+        return {"not_kept": metadata_not_kept(job.info, sink, (folder.written, *out.shape[1:]))}
 
     def write(folder: RunFolder) -> None:
         write_frames(form, sink, out.with_frames(folder.written), _stored_frames(folder), compression)
@@ -176,7 +176,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         windows=len(windows),
         compute=compute,
         write=write,
-        not_kept=lambda count: metadata_not_kept(job.info, sink, (count, *out.shape[1:])),
     )
     return replace(report, first=first)
 

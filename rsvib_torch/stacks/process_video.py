@@ -147,7 +147,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
-        return {"margins": None if margins is None else asdict(margins), "gyroscope": gyroscope}
+        not_kept = metadata_not_kept(job.info, sink, content.shape)
+        return {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
@@ -161,7 +162,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         windows=video.parts,
         compute=compute,
         write=write,
-        not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
     )
 
 

@@ -376,12 +376,11 @@ def run_to_file(
     windows: int,
     compute: Callable[[RunFolder], dict[str, Any]],
     write: Callable[[RunFolder], None],
-    not_kept: Callable[[int], Sequence[str]],
 ) -> StackReport:
     """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.
 
-    ``compute`` adds the missing windows to the folder and returns further keys of the manifest; ``write`` writes the
-    output from the folder; ``not_kept`` names the metadata that an output of a number of frames does not contain.
+    ``compute`` adds the missing windows to the folder and returns further keys of the manifest, among them the metadata
+    that are ``not_kept``; ``write`` writes the output from the folder.
     """
     start = time.perf_counter()
     manifest = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
@@ -414,14 +413,13 @@ def run_to_file(
     try:
         resumed = folder.count
         results = compute(folder)
-        lost = not_kept(folder.written)
         with disk_errors_named(folder):
             make_folder(manifest.parent)
             with whole_file(manifest) as part:
-                part.write_text(manifest_text(header, folder.records(), lost, **results), encoding="utf-8")
+                part.write_text(manifest_text(header, folder.records(), **results), encoding="utf-8")
                 write(folder)
             sync(manifest.absolute().parent)  # the temporary folder is gone as well
-        summary = report(folder.records(), resumed, lost)
+        summary = report(folder.records(), resumed, results["not_kept"])
         folder.remove()
         return summary
     finally:
