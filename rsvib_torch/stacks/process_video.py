@@ -276,6 +276,6 @@ def _cut(planes: Planes, margins: Margins | None) -> Planes:
         return planes
     first, *others = planes
     luma = margins.cut(first)
-    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``FrameLayout.margins``
+    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``VideoFrames.margins``
     top, left = margins.top // 2, margins.left // 2
     return [luma, *(plane[..., top : top + rows, left : left + columns] for plane in others)]
