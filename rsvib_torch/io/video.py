@@ -5,13 +5,13 @@ applied; the videos that are written state it.
 """
 
 import math
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from io import BytesIO
-from itertools import chain, pairwise
+from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -446,35 +446,30 @@ def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], com
 _PART_OPTIONS = {"preset": "ultrafast", "crf": "14", "bf": "0"}
 
 
-class PartWriter:
-    """A new file with consecutive frames of a video; only ``join_parts`` gives them their times.
+@contextmanager
+def part_of_video(
+    file: BinaryIO, video: Path, info: StackInfo, picture: Picture | None
+) -> Iterator[Callable[[NDArray[Any]], None]]:
+    """Encode consecutive frames of a video into a new file; only ``join_parts`` gives them their times.
 
-    The ending of ``video`` selects container and codec. Frames are planes as in a ``picture``, or pixels.
+    Args:
+        file: The file, which is complete when the block ends without an exception.
+        video: Name of the video, whose ending selects container and codec.
+        info: Content of the video.
+        picture: As in ``VideoEncoder``.
+
+    Yields:
+        Function that encodes a frame.
     """
-
-    def __init__(self, file: BinaryIO, video: Path, info: StackInfo, picture: Picture | None) -> None:
-        ending, self._count, self._opened = video.suffix.lower(), 0, ExitStack()
-        self._opened.enter_context(file)
-        source = open_source(info, self._opened)
-        output = self._opened.enter_context(_av().open(file, "w", format=CONTAINERS[ending]))
+    ending, numbers = video.suffix.lower(), count()
+    with ExitStack() as opened:
+        opened.enter_context(file)
+        source = open_source(info, opened)
+        output = opened.enter_context(_av().open(file, "w", format=CONTAINERS[ending]))
         options = _PART_OPTIONS if ending in H264 else {}
-        self._encoder = VideoEncoder(output, video, info, source, picture, options)
-
-    def write(self, frame: NDArray[Any]) -> None:
-        """Encode a frame."""
-        self._encoder.write(frame, self._count * self._encoder.step)
-        self._count += 1
-
-    def close(self) -> None:
-        """Finish the file."""
-        try:
-            self._encoder.finish()
-        finally:
-            self._opened.close()
-
-    def abandon(self) -> None:
-        """Close the file, finished or not."""
-        self._opened.close()
+        encoder = VideoEncoder(output, video, info, source, picture, options)
+        yield lambda frame: encoder.write(frame, next(numbers) * encoder.step)
+        encoder.finish()
 
 
 def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:

@@ -21,7 +21,7 @@ from rsvib_torch.io.gyroscope.read_gyroscope import read_gyroscope
 from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
-from rsvib_torch.io.video import CONTAINERS, PartWriter, VideoReader, join_parts
+from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
@@ -235,15 +235,15 @@ def _encode_part(
             before = layout.planes(np.load(file, allow_pickle=False))
     with ExitStack() as opened:
         with disk_errors_named(folder):
-            writer = PartWriter(folder.create(name), output.path, output.info, layout.picture)
-        opened.callback(writer.abandon)
+            encoded = part_of_video(folder.create(name), output.path, output.info, layout.picture)
+            write = opened.enter_context(encoded)
         for track, frame, restored in frames:
             if tracks:
                 progress()  # the frame before is complete
             before = _without_gaps(restored, before, layout, output.border)
             final = layout.frame(_cut(before, output.margins))
             with disk_errors_named(folder):
-                writer.write(final)
+                write(final)
             if len(tracks) < CHECKED_FRAMES:
                 written.append(final)
             tracks.append(track)
@@ -251,7 +251,7 @@ def _encode_part(
                 follows = bool(pair) and pair[-1][0].index == track.index - 1
                 pair = [*pair, (track, frame)] if follows else [(track, frame)]
         with disk_errors_named(folder):
-            writer.close()
+            opened.close()  # the file is complete
     assert before is not None
     verdict = video.verdict(pair) if len(pair) == 2 else None
     record = video.record(part, tracks, motion, verdict, written)
