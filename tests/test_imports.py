@@ -150,7 +150,9 @@ def test_modules_do_not_import_each_other_in_a_cycle():
 def test_modules_of_file_formats_are_read_as_imports():
     source = (PACKAGE / "io" / "formats.py").read_text()
     named = {name for _, name in imported_modules(source, "rsvib_torch.io.formats")}
-    assert {f"rsvib_torch.io.{name}" for name in ("tiff", "npy", "hdf5", "raw", "video", "zarr_store")} <= named
+    assert {
+        f"rsvib_torch.io.{name}" for name in ("tiff", "flat_files", "hdf5", "images", "video", "zarr_store")
+    } <= named
 
 
 def test_every_part_has_a_layer():

@@ -219,7 +219,7 @@ def _video_name(frames: Path, output: str) -> str:
     """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
     if output != "restored.tif":
         raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-    from rsvib_torch.io.stack_format import H264, split_range  # noqa: PLC0415
+    from rsvib_torch.io.stack_info import H264, split_range  # noqa: PLC0415
 
     ending = split_range(frames)[0].suffix.lower()
     return f"restored{ending if ending in H264 else '.mkv'}"
@@ -227,7 +227,7 @@ def _video_name(frames: Path, output: str) -> str:
 
 def _is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
     """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
-    from rsvib_torch.io.stack_format import VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
+    from rsvib_torch.io.stack_info import VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
 
     return requested or (split_range(frames)[0].suffix.lower() in VIDEO and count > window)
 

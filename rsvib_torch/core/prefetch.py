@@ -1,34 +1,74 @@
-"""Items of an iterator, made ahead in a thread."""
+"""Loops over a source of items, which threads make and process ahead of the one that uses the results."""
 
 from collections import deque
-from collections.abc import Generator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import repeat, takewhile
 from typing import Any, TypeVar
 
 import torch
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 _END: Any = object()
 
 
-def prefetched(items: Generator[Item, None, None], count: int) -> Generator[Item, None, None]:
+def in_order(
+    items: Iterable[Any],
+    submit: Callable[[Any], Item],
+    capacity: Callable[[], int],
+    result: Callable[[Item], Result],
+    waiting: deque[Item],
+) -> Generator[Result, None, None]:
+    """Results of items in their order; up to ``capacity()`` of them are computed or wait, in ``waiting``."""
+    remaining = iter(items)
+    while True:
+        while len(waiting) < capacity() and (item := next(remaining, None)) is not None:
+            waiting.append(submit(item))
+        if not waiting:
+            return
+        yield result(waiting.popleft())
+
+
+@contextmanager
+def _pool(count: int, threads: int, items: Generator[Any, None, None]) -> Iterator[ThreadPoolExecutor]:
+    """Threads that use ``threads`` of PyTorch each; they end with the block, and then the source of items is closed."""
+    before = torch.get_num_threads()
+    pool = ThreadPoolExecutor(count, "rsvib", initializer=torch.set_num_threads, initargs=(threads,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+        items.close()
+        torch.set_num_threads(before)  # the default of threads that start later
+
+
+def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1) -> Generator[Item, None, None]:
     """Yield the items of a generator, which a thread makes while earlier ones are used; ``count`` of them wait.
 
-    The thread uses one thread of PyTorch. It ends with the generator, or when this one is closed. Errors are raised
-    behind the items before them.
+    The thread uses a number of ``threads`` of PyTorch. It ends with the generator, or when this one is closed. Errors
+    are raised behind the items before them.
 
     Example:
         >>> list(prefetched((letter for letter in "abc"), 2))
         ['a', 'b', 'c']
     """
-    threads = torch.get_num_threads()
-    pool = ThreadPoolExecutor(1, "rsvib-ahead", initializer=torch.set_num_threads, initargs=(1,))
-    try:
-        waiting = deque(pool.submit(next, items, _END) for _ in range(count))
-        while (item := waiting.popleft().result()) is not _END:
-            waiting.append(pool.submit(next, items, _END))
-            yield item
-    finally:
-        pool.shutdown(cancel_futures=True)
-        items.close()
-        torch.set_num_threads(threads)  # the default of threads that start later
+    with _pool(1, threads, items) as pool:
+        made = in_order(repeat(0), lambda _: pool.submit(next, items, _END), lambda: count + 1, Future.result, deque())
+        yield from takewhile(lambda item: item is not _END, made)
+
+
+def in_threads(
+    work: Callable[..., Result], items: Generator[tuple[Any, ...], None, None], *, at_once: int, threads: int = 1
+) -> Generator[Result, None, None]:
+    """Results of ``work(*item)`` in the order of the items, from ``at_once`` threads, while one more item is made.
+
+    Each thread uses a number of ``threads`` of PyTorch.
+
+    Example:
+        >>> list(in_threads(pow, ((number, 2) for number in range(4)), at_once=2))
+        [0, 1, 4, 9]
+    """
+    with _pool(at_once, threads, items) as pool:
+        yield from in_order(items, lambda item: pool.submit(work, *item), lambda: at_once + 1, Future.result, deque())

@@ -1,7 +1,6 @@
-from .formats import register_format
+from .formats import StackFormat, register_format
 from .frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
-from .stack_format import FrameReader, StackFormat
-from .stack_info import FrameError, StackInfo
+from .stack_info import FrameError, FrameReader, StackInfo
 from .stack_reading import open_stack, read_stack, read_stack_info
 from .stack_writing import check_stack_target, metadata_not_kept, stack_files, write_stack
 

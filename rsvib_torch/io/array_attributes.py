@@ -29,15 +29,9 @@ def attributes_of(info: StackInfo) -> dict[str, Any]:
 
 
 def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> StackInfo:
-    """Interpret a stored array as a stack.
+    """Interpret a stored array of (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it, as a stack.
 
-    Args:
-        attributes: As made by ``attributes_of``, or times of other programs; all may be missing.
-        shape: Shape of the array in the file: (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it.
-        dtype: Data type in the file.
-
-    Raises:
-        ValueError: If shape and attributes contradict each other.
+    The attributes are those of ``attributes_of``, or times of other programs; all may be missing.
     """
     axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
     if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:

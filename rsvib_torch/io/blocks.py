@@ -9,22 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.io.stack_format import FrameReader
-from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_frame
+from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
 
 Read = Callable[[int, int], NDArray[Any]]
 
 
 class BlockReader(FrameReader):
-    """Frames that are read in blocks; a block is kept until its last frame has been read.
+    """Frames that are read in blocks of a number of frames ``together``; a block is kept until its last frame was read.
 
-    Args:
-        path: The stack.
-        info: What its file states.
-        read: ``read(first, last)`` returns frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W).
-        together: Frames of a block.
-        more_bytes: Memory that reading a block needs besides its pixels.
-        close: Closes the file.
+    ``read(first, last)`` returns frames ``first`` to ``last`` (exclusive), (N, H, W) or (N, C, H, W); it needs
+    ``more_bytes`` of memory besides their pixels.
     """
 
     def __init__(
@@ -81,18 +75,10 @@ def array_reader(
 
 
 def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype[Any]) -> BlockReader:
-    """Reader of frames that lie one after another in a file.
+    """Reader of frames of a ``dtype`` with its byte order that lie one after another in a file from an ``offset`` on.
 
-    Files are read instead of mapped into memory: if a mapped file shrinks, the access ends the process.
-
-    Args:
-        path: The file.
-        info: The stack.
-        offset: Position of the first frame in bytes.
-        dtype: Data type in the file, with its byte order.
-
-    Raises:
-        ValueError: If the file holds less than half of the frames; others are reported when they are read.
+    Files are read instead of mapped into memory: if a mapped file shrinks, the access ends the process. A file that
+    holds less than half of the frames is refused; others are reported when they are read.
     """
     size, held = info.frame_bytes, max(0, path.stat().st_size - offset)
     if held // size < 0.5 * info.shape[0]:
@@ -113,11 +99,7 @@ def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype[
 
 
 def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader:
-    """Reader of frames ``start`` to ``end`` (exclusive; None for the last) of an open stack.
-
-    Raises:
-        ValueError: If the stack does not have these frames.
-    """
+    """Reader of frames ``start`` to ``end`` (exclusive; None for the last) of an open stack."""
     info, count = reader.info, reader.info.shape[0]
     last = count if end is None else end
     if not start < last <= count:

@@ -1,17 +1,76 @@
-"""The table of stack formats, and the choice of a format by the ending of a file name.
+"""The table of stack formats, their contract, and the choice of a format by the ending of a file name.
 
 The table is data. The module that reads and writes a format is imported when a stack of that format is opened, checked
 or written (``packaged_format``).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from numpy.typing import NDArray
 
 from rsvib_torch.core.reading import check_regular
 from rsvib_torch.core.text import quoted
-from rsvib_torch.io.stack_format import FFV1, H264, READ_ONLY_VIDEO, StackFormat
+from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+
+Frame = NDArray[Any]
+
+
+# Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
+# folder, which the caller renames when it is complete (``rsvib_torch/core/atomic.py``).
+#
+# Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
+#              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
+# Data types:  one of ``dtypes`` in native byte order; pixels are returned as stored, without scaling.
+# Full scale:  ``info.full_scale`` is the count that corresponds to 1.0, or None if the file does not state it; formats
+#              that have room for it store it (``known_full_scale`` supplies 255 for uint8).
+# Frame times: exposure starts in seconds, or None; times that are not exact need ``time_error`` and ``time_source``.
+# Orientation: frames have the rows and columns of the file; ``info.orientation`` states how they are displayed.
+# Metadata:    ``keeps`` states what the format stores besides pixels; users are told what their file loses.
+# Reading:     ``open`` must not allocate memory by sizes in a header before it has compared them with the size of the
+#              file, must not decode pixels, execute code or follow links to other files, and raises an ``OSError`` if
+#              the file cannot be opened, a one-line ``ValueError`` that names the file if it is not a stack
+#              (``readable_stack``), and ``ModuleNotFoundError`` if a package is missing (``needed_package``). A reader
+#              raises ``FrameError`` for a damaged frame (``readable_frame``); opening fails if more than half of the
+#              frames are missing. Frames that are stored together are decoded once (``io/blocks.py``);
+#              ``info.decoding_bytes`` is the memory that this needs.
+# Writing:     ``write`` takes the frames one after another; the caller synchronises the files with the disk.
+@dataclass(frozen=True)
+class StackFormat:
+    """How stacks are stored in files with certain endings.
+
+    Attributes:
+        name: Name in messages.
+        endings: File endings, lower case with the dot; ``""`` is a name without an ending.
+        open: Opens a stack for reading.
+        write: ``write(path, info, frames, compression)`` writes a stack from an iterator of its frames; None for
+            formats that are only read.
+        dtypes: NumPy names of the data types that can be written.
+        check: Raises an error if a stack cannot be written to a path.
+        kind: ``"file"``; ``"folder"``, which may contain other files; or ``"tree"``, a folder that is replaced as one.
+        marker: File that identifies a folder of any name as a stack of this format.
+        companions: Endings of additional files, which are appended to the file name.
+        compressions: Values of ``compression`` besides None.
+        keeps: What is stored besides pixels: ``"full_scale"``, ``"frame_times"``, ``"orientation"``, ``"resolution"``
+            and ``"metadata"``, attributes of ``StackInfo``.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    open: Callable[[Path], FrameReader]
+    write: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
+    dtypes: tuple[str, ...] = (
+        "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
+    )  # fmt: skip
+    check: Callable[[Path, StackInfo], None] | None = None
+    kind: Literal["file", "folder", "tree"] = "file"
+    marker: str = ""
+    companions: tuple[str, ...] = ()
+    compressions: tuple[str, ...] = ()
+    keeps: tuple[str, ...] = ()
 
 
 def packaged_format(
@@ -26,8 +85,8 @@ def packaged_format(
 ) -> StackFormat:
     """A format whose functions are imported when they are called: reading a TIFF file imports no other format.
 
-    ``tests/test_imports.py`` reads the names of the modules in the calls of this function as imports. ``open``,
-    ``write`` and ``check`` name the functions of ``StackFormat`` in the ``module``.
+    ``open``, ``write`` and ``check`` name functions of ``StackFormat`` in the ``module``. ``tests/test_imports.py``
+    reads these calls as imports.
     """
 
     def imported(function: str) -> Callable[..., Any]:
@@ -47,21 +106,21 @@ _KEPT_BY_VIDEO = ("full_scale", "frame_times", "orientation")
 
 # The order is that of error messages.
 _FORMATS_OF_THE_PACKAGE = (
-    packaged_format("npy", (".npy",), "rsvib_torch.io.npy", "open_npy", write="write_npy", check="check_npy"),
+    packaged_format("npy", (".npy",), "rsvib_torch.io.flat_files", "open_npy", write="write_npy", check="check_npy"),
     packaged_format(
         "hdf5", (".h5", ".hdf5", ".hdf"), "rsvib_torch.io.hdf5", "open_hdf5", write="write_hdf5", keeps=_KEPT
     ),
-    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.image_folder", "open_images"),
+    packaged_format("jpeg", (".jpg", ".jpeg"), "rsvib_torch.io.images", "open_images"),
     packaged_format(
-        "png", (".png",), "rsvib_torch.io.image_folder", "open_images", write="write_image", check="check_image",
+        "png", (".png",), "rsvib_torch.io.images", "open_images", write="write_image", check="check_image",
         dtypes=("uint8", "uint16"), keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
-        "image folder", ("",), "rsvib_torch.io.image_folder", "open_images", write="write_folder",
+        "image folder", ("",), "rsvib_torch.io.images", "open_images", write="write_folder",
         check="check_folder", kind="folder", keeps=_KEPT_BY_PNG,
     ),
     packaged_format(
-        "raw", (".raw",), "rsvib_torch.io.raw", "open_raw", write="write_raw", companions=(".json",), keeps=_KEPT
+        "raw", (".raw",), "rsvib_torch.io.flat_files", "open_raw", write="write_raw", companions=(".json",), keeps=_KEPT
     ),
     packaged_format(
         "tiff", (".tif", ".tiff"), "rsvib_torch.io.tiff", "open_tiff", write="write_tiff",
@@ -89,7 +148,7 @@ def register_format(form: StackFormat) -> None:
     """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
 
     Args:
-        form: The format; see the contract in ``stack_format.py``.
+        form: The format; see the contract above ``StackFormat``.
 
     Raises:
         ValueError: If it has no ending, or one without a dot or in upper case.
@@ -109,12 +168,7 @@ def register_format(form: StackFormat) -> None:
 
 
 def find_format(path: Path) -> StackFormat:
-    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images.
-
-    Raises:
-        FileNotFoundError: If it does not exist.
-        ValueError: If the ending is not registered, or the path is a pipe, a socket or a device.
-    """
+    """The format of an existing stack: by its ending, of a folder also by its marker file, else a folder of images."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     check_regular(path)
@@ -128,11 +182,7 @@ def find_format(path: Path) -> StackFormat:
 
 
 def target_format(path: Path) -> StackFormat:
-    """The format in which a path is written, by its ending only.
-
-    Raises:
-        ValueError: If the ending is not registered.
-    """
+    """The format in which a path is written, by its ending only."""
     if path.suffix.lower() in FORMATS:
         return FORMATS[path.suffix.lower()]
     known = ", ".join(ending for ending in FORMATS if ending)

@@ -42,31 +42,21 @@ class TimingWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False)
 class _Spacing:
-    """Spacing of the frames of a file.
+    """Spacing of the frames of a file."""
 
-    Attributes:
-        numbers: Number of intervals from the first frame to each frame, more than one where frames were dropped, (T,).
-        interval: Interval without dropped frames in s: of a straight line, or the median if the rate is variable.
-        shortest: Shortest interval in s if the rate is variable, otherwise ``interval``.
-        longest: Longest interval in s if the rate is variable, otherwise ``interval``.
-        error: Error of ``interval`` in s due to the error of the times.
-        equal: Whether the times are whole numbers of intervals apart, to within their error, 2 % of an interval (clock
-            of a telephone or camera), and a quarter of an interval.
-    """
-
-    numbers: NDArray[np.float64]
-    interval: float
-    shortest: float
-    longest: float
-    error: float
+    numbers: NDArray[np.float64]  # (T,) intervals from the first frame to each, more than one where frames were dropped
+    interval: float  # s, without dropped frames: of a straight line, or the median if the rate is variable
+    shortest: float  # s, shortest interval if the rate is variable, otherwise ``interval``
+    longest: float  # s, longest interval if the rate is variable, otherwise ``interval``
+    error: float  # s, of ``interval`` due to the error of the times
+    # whether times are whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one
     equal: bool
 
 
 def _spacing(info: StackInfo) -> _Spacing | None:
     """Spacing according to the times or the frame rate of a file; None if it states neither.
 
-    Raises:
-        ValueError: If times do not increase, or they or the rate are not those of a camera.
+    Impossible ones are refused.
     """
     few = info.frame_times is None or len(info.frame_times) < 2
     if few and info.frame_rate is None:
@@ -111,24 +101,6 @@ def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
     return spacing.shortest - tolerance <= period <= spacing.longest + tolerance
 
 
-def _warn_of_rate(info: StackInfo, timing: SensorTiming) -> None:
-    """Warn if the frame rate of a file is not that of the sensor, with both values and the remedy."""
-    spacing = _spacing(info)
-    if spacing is None or _same_rate(info, timing):
-        return
-    exact = info.frame_times is not None and info.time_error == 0.0
-    used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
-    warnings.warn(
-        f"{info.path or 'the file'}: {1.0 / spacing.interval:.5g} frames per second according to its "
-        f"{info.time_source}, but {timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
-        f"row_time={timing.row_time:g} s); {used}. If the file is right, set the frame rate to "
-        f"{1.0 / spacing.interval:.6g} (frame_rows={spacing.interval / timing.row_time:.6g}) or correct row_time; if "
-        "the sensor is right (slow motion), nothing needs to be changed",
-        TimingWarning,
-        stacklevel=2,
-    )
-
-
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
     """Exposure start of every frame according to its file, in seconds; None if it is not stated, or at another rate.
 
@@ -138,10 +110,6 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     numbers of intervals apart to within their error or 2 % of a period, the result consists of multiples of the
     sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are
     returned as they are if their error is less than a tenth of a period.
-
-    Args:
-        info: What the file states.
-        timing: The sensor.
 
     Example:
         >>> info = StackInfo((4, 8, 8), "uint8", 255.0, (0.0, 0.033, 0.067, 0.2), time_error=0.001)
@@ -162,25 +130,30 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
 
 
 def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
-    """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced.
-
-    Warns:
-        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
-    """
+    """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced."""
     if timing.frame_start_times is not None:
         return timing
-    _warn_of_rate(info, timing)
-    times = exposure_times(info, timing)
-    if times is None:
-        if info.frame_times is not None and len(info.frame_times) > 1 and _same_rate(info, timing):
-            warnings.warn(
-                f"{info.path or 'the file'}: the {info.time_source} are irregular and have errors of up to "
-                f"{1e3 * info.time_error:.3g} ms; equal intervals are assumed, set frame_start_times if they are not",
-                TimingWarning,
-                stacklevel=2,
-            )
-        return timing
-    if info.time_error and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period:
+    name, spacing, times = info.path or "the file", _spacing(info), exposure_times(info, timing)
+    if spacing is not None and not _same_rate(info, timing):
+        exact = info.frame_times is not None and info.time_error == 0.0
+        used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
+        warnings.warn(
+            f"{name}: {1.0 / spacing.interval:.5g} frames per second according to its {info.time_source}, but "
+            f"{timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
+            f"row_time={timing.row_time:g} s); {used}. If the file is right, set the frame rate to "
+            f"{1.0 / spacing.interval:.6g} (frame_rows={spacing.interval / timing.row_time:.6g}) or correct row_time; "
+            "if the sensor is right (slow motion), nothing needs to be changed",
+            TimingWarning,
+            stacklevel=2,
+        )
+    elif times is None and info.frame_times is not None and len(info.frame_times) > 1:
+        warnings.warn(
+            f"{name}: the {info.time_source} are irregular and have errors of up to {1e3 * info.time_error:.3g} ms; "
+            "equal intervals are assumed, set frame_start_times if they are not",
+            TimingWarning,
+            stacklevel=2,
+        )
+    if times is None or (info.time_error and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period):
         return timing
     return replace(timing, frame_start_times=times)
 
@@ -211,12 +184,7 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
 
 
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
-    """Sentences about an orientation, dropped frames and unequal intervals that a file states.
-
-    Args:
-        info: What the file states.
-        timing: The sensor, without the times of the file; None if it is not known.
-    """
+    """Sentences about an orientation, dropped frames and unequal intervals that a file states."""
 
     def missing_frames(count: int) -> str:
         return f"{number_of(count, 'frame')} {'is' if count == 1 else 'are'} missing"

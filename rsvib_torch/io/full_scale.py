@@ -17,41 +17,29 @@ def check_dtype(dtype: np.dtype[Any]) -> None:
         raise ValueError(f"pixels are {dtype}; expected integers of up to 32 bits, or floats of up to 64")
 
 
-def check_full_scale(full_scale: object, dtype: np.dtype[Any]) -> float:
-    """Return ``full_scale`` as a float that is positive and representable by integers of ``dtype``."""
-    value = check_number("full_scale", full_scale, above=0.0)
+def known_full_scale(dtype: np.dtype[Any], stated: object = None) -> float | None:
+    """Full scale of pixels of ``dtype``: the stated value, or 255 for ``uint8``; None if unknown, and for floats."""
+    if dtype.kind == "f":
+        return None
+    if stated is None:
+        return 255.0 if dtype == np.uint8 else None
+    value = check_number("full_scale", stated, above=0.0)
     largest = int(np.iinfo(dtype).max)
     if value > largest:
         raise ValueError(f"full_scale={value:g} exceeds the largest {dtype} value ({largest})")
     return value
 
 
-def known_full_scale(dtype: np.dtype[Any], stated: object = None) -> float | None:
-    """Full scale of pixels of ``dtype``: the stated value, or 255 for ``uint8``; None if unknown, and for floats."""
-    if dtype.kind == "f":
-        return None
-    if stated is not None:
-        return check_full_scale(stated, dtype)
-    return 255.0 if dtype == np.uint8 else None
-
-
 def required_full_scale(full_scale: float | None, dtype: np.dtype[Any], name: object) -> float:
-    """Return ``full_scale`` checked for integers of ``dtype``.
-
-    Args:
-        full_scale: Count that corresponds to 1.0; None if unknown.
-        dtype: Data type of the pixels.
-        name: File or argument, for messages.
-
-    Raises:
-        ValueError: If it is unknown, not positive, or not representable.
-    """
+    """The count of integers that corresponds to 1.0; the error names a file or an argument if it is unknown."""
     if full_scale is None:
         raise ValueError(
             f"{name}: full scale of {dtype} frames unknown: pass full_scale, e.g. full_scale=4095 for 12-bit counts "
             "(commands: --full-scale 4095)"
         )
-    return check_full_scale(full_scale, dtype)
+    known = known_full_scale(dtype, full_scale)
+    assert known is not None  # of integers
+    return known
 
 
 def beyond_full_scale(largest: int, full_scale: float) -> str:
@@ -69,16 +57,9 @@ def full_scale_of_counts(counts: NDArray[Any], full_scale: float | None, name: s
 
 
 def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, nodata: float | None = None) -> Tensor:
-    """Convert pixels as stored to float32 frames; floats keep their values.
+    """Convert pixels as stored to float32 frames; floats keep their values, and pixels of the value ``nodata`` are NaN.
 
-    Args:
-        counts: Pixels as stored.
-        full_scale: Count that corresponds to 1.0; not used for floats.
-        name: File or argument, for messages.
-        nodata: Value of pixels without data, which become NaN.
-
-    Raises:
-        ValueError: If the full scale of integers is unknown or exceeded.
+    ``name`` is the file or argument, for messages.
     """
     if nodata is not None:
         missing = counts == counts.dtype.type(nodata)
@@ -100,16 +81,9 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, 
 def frames_to_counts(
     frames: Tensor, dtype: np.dtype[Any], full_scale: float | None, nodata: float | None = None
 ) -> NDArray[Any]:
-    """Convert frames to pixels to store: integers are scaled, rounded and clipped; floats keep their values.
+    """Convert frames of full scale 1 to pixels to store: integers are scaled, rounded and clipped; floats are kept.
 
-    Args:
-        frames: Frames whose full scale is 1.
-        dtype: Data type to store.
-        full_scale: Count that corresponds to 1.0; not used for floats.
-        nodata: Value to store for NaN; None to store NaN, which integers cannot.
-
-    Raises:
-        ValueError: If integers are requested without a full scale, or of frames that are not finite.
+    NaN is stored as ``nodata``; without it, frames that are not finite cannot be stored as integers.
     """
     pixels = frames.detach().cpu()
     if nodata is not None:

@@ -1,11 +1,12 @@
 """What a file states about a stack: shape, data type, full scale, times, orientation; errors of unreadable files."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,11 @@ from numpy.typing import NDArray
 from rsvib_torch.core.arguments import check_fields, checked_methods
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
+
+# Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
+H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
+READ_ONLY_VIDEO = (".avi", ".webm", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv")
+VIDEO = (*FFV1, *H264, *READ_ONLY_VIDEO)
 
 DIFFERENT = " (differs between files)"  # ending of the names of metadata of a folder
 
@@ -26,23 +32,15 @@ Scope = Literal["file", "image", "stack"]
 
 @dataclass(frozen=True)
 class Tag:
-    """An entry in the header of a TIFF file.
+    """An entry in the header of a TIFF file."""
 
-    Attributes:
-        code: Number of the tag.
-        dtype: Number of its data type in TIFF.
-        count: Number of values.
-        value: A number, text, bytes, or a tuple of numbers.
-        first_page: Whether only the first page has it.
-        scope: What it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``:
-            for the same number of them in the same data type only; ``"file"``: for any frames.
-    """
-
-    code: int
-    dtype: int
-    count: int
-    value: Any
-    first_page: bool
+    code: int  # number of the tag
+    dtype: int  # number of its data type in TIFF
+    count: int  # number of values
+    value: Any  # a number, text, bytes, or a tuple of numbers
+    first_page: bool  # whether only the first page has it
+    # what it describes: ``"image"``: valid for frames of the same size only (georeferencing); ``"stack"``: for the same
+    # number of them in the same data type only; ``"file"``: for any frames
     scope: Scope
 
 
@@ -209,6 +207,38 @@ class StackInfo(Summarised):
         if self.stored_axes == "THWC":
             frame = np.moveaxis(frame, 0, -1)
         return np.ascontiguousarray(frame, dtype=self.dtype)
+
+
+class FrameReader(Protocol):
+    """An open stack; frames are read one at a time, in any order."""
+
+    info: StackInfo
+
+    def frame(self, index: int) -> NDArray[Any]:
+        """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
+
+    def close(self) -> None:
+        """Close the file, if it is open between frames."""
+        return
+
+
+_RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
+
+
+def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
+    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them.
+
+    Example:
+        >>> split_range(Path("clip.mp4[100:200]"))
+        (PosixPath('clip.mp4'), (100, 200))
+        >>> split_range(Path("clip.mp4"))
+        (PosixPath('clip.mp4'), None)
+    """
+    found = _RANGE.fullmatch(path.name)
+    if found is None or path.exists():
+        return path, None
+    name, start, end = found.groups()
+    return path.with_name(name), (int(start or 0), int(end) if end else None)
 
 
 @contextmanager

@@ -19,8 +19,7 @@ from rsvib_torch.core.progress import steps
 from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
-from rsvib_torch.io.stack_format import FrameReader, split_range
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import FrameReader, StackInfo, split_range
 
 PathLike = str | os.PathLike[str]
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]
@@ -62,18 +61,9 @@ def open_stack(path: PathLike) -> FrameReader:
 
 @checks_arguments
 def read_stack_info(path: PathLike) -> StackInfo:
-    """Read shape, data type and full scale of a stack without its pixels.
+    """Read what a file states about its stack: shape, data type and full scale, without its pixels.
 
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        What the file states; unknown values are None.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack.
+    Arguments and errors are those of ``open_stack``; unknown values are None.
 
     Example:
         >>> info = read_stack_info("frames.tif")  # doctest: +SKIP
@@ -132,11 +122,8 @@ def _read_pixels(
 ) -> tuple[NDArray[Any], float | None, StackInfo]:
     """Frames of all files, (T, H, W) or (T, C, H, W), their full scale, and what the first file states.
 
-    Args:
-        paths: The files.
-        full_scale: As in ``read_stack``.
-        as_counts: Whether integers are returned as stored instead of as float32; those of files with a nodata value
-            are always float32, with NaN where pixels have no data.
+    Integers are returned as stored if wanted ``as_counts``, and the files have no nodata value: then NaN marks those
+    pixels.
     """
     if not paths:
         raise ValueError("path must contain at least one file, got an empty list")
@@ -177,25 +164,15 @@ def _read_pixels(
 
 
 class LoadedFrames(NamedTuple):
-    """Frames in memory, from the argument ``frames`` of a function.
+    """Frames in memory, from the argument ``frames`` of a function."""
 
-    Attributes:
-        frames: Tensor, array or list of these; integers as stored, unless the file has a nodata value.
-        full_scale: Count that corresponds to 1.0; None if it is unknown, and for floats of a file.
-        info: What the file states, if the frames were given by one path.
-    """
-
-    frames: FramesLike
-    full_scale: float | None
-    info: StackInfo | None
+    frames: FramesLike  # tensor, array or list of these; integers as stored, unless the file has a nodata value
+    full_scale: float | None  # count that corresponds to 1.0; None if it is unknown, and for floats of a file
+    info: StackInfo | None  # what the file states, if the frames were given by one path
 
 
 def load_frames(frames: FramesOrFiles, full_scale: float | None) -> LoadedFrames:
     """Read frames that are given by the paths of their files; other frames are returned unchanged.
-
-    Args:
-        frames: Frames in memory, a path, or a list of paths.
-        full_scale: Count that corresponds to 1.0, as in ``read_stack``.
 
     Example:
         >>> load_frames([[[0.5]]], None)

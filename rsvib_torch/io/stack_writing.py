@@ -15,10 +15,9 @@ from rsvib_torch.core.atomic import check_target, check_writable, whole
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
-from rsvib_torch.io.formats import FORMATS, target_format
+from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
-from rsvib_torch.io.stack_format import StackFormat, split_range
-from rsvib_torch.io.stack_info import DIFFERENT, StackInfo
+from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike
 
 

@@ -3,14 +3,15 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from rsvib_torch.io.array_attributes import attributes_of
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
@@ -22,23 +23,14 @@ _LOSSLESS = {1, 5, 8, 32946, 32773, 34925, 50000}  # none, LZW, Deflate (two cod
 _LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 
 
-@dataclass(frozen=True, slots=True)
-class _Page:
-    """What the header of a page states.
+class _Page(NamedTuple):
+    """What the header of a page states."""
 
-    Attributes:
-        number: Its number in the file.
-        kind: Size and type of the pixels, for messages and comparisons.
-        nbytes: Size of its decoded pixels in bytes.
-        complete: Whether its stored pixels lie within the file.
-        secondary: Whether it is a thumbnail or a mask of another page.
-    """
-
-    number: int
-    kind: str
-    nbytes: int
-    complete: bool
-    secondary: bool
+    number: int  # in the file
+    kind: str  # size and type of the pixels, for messages and comparisons
+    nbytes: int  # of its decoded pixels
+    complete: bool  # whether its stored pixels lie within the file
+    secondary: bool  # whether it is a thumbnail or a mask of another page
 
 
 def _name(photometric: Any) -> str:
@@ -101,21 +93,15 @@ def _check_complete(complete: Sequence[bool], nbytes: int, size: int) -> None:
 def _resolution(tif: Any) -> tuple[float, float, str] | None:
     """Pixels per unit, if the unit is one of length."""
     tags = tif.pages.first.tags
-    unit = {2: "inch", 3: "centimeter"}.get(int(tags["ResolutionUnit"].value) if "ResolutionUnit" in tags else 0)
-    if unit is None or "XResolution" not in tags or "YResolution" not in tags:
-        return None
-    (x, per_x), (y, per_y) = tags["XResolution"].value, tags["YResolution"].value
-    return (x / per_x, y / per_y, unit) if min(x, per_x, y, per_y) > 0 else None
+    unit = {2: "inch", 3: "centimeter"}.get(int(tags.valueof("ResolutionUnit", 0)))
+    (x, per_x), (y, per_y) = (tags.valueof(name, (0, 0)) for name in ("XResolution", "YResolution"))
+    return (x / per_x, y / per_y, unit) if unit is not None and min(x, per_x, y, per_y) > 0 else None
 
 
 def _info(
     tif: Any, shape: tuple[int, ...], dtype: np.dtype[Any], photometric: Any, *, channels_last: bool
 ) -> StackInfo:
-    """A stack of that shape, with what the first page states.
-
-    Raises:
-        ValueError: If the kind of its pixels is not supported.
-    """
+    """A stack of that shape, with what the first page states."""
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
     check_dtype(dtype)
@@ -254,38 +240,14 @@ def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> 
 
 
 # programs that state how the pages of a file are arranged, as tifffile names them
-_ARRANGED = frozenset(
-    [
-        "shaped",
-        "lsm",
-        "mmstack",
-        "ome",
-        "imagej",
-        "ndtiff",
-        "fluoview",
-        "stk",
-        "sis",
-        "svs",
-        "scn",
-        "qpi",
-        "ndpi",
-        "bif",
-        "avs",
-        "eer",
-        "philips",
-        "scanimage",
-        "nih",
-        "mdgel",
-    ]
+_PROGRAMS = (
+    "shaped lsm mmstack ome imagej ndtiff fluoview stk sis svs scn qpi ndpi bif avs eer philips scanimage nih mdgel"
 )
+_ARRANGED = frozenset(_PROGRAMS.split())
 
 
 def _are_arranged(tif: Any, count: int) -> bool:
-    """Whether the ``count`` pages of a file are arranged as one array; otherwise every page is a frame.
-
-    Raises:
-        ValueError: If there are several arrays that are not frames.
-    """
+    """Whether the ``count`` pages of a file are arranged as one array; otherwise every page is a frame."""
     metadata = json_description(tif)
     if "shape" in metadata:  # series of pages that were written one by one would take quadratic time
         shape = tuple(metadata["shape"])
@@ -323,13 +285,8 @@ def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
     stored = replace(info, channels_last=colour)
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
-    description: dict[str, object] = {"axes": axes}
-    if info.full_scale is not None:
-        description["full_scale"] = info.full_scale
-    if info.frame_times is not None:
-        description["frame_times"] = list(info.frame_times)
-    elif info.frame_rate is not None:
-        description["frame_rate"] = info.frame_rate
+    plain = replace(info, orientation=1, resolution=None)  # those are tags
+    description = {**attributes_of(plain), "axes": axes}
     options = {"photometric": "rgb" if colour else "minisblack", **writer_options(info, description)}
     if axes == "TSYX":
         options["planarconfig"] = "separate"

@@ -57,10 +57,7 @@ def _parsed(text: str) -> dict[str, Any]:
 def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
     """Metadata of a TIFF file by name; None for those that cannot be copied to the file that this package writes.
 
-    Args:
-        tif: The open ``tifffile.TiffFile``.
-        info: The stack in it. Descriptions of its arrangement (OME, ImageJ) are copied only if the pages of the output
-            will be the same.
+    Descriptions of the arrangement of its pages (OME, ImageJ) are copied only if those of the output will be the same.
     """
     numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
     others = [tif.pages.get(number) for number in numbers if 0 < number < len(tif.pages)]
@@ -136,12 +133,7 @@ def _text(text: str, scope: Scope) -> Tag:
 
 
 def writer_options(info: StackInfo, description: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of ``tifffile.imwrite`` that store the metadata of a stack.
-
-    Args:
-        info: The stack.
-        description: Axes, full scale, frame times and frame rate, to be stored as JSON.
-    """
+    """Options of ``tifffile.imwrite`` that store the metadata of a stack, and a description as JSON."""
     extratags: list[tuple[Any, ...]] = []
     options: dict[str, Any] = {"metadata": dict(description), "extratags": extratags}
     for name, tag in info.metadata.items():

@@ -68,14 +68,10 @@ def time_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def times_of_attributes(attributes: Mapping[str, Any], count: int) -> dict[str, Any]:
-    """Times and frame rate of HDF5 and Zarr attributes such as ``timestamps``, ``timestamps_ms``, ``frame_rate``.
+    """Times of ``count`` frames, and frame rate, of HDF5 and Zarr attributes such as ``timestamps_ms``, ``frame_rate``.
 
     The unit of times is that of the attribute with ``_unit`` or ``_units`` appended, or the ending of the name;
-    otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second.
-
-    Args:
-        attributes: All attributes; others are ignored.
-        count: Number of frames.
+    otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second. Other attributes are ignored.
     """
     fields: dict[str, Any] = {}
     for name, value in attributes.items():
@@ -106,15 +102,14 @@ def times_of_attributes(attributes: Mapping[str, Any], count: int) -> dict[str, 
 def _seconds_of_date(text: object, fraction: object = "") -> float | None:
     """Seconds since 1970 of a date of TIFF and EXIF with a fraction of a second; None without a fraction."""
     digits = str(fraction).strip("\0 ")
-    date = str(text).strip("\0 ").replace("T", " ")
+    date = str(text).strip("\0 ")
     if "." not in date and digits.isdecimal():
         date = f"{date}.{digits}"
-    for layout in ("%Y:%m:%d %H:%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f"):
-        try:
-            return datetime.strptime(date[:26], layout).replace(tzinfo=UTC).timestamp()
-        except ValueError:
-            continue
-    return None
+    try:
+        moment = datetime.fromisoformat(date[:10].replace(":", "-") + date[10:26])
+    except ValueError:
+        return None
+    return moment.replace(tzinfo=UTC).timestamp() if "." in date else None
 
 
 def exif_fields(data: bytes) -> dict[str, Any]:
@@ -175,15 +170,10 @@ def _ome_fields(text: str, count: int) -> dict[str, Any]:
 
 
 def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Times or frame rate of a TIFF file.
+    """Times of ``count`` frames or frame rate of a TIFF file.
 
-    They are stated by the metadata that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
+    They are stated by the ``metadata`` that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
     description with a time and its unit, or by the tag DateTime with a fraction of a second.
-
-    Args:
-        tif: The open ``tifffile.TiffFile``.
-        count: Number of frames.
-        metadata: Metadata that this package has written.
     """
     if len(metadata.get("frame_times", ())) == count:  # otherwise those of the first of several arrays
         return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}

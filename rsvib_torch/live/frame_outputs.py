@@ -1,7 +1,7 @@
 """Outputs of video frames: files, pipes and a window."""
 
-from contextlib import suppress
-from fractions import Fraction
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import sync
 from rsvib_torch.core.checks import needed_package
+from rsvib_torch.io.stack_info import H264, StackInfo
+from rsvib_torch.io.video import CONTAINERS, VideoEncoder
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
@@ -30,11 +32,7 @@ class FrameOutput(Protocol):
 
 
 class PipeOutput:
-    """Raw frames, 8 bits per channel, grey or RGB, one behind the other.
-
-    Args:
-        stream: The pipe, without a buffer.
-    """
+    """Raw frames, 8 bits per channel, grey or RGB, one behind the other, in a pipe without a buffer."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -52,41 +50,26 @@ class PipeOutput:
 class VideoOutput:
     """A video file: H.264 for .mp4, .mov and .m4v, FFV1 (without loss) for .mkv.
 
-    The file is created with the first frame, and can be played from then on, however the process ends.
-
-    Args:
-        path: The file.
-        frame_rate: Frames per second.
-        overwrite: Whether a file that exists when the first frame is written is replaced.
-
-    Raises:
-        ValueError: If the file ending is another one.
+    The file is created with the first frame, and can be played from then on, however the process ends. A file that
+    exists then is replaced only to ``overwrite`` it.
     """
 
     def __init__(self, path: Path, frame_rate: float, *, overwrite: bool = False) -> None:
-        if path.suffix.lower() not in (".mp4", ".mov", ".m4v", ".mkv"):
+        if path.suffix.lower() not in CONTAINERS:
             raise ValueError(f"{path}: a live video is written to .mp4, .mov, .m4v or .mkv; or to a pipe with --out -")
         self._av = needed_package("av", "writing video", "video")
-        self._rate = Fraction(frame_rate).limit_denominator(1001)
-        self._path, self._overwrite = path, overwrite
+        self._path, self._rate, self._overwrite = path, frame_rate, overwrite
         self._container: Any = None
-        self._stream: Any = None
 
     def write(self, frame: Frame, index: int) -> None:
-        """Encode a frame.
-
-        Raises:
-            FileExistsError: If it is the first frame, and the file exists.
-            OSError: If it cannot be written; the file has the frames before.
-        """
-        grey = frame.ndim == 2
+        """Encode a frame; after an error, the file has the frames before."""
+        pixels = frame if frame.ndim == 2 else np.moveaxis(frame, -1, 0)
         if self._container is None:
-            self._create(frame.shape[0], frame.shape[1], grey=grey)
-        picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="gray" if grey else "rgb24")
-        picture.pts, picture.time_base = index, 1 / self._rate
-        self._encode(picture)
+            self._create(pixels.shape)
+        with self._errors_named():
+            self._encoder.write(pixels, index * self._encoder.step)
 
-    def _create(self, height: int, width: int, *, grey: bool) -> None:
+    def _create(self, shape: tuple[int, ...]) -> None:
         if self._overwrite:
             self._path.unlink(missing_ok=True)  # a link is replaced, not the file behind it
         try:
@@ -94,19 +77,18 @@ class VideoOutput:
         except FileExistsError as error:
             raise FileExistsError(f"{self._path} was created by another program; choose another name") from error
         sync(self._path.absolute().parent)
-        lossy = self._path.suffix.lower() != ".mkv"
+        lossy = self._path.suffix.lower() in H264
+        info = StackInfo((2, *shape), "uint8", 255.0, frame_rate=self._rate)  # of any number of frames
         self._container = self._av.open(str(self._path), "w", options=_FRAGMENTS if lossy else _CLUSTERS)
         # ultrafast keeps up with a camera; the other presets make smaller files of the same quality
-        options = {"crf": "16", "preset": "ultrafast"} if lossy else {"level": "3", "g": "1"}
-        self._stream = self._container.add_stream("libx264" if lossy else "ffv1", self._rate, options=options)
-        self._stream.height, self._stream.width = height, width
-        self._stream.pix_fmt = "yuv420p" if lossy else "gray" if grey else "bgr0"
-        self._stream.codec_context.time_base = 1 / self._rate
+        options = {"crf": "16", "preset": "ultrafast"} if lossy else {}
+        self._encoder = VideoEncoder(self._container, self._path, info, None, options=options)
 
-    def _encode(self, picture: Any) -> None:
-        """Encode and write a frame; None for those that the encoder has not yet returned."""
+    @contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        """State the file in errors of FFmpeg, after which nothing more is written."""
         try:
-            self._container.mux(self._stream.encode(picture))
+            yield
         except self._av.error.FFmpegError as error:
             with suppress(self._av.error.FFmpegError):
                 self._container.close()
@@ -116,17 +98,14 @@ class VideoOutput:
     def close(self) -> None:
         """Finish the file."""
         if self._container is not None:
-            self._encode(None)
+            with self._errors_named():
+                self._encoder.finish()
             self._container.close()
             sync(self._path)
 
 
 class PreviewOutput:
-    """A window of OpenCV.
-
-    Raises:
-        ValueError: If the installed OpenCV has no windows.
-    """
+    """A window of OpenCV, if the installed one has windows."""
 
     def __init__(self) -> None:
         import cv2  # noqa: PLC0415

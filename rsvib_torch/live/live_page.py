@@ -18,17 +18,7 @@ await (await fetch("/state")).text()}}, 500)</script></body></html>"""
 
 
 class PageOutput:
-    """Restored frames at ``http://127.0.0.1:PORT``.
-
-    Args:
-        port: Port; 0 chooses a free one.
-
-    Attributes:
-        url: Address of the page.
-
-    Raises:
-        OSError: If the port is in use.
-    """
+    """Restored frames at ``http://127.0.0.1:PORT``; the port 0 chooses a free one. ``url`` is the address."""
 
     def __init__(self, port: int) -> None:
         self._changed, self._frame, self._number, self._open = threading.Condition(), b"", 0, True

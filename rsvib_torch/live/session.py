@@ -1,12 +1,11 @@
-"""The loop from a source of frames to its outputs: reading, tracking and writing in three threads."""
+"""The loop from a source of frames to its outputs: frames are read, tracked and written in three threads."""
 
 import math
-import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.core.prefetch import prefetched
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.live.frame_outputs import FrameOutput
 from rsvib_torch.live.sources import FrameReader, FrameSource
@@ -26,43 +26,33 @@ _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay 
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, end of a service, end of a terminal
 _LONGEST_END = 10.0  # s from such a signal until outputs that do not take frames, such as a full pipe, are abandoned
-_CHECK = 0.5  # s between checks whether a signal has arrived
 
 
 @dataclass(eq=False)
 class LiveReport:
-    """What happened in a session.
+    """What happened in a session."""
 
-    Attributes:
-        frames: Frames that were written.
-        tracked: Frames whose motion was known.
-        predicted: Tracked frames whose motion was predicted and not measured, because they were late.
-        unusable: Frames that were constant, or copies.
-        dropped: Frames that arrived and were dropped, because processing was too slow.
-        lost: Frames that the source did not deliver, by its clock.
-        detections: Calls of ``detect_vibration``.
-        seconds: Duration of the session.
-        latencies: Number of frames by their delay: how many frames had arrived behind it when a frame was written.
-        detection: The last vibration.
-        size: (height, width) of the written frames.
-    """
-
-    frames: int = 0
-    tracked: int = 0
-    predicted: int = 0
-    unusable: int = 0
-    dropped: int = 0
-    lost: int = 0
-    detections: int = 0
-    seconds: float = 0.0
+    frames: int = 0  # that were written
+    tracked: int = 0  # frames whose motion was known
+    predicted: int = 0  # tracked frames whose motion was predicted and not measured, because they were late
+    unusable: int = 0  # frames that were constant, or copies
+    dropped: int = 0  # frames that arrived and were dropped, because processing was too slow
+    lost: int = 0  # frames that the source did not deliver, by its clock
+    detections: int = 0  # calls of ``detect_vibration``
+    seconds: float = 0.0  # duration of the session
+    # number of frames by their delay: how many frames had arrived behind it when a frame was written
     latencies: list[int] = field(default_factory=lambda: [0] * (_LATENCY_COUNTS + 1))
-    detection: DetectionResult | None = None
-    size: tuple[int, int] | None = None
+    detection: DetectionResult | None = None  # the last vibration
+    size: tuple[int, int] | None = None  # (height, width) of the written frames
 
     def latency(self, share: float) -> int:
         """Delay in frames that ``share`` (0 to 1) of the frames do not exceed."""
         counts = np.cumsum(self.latencies)
         return int(np.searchsorted(counts, share * counts[-1]))
+
+
+class _AbandonedError(Exception):
+    """An output has taken no frames for too long after a signal."""
 
 
 def run_live(
@@ -104,23 +94,37 @@ def run_live(
             source or the tracker.
     """
     report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
-    torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
-    reader = FrameReader(source, waiting, drops=drops)
-    writer = _Writer(outputs, border or VideoBorder("mirror"), report, reader, tracker.timing.frame_period)
-    with ExitStack() as ending:  # frames before an error of the source are not lost
+    border, period = border or VideoBorder("mirror"), tracker.timing.frame_period
+    reader, last = FrameReader(source, waiting, drops=drops), None
+    with ExitStack() as ending:  # from the last line to the first
         ending.callback(torch.set_num_threads, threads)
-        ending.enter_context(_signals_call(reader.stop))
+        torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
+        in_time = ending.enter_context(_signals_stop(reader))
         ending.push(partial(_save, save, report))
+        ending.enter_context(suppress(BrokenPipeError, _AbandonedError))  # the program behind a pipe has ended
+        ending.callback(in_time)
         ending.callback(reader.close)
-        ending.callback(writer.finish)
+        for output in outputs:
+            ending.callback(output.close)
+        tracked_frames = prefetched(
+            _tracked(reader, tracker, report, drops, max_frames), _WAITING_RESTORED, torch.get_num_threads()
+        )
+        ending.enter_context(closing(tracked_frames))
+        ending.callback(reader.stop)
         reader.start()
-        for tracked, arrived in _tracked(reader, tracker, report, drops, max_frames):
+        for tracked, arrived in tracked_frames:
             if spectrogram is not None:
                 spectrogram.add(tracked)
             if progress is not None:
                 progress(tracked, report)
-            if not writer.put((tracked, arrived)):
-                break
+            frame = to_counts(border(tracked))
+            for output in outputs:
+                output.write(frame, round(tracked.time / period))
+            last, report.size = tracked, frame.shape[:2]
+            report.frames += 1
+            late = math.floor((time.perf_counter() - arrived) / period)
+            report.latencies[min(late, _LATENCY_COUNTS)] += 1
+    report.detection = None if last is None else last.detection
     report.dropped, report.lost = reader.dropped, source.lost
     report.seconds = time.perf_counter() - begin
     return report
@@ -134,24 +138,50 @@ def _save(save: Callable[[], object] | None, report: LiveReport, _: Any, error: 
 
 
 @contextmanager
-def _signals_call(stop: Callable[[], None]) -> Iterator[None]:
-    """Signals that end the process call ``stop`` instead; only the main thread can set their handlers."""
+def _signals_stop(reader: FrameReader) -> Iterator[Callable[[], None]]:
+    """Signals that end the process stop the reader instead; only the main thread can set their handlers.
+
+    ``_LONGEST_END`` later the main thread is interrupted, unless the function that this yields was called before.
+    """
     before: dict[signal.Signals, Any] = {}
+    timers: list[threading.Timer] = []
+    late = threading.Event()
+
+    def interrupt(number: int) -> None:
+        late.set()
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+    def stop(number: int, _: Any) -> None:
+        reader.stop()
+        if late.is_set():
+            late.clear()
+            raise _AbandonedError
+        if not timers:
+            timers.append(threading.Timer(_LONGEST_END, interrupt, [number]))
+            timers[0].daemon = True
+            timers[0].start()
+
+    def in_time() -> None:
+        for timer in timers:
+            timer.cancel()
+        late.clear()
+
     if threading.current_thread() is threading.main_thread():
         usual = (signal.SIG_DFL, signal.default_int_handler)
         before = {number: signal.getsignal(number) for number in _SIGNALS if signal.getsignal(number) in usual}
     for number in before:
-        signal.signal(number, lambda *_: stop())
+        signal.signal(number, stop)
     try:
-        yield
+        yield in_time
     finally:
+        in_time()
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
 def _tracked(
     reader: FrameReader, tracker: VibrationTracker, report: LiveReport, drops: bool, max_frames: int | None
-) -> Iterator[tuple[TrackedFrame, float]]:
+) -> Generator[tuple[TrackedFrame, float], None, None]:
     """Tracked frames with the times of ``perf_counter`` at which they arrived.
 
     The motion of frames that have waited for half a frame period is predicted if the source must not wait: without
@@ -168,80 +198,6 @@ def _tracked(
         report.unusable += tracked.state == "unusable"
         report.detections += tracked.detected
         yield tracked, frame.arrived
-
-
-class _Writer:
-    """Restores and writes frames in a thread, while the next ones are tracked."""
-
-    def __init__(
-        self,
-        outputs: Sequence[FrameOutput],
-        border: VideoBorder,
-        report: LiveReport,
-        reader: FrameReader,
-        period: float,
-    ) -> None:
-        self._outputs, self._border, self._report = outputs, border, report
-        self._reader, self._period = reader, period
-        self._queue: queue.Queue[tuple[TrackedFrame, float] | None] = queue.Queue(_WAITING_RESTORED)
-        self._error: Exception | None = None
-        self._last: TrackedFrame | None = None
-        self._threads = torch.get_num_threads()
-        self._thread = threading.Thread(target=self._run, name="rsvib-write", daemon=True)
-        self._thread.start()
-
-    def put(self, item: tuple[TrackedFrame, float] | None) -> bool:
-        """Hand over a frame, or None behind the last one; waits while the thread is behind.
-
-        Returns:
-            Whether it was handed over.
-        """
-        while self._is_running():
-            try:
-                self._queue.put(item, timeout=_CHECK)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def _is_running(self) -> bool:
-        """Whether the thread has not ended, and is not abandoned."""
-        stopped = self._reader.stopped_at
-        return self._thread.is_alive() and (stopped is None or time.perf_counter() < stopped + _LONGEST_END)
-
-    def finish(self) -> None:
-        """Wait until all frames are written and the outputs are closed; raises the error of the thread."""
-        self.put(None)
-        while self._is_running():
-            self._thread.join(_CHECK)
-        if self._error is not None:
-            raise self._error
-        if self._last is not None:
-            self._report.detection = self._last.detection
-
-    def _run(self) -> None:
-        torch.set_num_threads(self._threads)  # of this thread
-        try:
-            with ExitStack() as opened:
-                for output in self._outputs:
-                    opened.callback(output.close)
-                while (item := self._queue.get()) is not None:
-                    self._write(*item)
-        except BrokenPipeError:  # the program behind a pipe has ended
-            pass
-        except Exception as error:  # raised again in the main thread
-            self._error = error
-
-    def _write(self, tracked: TrackedFrame, arrived: float) -> None:
-        frame = to_counts(self._border(tracked))
-        index = round(tracked.time / self._period)
-        for output in self._outputs:
-            output.write(frame, index)
-        self._last = tracked
-        self._report.size = frame.shape[:2]
-        self._report.frames += 1
-        late = math.floor((time.perf_counter() - arrived) / self._period)
-        self._report.latencies[min(late, _LATENCY_COUNTS)] += 1
 
 
 def to_counts(frame: Tensor) -> NDArray[np.uint8]:

@@ -6,11 +6,12 @@ between (``FrameCounter``).
 """
 
 import math
+import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, Protocol, get_args
@@ -23,34 +24,24 @@ from rsvib_torch.io import open_stack, read_stack_info, timing_from_first_frame
 from rsvib_torch.motion.timing import SensorTiming
 
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
+_CHECK = 0.05  # s between checks whether the source has ended, or the session
 _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the source; OpenCV waits 30 s for a camera
 
 
 @dataclass(frozen=True, eq=False)
 class TimedFrame:
-    """A frame of a source.
+    """A frame of a source."""
 
-    Attributes:
-        pixels: (H, W) or (3, H, W) counts, or floats whose full scale is 1.
-        time: s from the first frame.
-        arrived: s of ``time.perf_counter``, when it was read.
-    """
-
-    pixels: NDArray[Any]
-    time: float
-    arrived: float
+    pixels: NDArray[Any]  # (H, W) or (3, H, W) counts, or floats whose full scale is 1
+    time: float  # s from the first frame
+    arrived: float  # s of ``time.perf_counter``, when it was read
 
 
 class FrameSource(Protocol):
-    """A source of frames.
+    """A source of frames."""
 
-    Attributes:
-        full_scale: Count that means 1.0; None for floats.
-        lost: Frames that the source did not deliver, by its clock.
-    """
-
-    full_scale: float | None
-    lost: int
+    full_scale: float | None  # count that means 1.0; None for floats
+    lost: int  # frames that the source did not deliver, by its clock
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; called once, in the thread that reads. A generator releases the source in its ``finally``."""
@@ -64,9 +55,6 @@ class FrameCounter:
     one: the times behind a lost frame are later than before by whole periods. Arrival is therefore compared with the
     least delay of the last frames: with random delays of 3 to 10 ms at 30 frames/s, 0 to 6 frames in five minutes are
     counted as lost by mistake; with the intervals between frames, 30 to 850 were.
-
-    Args:
-        period: s, frame period.
     """
 
     _FRAMES = 300  # of which the least delay is taken; the clock of a camera deviates by less than 0.1 periods in them
@@ -76,12 +64,7 @@ class FrameCounter:
         self._delays: deque[float] = deque(maxlen=self._FRAMES)  # periods
 
     def number(self, arrived: float, stamp: float) -> int:
-        """Number of the next frame.
-
-        Args:
-            arrived: s, when it was read.
-            stamp: s, its time in the stream.
-        """
+        """Number of the next frame, from the time when it was read and that in the stream, both in s."""
         if self._number < 0:
             self._first = self._before = arrived, stamp
         by_arrival, by_stamp = (arrived - self._first[0]) / self._period, (stamp - self._first[1]) / self._period
@@ -100,12 +83,7 @@ class FrameCounter:
 
 
 class CameraSource:
-    """A camera of OpenCV.
-
-    Args:
-        camera: Index, or URL.
-        timing: The sensor.
-    """
+    """A camera of OpenCV, by its index or URL."""
 
     full_scale: float | None = 255.0
 
@@ -113,11 +91,7 @@ class CameraSource:
         self._camera, self._period, self.lost = camera, timing.frame_period, 0
 
     def frames(self) -> Iterator[TimedFrame]:
-        """The frames; times are whole frame periods apart.
-
-        Raises:
-            OSError: If the camera cannot be opened.
-        """
+        """The frames; times are whole frame periods apart."""
         import cv2  # noqa: PLC0415
 
         level = cv2.utils.logging.getLogLevel()
@@ -142,14 +116,7 @@ class CameraSource:
 
 
 class PipeSource:
-    """Raw frames one behind the other in a pipe.
-
-    Args:
-        stream: The pipe.
-        size: (height, width) in px.
-        pixel_format: Layout of the pixels.
-        timing: The sensor.
-    """
+    """Raw frames of a size (height, width) one behind the other in a pipe."""
 
     def __init__(
         self, stream: BinaryIO, size: tuple[int, int], pixel_format: PixelFormat, timing: SensorTiming
@@ -179,13 +146,10 @@ class PipeSource:
 
 
 class FileSource:
-    """A file, as ``open_stack`` reads it.
+    """A file, as ``open_stack`` reads it, with its frame times.
 
-    Args:
-        path: The stack.
-        timing: The sensor; the frame times of the file are used, as in ``read_stack``.
-        full_scale: Count that means 1.0, if the file does not state it.
-        realtime: Whether frames come at the times of the file, instead of as fast as they are processed.
+    Frames come as fast as they are processed, or with ``realtime`` at the times of the file. ``full_scale`` is the
+    count that means 1.0, if the file does not state it.
     """
 
     def __init__(
@@ -212,25 +176,15 @@ def _channels_first(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 class FrameReader:
-    """Frames of a source, read in a thread: the source never waits, and the oldest waiting frames are dropped.
+    """Frames of a source, read in a thread; up to a number of them wait.
 
-    Args:
-        source: The source.
-        waiting: Largest number of frames that wait.
-        drops: Whether frames are dropped; if not, the source waits.
-
-    Attributes:
-        dropped: Number of frames that were dropped.
-        stopped_at: s of ``time.perf_counter``, when ``stop`` was called; None before.
+    If frames may be dropped, the source never waits, and the oldest waiting frames are dropped and counted.
     """
 
     def __init__(self, source: FrameSource, waiting: int = 64, *, drops: bool = True) -> None:
-        self._source, self._limit, self._drops = source, check_whole_number("waiting", waiting, at_least=1), drops
-        self._frames: deque[TimedFrame] = deque()
-        self._changed, self._ended = threading.Condition(), False
+        self._source, self._drops, self._stopped, self.dropped = source, drops, False, 0
+        self._frames: queue.Queue[TimedFrame] = queue.Queue(check_whole_number("waiting", waiting, at_least=1))
         self._error: Exception | None = None
-        self.dropped = 0
-        self.stopped_at: float | None = None
         self._thread = threading.Thread(target=self._read, name="rsvib-read", daemon=True)
 
     def start(self) -> None:
@@ -240,40 +194,38 @@ class FrameReader:
     def _read(self) -> None:
         try:
             for frame in self._source.frames():
-                with self._changed:
-                    while not self._drops and len(self._frames) >= self._limit and self.stopped_at is None:
-                        self._changed.wait()
-                    if self.stopped_at is not None:
-                        return
-                    if len(self._frames) >= self._limit:
-                        self._frames.popleft()
-                        self.dropped += 1
-                    self._frames.append(frame)
-                    self._changed.notify_all()
+                while not self._stopped and not self._put(frame):
+                    if self._drops:
+                        with suppress(queue.Empty):
+                            self._frames.get_nowait()
+                            self.dropped += 1
+                if self._stopped:
+                    return
         except Exception as error:  # raised again in the thread that takes the frames
             self._error = error
-        finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify_all()
+
+    def _put(self, frame: TimedFrame) -> bool:
+        """Whether there was room for a frame; waits for it if no frames may be dropped."""
+        try:
+            self._frames.put(frame, block=not self._drops, timeout=_CHECK)
+        except queue.Full:
+            return False
+        return True
 
     def __iter__(self) -> Iterator[TimedFrame]:
-        while self.stopped_at is None:
-            with self._changed:
-                if not self._frames and self._ended:
+        while not self._stopped:
+            ended = not self._thread.is_alive()
+            try:
+                yield self._frames.get(block=not ended, timeout=_CHECK)
+            except queue.Empty:
+                if ended:
                     break
-                if not self._frames:
-                    self._changed.wait(0.5)  # s; ``stop`` is noticed in between
-                    continue
-                frame = self._frames.popleft()
-                self._changed.notify_all()
-            yield frame
         if self._error is not None:
             raise self._error
 
     def stop(self) -> None:
         """End the iteration; may be called by a signal handler, because it waits for no other thread."""
-        self.stopped_at = self.stopped_at or time.perf_counter()
+        self._stopped = True
 
     def close(self) -> None:
         """Stop reading. The thread itself releases the source, because libraries crash if another one does so.
@@ -281,6 +233,4 @@ class FrameReader:
         A thread that waits for a source longer than ``_LONGEST_READ`` ends with the process.
         """
         self.stop()
-        with self._changed:
-            self._changed.notify_all()
         self._thread.join(_LONGEST_READ)

@@ -98,11 +98,7 @@ class Spectrogram:
 
 
 def save_spectrogram(path: Path, spectrogram: Spectrogram) -> list[Path]:
-    """Write ``PATH.png`` and ``PATH.zarr`` (group with ``amplitude`` (2, T, F) in px, ``time``, ``frequency``).
-
-    Returns:
-        The files.
-    """
+    """Write ``PATH.png`` and ``PATH.zarr`` (group with ``amplitude`` (2, T, F) in px, ``time``, ``frequency``)."""
     from matplotlib.colors import LogNorm  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 

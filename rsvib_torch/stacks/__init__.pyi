@@ -3,7 +3,7 @@ from .job import WindowResult, restore_block
 from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
 from .process_video import process_video
-from .resumable_run import StackReport
+from .run_folder import StackReport
 from .window_restoration import RestoredFrames, restore_trusted, without_data
 from .windows import Window, cut_windows
 

@@ -1,50 +1,24 @@
 """Parallel processing of windows: threads of this process, or Dask workers."""
 
 import logging
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import closing, suppress
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
 
 from rsvib_torch.core.checks import needed_package
+from rsvib_torch.core.prefetch import in_order, in_threads
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows
 from rsvib_torch.stacks.windows import Window
 
-_Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time after those before them ended
-
-
-def _one_thread_each(windows: Sequence[Window]) -> bool:
-    """Whether to compute every window on one thread, which is the case if there are several windows.
-
-    Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
-    """
-    return not all(window.alone for window in windows)
-
-
-def results_in_order(
-    items: Iterable[_Item], submit: Callable[[_Item], Any], capacity: Callable[[], int], waiting: deque[Any]
-) -> Generator[Any, None, None]:
-    """Results of items in their order.
-
-    ``submit`` starts the computation of one and returns an object with ``result()``; as many as ``capacity()`` are
-    computed or wait, in ``waiting``.
-    """
-    remaining = iter(items)
-    while True:
-        while len(waiting) < capacity() and (item := next(remaining, None)) is not None:
-            waiting.append(submit(item))
-        if not waiting:
-            return
-        yield waiting.popleft().result()
 
 
 def compute_here(
@@ -54,29 +28,15 @@ def compute_here(
     *,
     at_once: int,
 ) -> Generator[_Result, None, None]:
-    """Compute windows in threads of this process, ``at_once`` at a time, while one more is read.
-
-    ``finish`` is called with a result and its frames in the thread that computed it. Its results are in the order of
-    the windows.
-    """
-    share_one_heap()
-    default_threads = torch.get_num_threads()
-    threads = 1 if _one_thread_each(windows) else default_threads
-    pool = ThreadPoolExecutor(at_once, "rsvib-compute", initializer=torch.set_num_threads, initargs=(threads,))
-    stopped = threading.Event()
+    """Compute windows in this process; ``finish`` gets a result and its frames in the thread that computed it."""
 
     def compute(window: Window, pixels: WindowFrames) -> _Result:
-        if stopped.is_set():
-            raise RuntimeError("stopped")
         return finish(job.compute(window, pixels), pixels)
 
-    try:
-        with closing(read_windows(job, windows)) as read:
-            yield from results_in_order(read, lambda item: pool.submit(compute, *item), lambda: at_once + 1, deque())
-    finally:
-        stopped.set()
-        pool.shutdown(wait=True, cancel_futures=True)
-        torch.set_num_threads(default_threads)  # the default of threads that start later
+    share_one_heap()
+    # Sums of floats depend on the number of threads: results must not depend on how many windows are computed at once.
+    threads = torch.get_num_threads() if all(window.alone for window in windows) else 1
+    return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
@@ -104,63 +64,44 @@ def _device_of_worker() -> str:
     return f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0"
 
 
-@contextmanager
-def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
+def _dask_client(scheduler: str, workers: int) -> Any:
+    """A client of the scheduler at an address, or of a number of workers on this machine, which end with it."""
     distributed = needed_package("distributed", "the Dask engine", "distributed")
-    if scheduler != "local":
+    options: dict[str, Any] = {"address": scheduler, "timeout": 30}
+    if scheduler == "local":
+        options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
+        options |= {"dashboard_address": None, "silence_logs": logging.ERROR}
+    try:
+        return distributed.Client(**options, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        failed = f"no Dask scheduler answers at {scheduler}"
+        failed = "Dask workers cannot be started" if scheduler == "local" else failed
+        raise OSError(f"{failed}: {' '.join(str(error).split())}") from error
+
+
+def _wait(client: Any, future: Any, window: Window) -> Any:
+    """The result of a window that Dask workers compute, as long as there are workers and a scheduler."""
+    distributed = needed_package("distributed", "the Dask engine", "distributed")
+    last_seen = time.monotonic()
+    while True:
         try:
-            client = distributed.Client(scheduler, timeout=30, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise OSError(f"no Dask scheduler answers at {scheduler}: {' '.join(str(error).split())}") from error
-        with client:
-            yield client
-        return
-    options = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
-    with ExitStack() as opened:
-        try:
-            cluster = opened.enter_context(distributed.LocalCluster(**options, processes=True, memory_limit=0))
-            client = opened.enter_context(distributed.Client(cluster, set_as_default=False))
-        except (OSError, RuntimeError) as error:
-            raise OSError(f"Dask workers cannot be started: {' '.join(str(error).split())}") from error
-        yield client
-
-
-@dataclass(frozen=True)
-class _DaskResult:
-    """The result of a window that Dask workers compute."""
-
-    client: Any
-    future: Any
-    window: Window
-
-    def result(self) -> Any:
-        """Wait for the result.
-
-        Raises:
-            OSError: If the workers of the window died repeatedly, there are none, or the scheduler does not answer.
-        """
-        distributed = needed_package("distributed", "the Dask engine", "distributed")
-        last_seen = time.monotonic()
-        while True:
-            try:
-                return self.future.result(timeout=1.0)
-            except (distributed.TimeoutError, UnboundLocalError):  # of distributed, if its own wait is cancelled
-                if self.future.done():
-                    return self.future.result()  # or its error
-                if self.client.scheduler_info(n_workers=-1)["workers"]:
-                    last_seen = time.monotonic()
-                elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
-                    raise OSError(
-                        f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
-                    ) from None
-            except distributed.KilledWorker as error:
+            return future.result(timeout=1.0)
+        except (distributed.TimeoutError, UnboundLocalError):  # of distributed, if its own wait is cancelled
+            if future.done():
+                return future.result()  # or its error
+            if client.scheduler_info(n_workers=-1)["workers"]:
+                last_seen = time.monotonic()
+            elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
                 raise OSError(
-                    f"Dask workers died {error.allowed_failures + 1} times while they computed window "
-                    f"{self.window.index} (frames {self.window.first} to {self.window.last}); check their memory, "
-                    "and resume the run"
+                    f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
                 ) from None
-            except CancelledError as error:
-                raise OSError("the connection to the Dask scheduler was lost; resume the run") from error
+        except distributed.KilledWorker as error:
+            raise OSError(
+                f"Dask workers died {error.allowed_failures + 1} times while they computed window {window.index} "
+                f"(frames {window.first} to {window.last}); check their memory, and resume the run"
+            ) from None
+        except CancelledError as error:
+            raise OSError("the connection to the Dask scheduler was lost; resume the run") from error
 
 
 def compute_with_dask(
@@ -172,20 +113,20 @@ def compute_with_dask(
     scheduler ``"local"`` starts a number of workers on this machine.
     """
     job = replace(job, source=job.source.absolute())
-    one_thread = _one_thread_each(windows)
+    one_thread = not all(window.alone for window in windows)
+    waiting: deque[tuple[Any, Window]] = deque()
     with _dask_client(scheduler, workers) as client:
 
-        def submit(window: Window) -> _DaskResult:
+        def submit(window: Window) -> tuple[Any, Window]:
             # the job is sent with every task: scattered data are lost with the worker that holds them
             task = client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
-            return _DaskResult(client, task, window)
+            return task, window
 
         def two_per_worker() -> int:
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
-        waiting: deque[Any] = deque()
         try:
-            yield from results_in_order(windows, submit, two_per_worker, waiting)
+            yield from in_order(windows, submit, two_per_worker, lambda pair: _wait(client, *pair), waiting)
         finally:
             with suppress(Exception):
-                client.cancel([result.future for result in waiting])
+                client.cancel([task for task, _ in waiting])

@@ -1,7 +1,7 @@
 """The computation of one window: reading its frames, detection, restoration, and the record of the result."""
 
 import os
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels, channel_axis
 from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.presentation import Summarised, plain_values
+from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
@@ -27,7 +27,7 @@ from rsvib_torch.io.full_scale import (
     known_full_scale,
     required_full_scale,
 )
-from rsvib_torch.io.stack_info import FrameError, StackInfo
+from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -40,10 +40,16 @@ from rsvib_torch.options import (
     StackOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
-from rsvib_torch.stacks.followed_window import WARM_UP, follow_window
 from rsvib_torch.stacks.memory import windows_at_once
-from rsvib_torch.stacks.window_restoration import RestoredFrames, frame_fault, restore_trusted, without_data
-from rsvib_torch.stacks.windows import Window, cut_windows, window_timing
+from rsvib_torch.stacks.window_restoration import (
+    WARM_UP,
+    RestoredFrames,
+    follow_window,
+    frame_fault,
+    restore_trusted,
+    without_data,
+)
+from rsvib_torch.stacks.windows import Window, cut_windows, window_record, window_timing
 
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
 
@@ -116,6 +122,14 @@ class StackJob:
     device: str = "cpu"  # device for the computation
     window: int = StackOptions.window  # maximum number of frames of a window
     follow: bool = False  # whether the vibration is followed from frame to frame
+
+    def open(self) -> FrameReader:
+        """Open the stack, which must not have changed."""
+        reader = open_stack(self.source)
+        if reader.info != self.info:
+            reader.close()
+            raise ValueError(f"{self.source} has changed since it was first opened; start again")
+        return reader
 
     @property
     def joined(self) -> bool:
@@ -231,51 +245,56 @@ class StackJob:
         A frame that cannot be read is stored as NaN, or 0 for integers, unless bad frames are omitted.
         """
         dtype = np.dtype(self.info.dtype)
+
+        def counts(images: Tensor) -> NDArray[Any]:
+            return frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
+
         if result.restored and not result.indices:
-            frames = list(frames_to_counts(result.frames, dtype, self.full_scale, self.info.nodata))
+            frames = list(counts(result.frames))
             return StoredWindow(frames, self.record(result, len(frames)))
         written = list(result.window.written)
         restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
         frames = []
         for index in [written[len(written) // 2]] if self.joined else written:
             if index in restored and index not in result.unchanged:
-                frames.append(frames_to_counts(restored[index], dtype, self.full_scale, self.info.nodata))
+                frames.append(counts(restored[index]))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                same = self.scale == 1 and self.mosaic is None
-                frames.append(frame if same else self._unchanged_counts(frame))
+                if self.scale != 1 or self.mosaic is not None:  # the shape of restored ones
+                    taken = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
+                    frame = counts(self._unchanged(taken)[0])
+                frames.append(frame)
         return StoredWindow(frames, self.record(result, len(frames)))
-
-    def _unchanged_counts(self, frame: NDArray[Any]) -> NDArray[Any]:
-        """A frame as stored, in the shape of restored ones."""
-        counts = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
-        return frames_to_counts(self._unchanged(counts)[0], frame.dtype, self.full_scale, self.info.nodata)
 
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
-        verdict = None if restoration is None else restoration.verdict
-        return {
-            "window": window.index,
-            "first": window.first,
-            "last": window.last,
-            "start_time": float(self.timing.frame_starts(window.first + 1)[-1]),
-            "written": written,
-            "frames": "restored" if result.restored else "as taken",
-            "detection": plain_values(result.detection and DetectedVibration.of(result.detection)),
-            "left_alone": [] if restoration is None else plain_values(restoration.left_alone),
-            "outcome": None if verdict is None else verdict.overall,
-            "summary": None if verdict is None else verdict.sentence,
-            "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            "error": result.error,
-            "bad_frames": {str(index): reason for index, reason in result.bad_frames.items()},
-            "middle": result.middle,
-            "restored_frames": result.restored * len(set(result.indices) - {*result.unchanged})
-            if self.follow
-            else None,
-        }
+        restored_frames = result.restored * len(set(result.indices) - {*result.unchanged}) if self.follow else None
+        return window_record(
+            None if restoration is None else restoration.verdict,
+            result.bad_frames,
+            restored=result.restored,
+            window=window.index,
+            first=window.first,
+            last=window.last,
+            start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
+            written=written,
+            detection=result.detection and DetectedVibration.of(result.detection),
+            left_alone=() if restoration is None else restoration.left_alone,
+            error=result.error,
+            middle=result.middle,
+            restored_frames=restored_frames,
+        )
+
+
+def stored_frame(read: Callable[[int], NDArray[Any]], index: int) -> NDArray[Any] | str:
+    """A frame as stored, or why it cannot be read."""
+    try:
+        return read(index)
+    except FrameError as error:
+        return " ".join(str(error).split())
 
 
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
@@ -283,18 +302,11 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
 
     The frames that neighbours share are read once.
     """
-    with closing(open_stack(job.source)) as reader:
-        if reader.info != job.info:
-            raise ValueError(f"{job.source} has changed since it was first opened; start again")
+    with closing(job.open()) as reader:
         last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
         shared = 1 + (WARM_UP if job.follow else 0)
         for window in windows:
-            frames: WindowFrames = []
-            for index in window.frames:
-                try:
-                    frames.append(last[index] if index in last else reader.frame(index))
-                except FrameError as error:
-                    frames.append(" ".join(str(error).split()))
+            frames = [last[index] if index in last else stored_frame(reader.frame, index) for index in window.frames]
             last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
             yield window, frames
 

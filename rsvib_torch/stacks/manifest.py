@@ -9,61 +9,19 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joined_columns, physical_tone, plain_values
-from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.result_files import decode
 from rsvib_torch.core.text import json_text, measured_text, number_of, text_table, wrapped
-from rsvib_torch.io.stack_format import split_range
+from rsvib_torch.io.stack_info import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import StackJob
-
-
-@dataclass(frozen=True, eq=False)
-class WindowRecord:
-    """Result of one window.
-
-    Attributes:
-        window: Number of the window.
-        first: Its first frame.
-        last: Its last frame.
-        start_time: Exposure start of its first row in seconds, the time origin of its detection.
-        written: Number of frames written.
-        frames: Whether the frames written are restored, or as taken.
-        detection: The detection; None if it failed.
-        left_alone: A reason for each axis that was not restored.
-        outcome: ``RestorationVerdict.overall``; None if the frames could not be compared.
-        summary: ``RestorationVerdict.sentence``.
-        predicted_gain: Mean of ``RestorationVerdict.predicted_gain`` in dB; None if unknown.
-        error: Why detection or restoration failed.
-        bad_frames: Index of each frame that could not be used, with the reason.
-        shaking: Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``,
-            changes of the motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
-        middle: With ``follow=True``, the frame whose vibration ``detection`` states; None if it is not known.
-        restored_frames: With ``follow=True``, number of frames written that are restored; None otherwise.
-    """
-
-    window: int
-    first: int
-    last: int
-    start_time: float
-    written: int
-    frames: Literal["restored", "as taken"]
-    detection: DetectedVibration | None
-    left_alone: tuple[Reason, ...]
-    outcome: str | None
-    summary: str | None
-    predicted_gain: float | None
-    error: str | None
-    bad_frames: dict[str, str]
-    shaking: dict[str, tuple[float, ...]] | None = None
-    middle: int | None = None
-    restored_frames: int | None = None
+from rsvib_torch.stacks.windows import WindowRecord
 
 
 def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[str, tuple[float, ...]]:
@@ -105,10 +63,6 @@ class StackManifest(Result, file_format="rsvib stack"):
         for number, record in enumerate(self.windows):
             if record.window != number:
                 raise ValueError(f"windows[{number}].window: expected {number}, got {record.window}")
-
-    def header(self) -> dict[str, Any]:
-        """Everything that was determined before the first window, as made by ``manifest_header``."""
-        return {name: getattr(self, name) for name in ("input", "settings", "versions", "output")}
 
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""

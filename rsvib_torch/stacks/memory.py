@@ -39,11 +39,7 @@ def parse_memory(text: str | float) -> int:
 
 
 def memory_limit(memory: str | float | None) -> int:
-    """Limit for the memory of the process in bytes: as stated, else three quarters of what it has and can get.
-
-    Args:
-        memory: As in ``iterate_stack``.
-    """
+    """Limit for the memory of the process in bytes: as stated, else three quarters of what it has and can get."""
     if memory is not None:
         return parse_memory(memory)
     return int(0.75 * (psutil.Process().memory_info().rss + free_memory()))

@@ -1,6 +1,6 @@
 """Processing of stacks of any length: ``iterate_stack``, ``detect_stack`` and ``process_stack``."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +19,7 @@ from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progres
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
 from rsvib_torch.stacks.manifest import manifest_header, manifest_text
-from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
-from rsvib_torch.stacks.run_folder import RunFolder, check_space, disk_errors_named, work_folder
+from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, run_to_file
 from rsvib_torch.stacks.windows import Window
 
 _UNCOMPRESSED = ("npy", "hdf5", "raw", "tiff")  # formats whose files have the size of their pixels
@@ -80,17 +79,10 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
 
-    def records() -> Iterator[dict[str, Any]]:
-        errors: list[str | None] = []
-        for record in compute_here(job, windows, lambda result, _: job.record(result, 0), at_once=at_once):
-            errors.append(record["error"])
-            _check_not_all_failed(errors, windows)
-            if options.progress is not None:
-                options.progress(record["last"] + 1, job.info.shape[0])
-            yield record
-
+    results = compute_here(job, windows, lambda result, _: StoredWindow([], job.record(result, 0)), at_once=at_once)
     with whole_file(sink) as part:
-        part.write_text(manifest_text(manifest_header(job, None, None), records()), encoding="utf-8")
+        records = (stored.record for stored in _watched(results, windows, windows, [], options.progress))
+        part.write_text(manifest_text(manifest_header(job, None, None), records), encoding="utf-8")
 
 
 @file_options(ProcessStackOptions)
@@ -149,8 +141,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
     out = job.content(out, timing)
     form = check_info_target(sink, out, compression, check_folder=False)
-    target = manifest_path(sink, options)
-    check_outputs([*stack_files(sink), work_folder(sink), target], stack_files(source))
     first: WindowResult | None = None
 
     def finish(result: WindowResult, pixels: WindowFrames) -> StoredWindow:
@@ -169,40 +159,40 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             results = compute_here(job, remaining, finish, at_once=at_once)
         else:
             results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
-        _store_windows(windows, results, folder, options.progress)
-        return {}
+        errors = [record["error"] for record in folder.records()]
+        for stored in _watched(results, windows, remaining, errors, options.progress, folder.remove):
+            # channels may be stored last
+            folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
+        return {"not_kept": metadata_not_kept(job.info, sink, (folder.written, *out.shape[1:]))}
 
     def write(folder: RunFolder) -> None:
         write_frames(form, sink, out.with_frames(folder.written), _stored_frames(folder), compression)
 
     report = run_to_file(
         sink,
-        target,
+        options,
         manifest_header(job, sink.name, compression),
+        inputs=stack_files(source),
         windows=len(windows),
-        resume=options.resume,
         compute=compute,
         write=write,
-        not_kept=lambda count: metadata_not_kept(job.info, sink, (count, *out.shape[1:])),
     )
     return replace(report, first=first)
 
 
-def _check_not_all_failed(errors: Sequence[str | None], windows: Sequence[Window]) -> None:
-    """Raise a ``ValueError`` with the first error if the detection has failed in every window so far."""
-    if len(errors) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(errors) and errors[0] is not None:
-        raise ValueError(errors[0])
-
-
-def _store_windows(
-    windows: Sequence[Window],
+def _watched(
     results: Generator[StoredWindow, None, None],
-    folder: RunFolder,
+    windows: Sequence[Window],
+    remaining: Sequence[Window],
+    errors: list[str | None],
     progress: Progress,
-) -> None:
-    """Store the results of the windows that are not in the folder, while later ones are computed."""
-    errors = [record["error"] for record in folder.records()]
-    remaining = [window for window in windows if window.index not in folder]
+    fail: Callable[[], None] = lambda: None,
+) -> Iterator[StoredWindow]:
+    """The results of the remaining windows, while their frames are counted.
+
+    Raises:
+        ValueError: If detection has failed in every window so far (``errors`` before these); ``fail`` is called before.
+    """
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
     if progress is not None:
@@ -210,19 +200,10 @@ def _store_windows(
     with closing(results):
         for window, stored in zip(remaining, results, strict=True):
             errors.append(stored.record["error"])
-            try:
-                _check_not_all_failed(errors, windows)
-            except ValueError:
-                folder.remove()
-                raise
-            names = [f"{window.index:06d}.npy"] if stored.frames else []
-            with disk_errors_named(folder):
-                for name in names:
-                    stack = np.ascontiguousarray(np.stack(stored.frames))  # channels may be stored last
-                    with folder.create(name) as file:
-                        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(stack))
-                        file.write(stack.data)  # errors of np.save do not contain the reason
-                folder.add(stored.record, names)
+            if len(errors) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(errors):
+                fail()
+                raise ValueError(errors[0])
+            yield stored
             done += window.kept
             if progress is not None:
                 progress(done, total)

@@ -1,40 +1,40 @@
 """Videos from file to file, followed from frame to frame: ``process_video``."""
 
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
+from itertools import count, groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.prefetch import in_threads
 from rsvib_torch.core.presentation import plain_values
 from rsvib_torch.core.validation import fields_of
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment
 from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.io.gyroscope.read_gyroscope import read_gyroscope
-from rsvib_torch.io.stack_format import FrameReader, split_range
-from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
-from rsvib_torch.io.video import CONTAINERS
-from rsvib_torch.io.video_parts import PartWriter, PlaneReader, join_parts, planes_of
+from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import ProcessVideoOptions, Progress, ResourceOptions, RestorationOptions, StackOptions
-from rsvib_torch.stacks.engines import results_in_order
+from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
 from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
-from rsvib_torch.stacks.resumable_run import StackReport, manifest_path, run_to_file
-from rsvib_torch.stacks.run_folder import RunFolder, disk_errors_named, work_folder
-from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, RestoredFrame, VideoRestorer
+from rsvib_torch.stacks.run_folder import (
+    RunFolder,
+    StackReport,
+    disk_errors_named,
+    run_to_file,
+)
+from rsvib_torch.stacks.video_frames import FrameTrack, RestoredFrame, VideoFrames
 from rsvib_torch.stacks.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
 from rsvib_torch.tracking import Margins
 
@@ -47,6 +47,16 @@ _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_
 
 Frame = NDArray[Any]
 Planes = list[Frame]
+_Restored = tuple[FrameTrack, Frame | str, RestoredFrame]  # a frame as stored, or why it cannot be read, and restored
+
+
+class _Output(NamedTuple):
+    """The video to write."""
+
+    path: Path
+    info: StackInfo
+    border: str  # as in ``process_video``
+    margins: Margins | None  # that are cut off
 
 
 @file_options(ProcessVideoOptions)
@@ -96,12 +106,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         recording = split_range(source)[0]
     rates = None if recording is None else read_gyroscope(recording)
     video, at_once = _planned(source, timing, options, rates)
-    job = video.job
+    job = video.frames.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
-    target = manifest_path(sink, options)
-    inputs = [*stack_files(source), *([] if recording is None else [recording])]
-    check_outputs([sink, work_folder(sink), target], inputs)
     content = job.content(job.info, timing)
     if border != "crop":
         check_info_target(sink, content, check_folder=False)
@@ -118,20 +125,30 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     def compute(folder: RunFolder) -> dict[str, Any]:
         nonlocal content
-        shown = _Progress(options.progress, len(video.starts))
-        motion = video.motion(shown)
+        done = count(1)  # both passes through the video count as half of it each
+
+        def progress() -> None:
+            if options.progress is not None:
+                options.progress(next(done) // 2, len(video.starts))
+
+        if options.progress is not None:
+            options.progress(0, len(video.starts))
+        motion = video.motion(progress)
         margins = video.margins(motion) if border == "crop" else None
-        content = _cut_content(content, margins)
+        if margins is not None:
+            kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
+            content = replace(content, shape=(*content.shape[:-2], *kept))
         check_info_target(sink, content, check_folder=False)
-        with closing(open_stack(source)) as reader:
-            planes = planes_of(reader) if video.layout.planar else None
-            with closing(_Encoder(folder, sink, content, planes)) as encoder:
-                _restore_parts(video, motion, folder, encoder, border, margins, at_once, shown)
+        output = _Output(sink, content, border, margins)
+        with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
+            for part, frames in parts:
+                _encode_part(video, motion, folder, part, frames, output, progress)
         _check_shaking(folder)
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
-        return {"margins": None if margins is None else asdict(margins), "gyroscope": gyroscope}
+        not_kept = metadata_not_kept(job.info, sink, content.shape)
+        return {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
 
     def write(folder: RunFolder) -> None:
         with whole_file(sink) as part:
@@ -139,62 +156,13 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     return run_to_file(
         sink,
-        target,
+        options,
         header,
+        inputs=[*stack_files(source), *([] if recording is None else [recording])],
         windows=video.parts,
-        resume=options.resume,
         compute=compute,
         write=write,
-        not_kept=lambda _: metadata_not_kept(job.info, sink, tuple(content.shape)),
     )
-
-
-class _Encoder:
-    """Encodes the parts of a video into files of a run, and keeps the last frame of each part before it is cut."""
-
-    def __init__(self, folder: RunFolder, video: Path, info: StackInfo, planes: PlaneReader | None) -> None:
-        self._folder, self._video, self._info, self._planes = folder, video, info, planes
-        self._writer: PartWriter | None = None
-
-    def _names(self, part: int) -> tuple[str, str]:
-        return f"{part:06d}{self._video.suffix.lower()}", f"{part:06d}.npy"
-
-    def write(self, part: int, frame: Frame) -> None:
-        """Encode the next frame of a part."""
-        if self._writer is None:
-            self._writer = PartWriter(self._folder.create(self._names(part)[0]), self._video, self._info, self._planes)
-        self._writer.write(frame)
-
-    def finish_part(self, record: Mapping[str, Any], last: Frame) -> None:
-        """Finish a part with its ``WindowRecord`` and its last frame."""
-        assert self._writer is not None
-        self._writer.close()
-        self._writer = None
-        names = self._names(record["window"])
-        with self._folder.create(names[1]) as file:
-            np.save(file, last)
-        self._folder.add(record, names)
-
-    def last_frame(self, part: int) -> Frame | None:
-        """The frame that a part ends with; None for the part before the first one."""
-        if part < 0:
-            return None
-        with self._folder.open(self._names(part)[1]) as file:
-            frame: Frame = np.load(file, allow_pickle=False)
-        return frame
-
-    def close(self) -> None:
-        """Close the file of an unfinished part."""
-        if self._writer is not None:
-            self._writer.abandon()
-
-
-def _cut_content(content: StackInfo, margins: Margins | None) -> StackInfo:
-    """The content of the video without the margins."""
-    if margins is None:
-        return content
-    kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
-    return replace(content, shape=(*content.shape[:-2], *kept))
 
 
 def _check_shaking(folder: RunFolder) -> None:
@@ -210,21 +178,6 @@ def _check_shaking(folder: RunFolder) -> None:
             )
 
 
-class _Progress:
-    """Progress over both passes through a video, which count as half of it each."""
-
-    def __init__(self, show: Progress, count: int) -> None:
-        self._show, self._count, self._done = show, count, 0
-        if show is not None:
-            show(0, count)
-
-    def __call__(self) -> None:
-        """Count one frame of a pass."""
-        self._done += 1
-        if self._show is not None:
-            self._show(self._done // 2, self._count)
-
-
 def _planned(
     source: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
 ) -> tuple[VideoPasses, int]:
@@ -232,87 +185,81 @@ def _planned(
     given = single_frame_options(options.restoration)
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
-    reader: FrameReader = open_stack(source)
-    try:
-        planes = planes_of(reader)
-    finally:
-        reader.close()
-    method = RestorationOptions(**given)
-    white = None
-    if isinstance(method.saturation, float):
-        black, full = (0.0, job.full_scale or 1.0) if planes is None else (planes.black, planes.white)
-        white = black + method.saturation * (full - black)
-    scale = 255.0 if planes is not None else job.full_scale
-    layout = FrameLayout(job.info.shape[1:], planes is not None, scale, white, np.dtype(job.info.dtype))
-    restorer = VideoRestorer(layout, job.timing, method, job.device, masks=options.border != "mirror")
+    with closing(open_stack(source)) as reader:
+        picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
+    frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = [start - times[0] for start in times]
-    return VideoPasses(job, layout, restorer, starts, options.steady, options.crop_limit, rates), at_once
+    return VideoPasses(frames, starts, options.steady, options.crop_limit, rates), at_once
 
 
-def _restore_parts(
+def _restored_parts(
+    video: VideoPasses, motion: VideoMotion, folder: RunFolder, at_once: int, progress: Callable[[], None]
+) -> Generator[tuple[int, Iterator[_Restored]], None, None]:
+    """Number and restored frames of each part that is not in the folder."""
+
+    def missing() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+        with closing(video.decoded()) as decoded:
+            for index, frame in enumerate(decoded):
+                if index // PART_FRAMES not in folder:
+                    yield video.track(motion, index), frame
+                else:
+                    progress()
+
+    def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
+        return track, frame, video.frames.restored(frame, track)
+
+    share_one_heap()
+    threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
+    with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
+        yield from groupby(frames, lambda one: one[0].index // PART_FRAMES)
+
+
+def _encode_part(
     video: VideoPasses,
     motion: VideoMotion,
     folder: RunFolder,
-    encoder: _Encoder,
-    border: str,
-    margins: Margins | None,
-    at_once: int,
+    part: int,
+    frames: Iterator[_Restored],
+    output: _Output,
     progress: Callable[[], None],
 ) -> None:
-    """Restore and encode all parts that are not in the folder."""
-    share_one_heap()
-    default_threads = torch.get_num_threads()
-    threads = 1 if video.job.device == "cpu" else default_threads
-    pool = ThreadPoolExecutor(at_once, "rsvib-restore", initializer=torch.set_num_threads, initargs=(threads,))
-    tracks: list[FrameTrack] = []  # of the part
-    written: list[Frame] = []  # its first frames
-    pair: list[tuple[FrameTrack, Frame]] = []  # its first two neighbouring frames without fault
-    before: Planes | None = None
-    done = -1
-    decoded = video.decoded()
-
-    def missing() -> Iterator[tuple[FrameTrack, Frame | str]]:
-        """Frames of the parts that are not in the folder."""
-        for index, frame in enumerate(decoded):
-            if index // PART_FRAMES not in folder:
-                yield video.track(motion, index), frame
-            else:
-                progress()
-
-    def restore(track: FrameTrack, frame: Frame | str) -> tuple[FrameTrack, Frame | str, RestoredFrame]:
-        return track, frame, video.restorer.restored(frame, track)
-
-    frames = results_in_order(missing(), lambda item: pool.submit(restore, *item), lambda: at_once + 2, deque())
-    try:
-        with closing(decoded), closing(frames):
-            for track, frame, restored in frames:
-                part = track.index // PART_FRAMES
-                if track.index != done + 1 or before is None:
-                    ended = encoder.last_frame(part - 1)
-                    before = None if ended is None else video.layout.planes(ended)
-                before, done = _without_gaps(restored, before, video.layout, border), track.index
-                final = video.layout.frame(_cut(before, margins))
-                with disk_errors_named(folder):
-                    encoder.write(part, final)
-                if len(tracks) < CHECKED_FRAMES:
-                    written.append(final)
-                tracks.append(track)
-                if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
-                    pair = [*pair[-1:], (track, frame)] if pair and pair[-1][0].index == done - 1 else [(track, frame)]
-                if video.ends_part(done):
-                    verdict = video.verdict(pair) if len(pair) == 2 else None
-                    record = video.record(part, tracks, motion, verdict, written)
-                    with disk_errors_named(folder):
-                        encoder.finish_part(record, video.layout.frame(before))
-                    tracks, pair, written = [], [], []
-                progress()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        torch.set_num_threads(default_threads)
+    """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
+    layout, name = video.frames, f"{part:06d}{output.path.suffix.lower()}"
+    tracks: list[FrameTrack] = []
+    written: list[Frame] = []  # the first frames
+    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames without fault
+    before: Planes | None = None  # the frame before, without margins cut off
+    if part > 0:
+        with folder.open(f"{part - 1:06d}.npy") as file:
+            before = layout.planes(np.load(file, allow_pickle=False))
+    with ExitStack() as opened:
+        with disk_errors_named(folder):
+            encoded = part_of_video(folder.create(name), output.path, output.info, layout.picture)
+            write = opened.enter_context(encoded)
+        for track, frame, restored in frames:
+            if tracks:
+                progress()  # the frame before is complete
+            before = _without_gaps(restored, before, layout, output.border)
+            final = layout.frame(_cut(before, output.margins))
+            with disk_errors_named(folder):
+                write(final)
+            if len(tracks) < CHECKED_FRAMES:
+                written.append(final)
+            tracks.append(track)
+            if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
+                follows = bool(pair) and pair[-1][0].index == track.index - 1
+                pair = [*pair, (track, frame)] if follows else [(track, frame)]
+        with disk_errors_named(folder):
+            opened.close()  # the file is complete
+    assert before is not None
+    verdict = video.verdict(pair) if len(pair) == 2 else None
+    record = video.record(part, tracks, motion, verdict, written)
+    folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
+    progress()
 
 
-def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: FrameLayout, border: str) -> Planes:
+def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: VideoFrames, border: str) -> Planes:
     """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
     planes = restored.planes
     if planes is None or (restored.fault is not None and before is not None):
@@ -329,6 +276,6 @@ def _cut(planes: Planes, margins: Margins | None) -> Planes:
         return planes
     first, *others = planes
     luma = margins.cut(first)
-    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``FrameLayout.margins``
+    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``VideoFrames.margins``
     top, left = margins.top // 2, margins.left // 2
     return [luma, *(plane[..., top : top + rows, left : left + columns] for plane in others)]

@@ -1,9 +1,10 @@
-"""The finished windows of a run, in a folder beside its output, from which an interrupted run is resumed.
+"""A run that writes an output from windows, and is resumed if it was interrupted.
 
-A window consists of files of pixels and a marker: a file with the record of the window and the hashes of its files. The
-marker gets its name after all of them are on the disk, so that a window with a marker is finished. Files are opened
-relative to the open folder, and only new files are written: a link in the place of the folder or of a file is never
-followed, and nothing that others made is changed.
+Finished windows are in a folder beside the output. A window consists of files of pixels and a line of the journal, with
+its record and the hashes of its files. The line is written when the files and their names are on the disk, so that a
+window with a line is finished. Every line begins with a hash of itself and of the line before: a journal that somebody
+has edited is refused. Files are opened relative to the open folder, and only new files are written: a link in the place
+of the folder or of a file is never followed, and nothing that others made is changed.
 """
 
 import errno
@@ -15,21 +16,42 @@ import re
 import secrets
 import shutil
 import stat
+import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rsvib_torch.core.atomic import PART, error_of_full_disk, make_folder, nearest_folder, sync
-from rsvib_torch.core.free_memory import size_text
-from rsvib_torch.core.text import one_line
+import numpy as np
+from numpy.typing import NDArray
 
-_HEADER = "run.json"
-_NAMES = re.compile(
-    r"run\.json(\.part)?|\d{6,}\.(done|done\.part|npy|mkv|mp4|mov|m4v)"
-)  # of the files that a run makes
+from rsvib_torch.core.arguments import check_fields
+from rsvib_torch.core.atomic import (
+    PART,
+    error_of_full_disk,
+    make_folder,
+    nearest_folder,
+    remove_abandoned,
+    sync,
+    whole_file,
+)
+from rsvib_torch.core.free_memory import size_text
+from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.core.text import number_of, one_line
+from rsvib_torch.io.stack_writing import stack_files
+from rsvib_torch.options import RunOptions
+from rsvib_torch.stacks.job import WindowResult
+from rsvib_torch.stacks.manifest import manifest_text, read_manifest
+
+_JOURNAL = "journal"
+_NAMES = re.compile(rf"{_JOURNAL}|\d{{6,}}\.(npy|mkv|mp4|mov|m4v)")  # of the files that a run makes
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a named pipe must not wait for another process
+_blake2b = partial(hashlib.blake2b, digest_size=16)
 
 
 def work_folder(sink: Path) -> Path:
@@ -37,11 +59,11 @@ def work_folder(sink: Path) -> Path:
     return sink.with_name(f".{sink.name}.rsvib")
 
 
-def describe_difference(old: Any, new: Any, path: str = "") -> str | None:
+def _difference(old: Any, new: Any, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*new, *old]):
-            difference = describe_difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+            difference = _difference(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
             if difference:
                 return difference
         return None
@@ -60,79 +82,56 @@ def check_space(path: Path, needed: int) -> None:
 class RunFolder:
     """The work folder of a run, locked until it is closed.
 
-    Args:
-        sink: The output of the run.
-        header: Input, settings and versions of the run: it is resumed only if they are unchanged.
-        resume: Whether to continue an interrupted run.
-
-    Raises:
-        BlockingIOError: If another run writes the same output.
-        FileExistsError: If there is an interrupted run and ``resume`` is False, or the folder was not made by a run.
-        OSError: If the folder cannot be created.
-        ValueError: If the header differs from that of the run to resume, or a marker was changed.
+    A run is resumed only if its ``header`` is unchanged: input, settings and versions. A folder that no run has made,
+    or in which another run writes, is refused.
     """
 
     def __init__(self, sink: Path, header: Mapping[str, Any], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
-        content = json.dumps(header).encode()
-        self._key = hashlib.blake2b(content, digest_size=32).digest()
-        self._written: dict[int, int] = {}  # number of frames of each finished window
+        self._windows: dict[int, tuple[int, int, int]] = {}  # finished: place and size of the line; frames
+        self._digest = b""  # of the last line of the journal
         make_folder(self.path.parent)
         while not self._open():
             pass
-        try:
+        with ExitStack() as opened:
+            opened.callback(os.close, self._folder)
             names = self._checked_names()
-            windows = sorted(int(name[:-5]) for name in names if name.endswith(".done"))
-            if windows:
-                self._check_resumable(content, len(windows), resume=resume)
-                self._find_finished(windows)
-            else:
-                for name in names:
-                    self._delete(name)
-                self._write(_HEADER, content)
-        except BaseException:
-            os.close(self._folder)
-            raise
+            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | _SAFELY
+            self._journal = os.open(_JOURNAL, flags, 0o600, dir_fd=self._folder)
+            opened.callback(os.close, self._journal)
+            self._read_journal(dict(header), names, resume=resume)
+            self._opened = opened.pop_all()
 
     def _open(self) -> bool:
         """Open the folder, which is created if it does not exist, and lock it; False if it was removed meanwhile."""
-        try:
-            with suppress(FileExistsError):
-                self.path.mkdir(0o700)
-                sync(self.path.parent)
-            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
-        except FileNotFoundError:
-            return False
-        except OSError as error:
-            if not os.path.lexists(self.path) or stat.S_ISDIR(os.lstat(self.path).st_mode):
-                raise
-            raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
-        try:
-            if os.fstat(self._folder).st_uid != os.geteuid():
-                raise self._refusal("it belongs to another user")
-            self._lock()
+        with ExitStack() as opened:
+            try:
+                with suppress(FileExistsError):
+                    self.path.mkdir(0o700)
+                    sync(self.path.parent)
+                self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | _SAFELY)
+                opened.callback(os.close, self._folder)
+                if os.fstat(self._folder).st_uid != os.geteuid():
+                    raise self._refusal("it belongs to another user")
+                fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except FileNotFoundError:
+                return False
+            except BlockingIOError as error:
+                raise BlockingIOError(f"cannot write {self.sink}: another run is writing it") from error
+            except OSError as error:
+                if error.errno in (errno.ELOOP, errno.ENOTDIR):
+                    raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
+                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                    raise
+                warnings.warn(  # as those of some clusters
+                    f"{self.path}: the file system has no locks ({error.strerror}): start no other run with this "
+                    "output",
+                    stacklevel=2,
+                )
             if self._has_its_name():
+                opened.pop_all()
                 return True
-        except BlockingIOError as error:
-            os.close(self._folder)
-            raise BlockingIOError(f"cannot write {self.sink}: another run is writing it") from error
-        except BaseException:
-            os.close(self._folder)
-            raise
-        os.close(self._folder)  # another process has removed it
-        return False
-
-    def _lock(self) -> None:
-        """Lock the folder; a warning if the file system has no locks, as those of some clusters."""
-        try:
-            fcntl.flock(self._folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
-                raise
-            warnings.warn(
-                f"{self.path}: the file system has no locks ({error.strerror}): start no other run with this output",
-                stacklevel=2,
-            )
+            return False  # another process has removed it
 
     def _has_its_name(self) -> bool:
         with suppress(FileNotFoundError):
@@ -148,8 +147,8 @@ class RunFolder:
     def _checked_names(self) -> list[str]:
         """Names in the folder; a ``FileExistsError`` if there is anything in it that no run has made."""
         names = sorted(os.listdir(self._folder))
-        if not {_HEADER, f"{_HEADER}.part"}.intersection(names) and names:
-            raise self._refusal(f"it has no {_HEADER}")
+        if names and _JOURNAL not in names:
+            raise self._refusal(f"it has no {_JOURNAL}")
         for name in names:
             status = os.stat(name, dir_fd=self._folder, follow_symlinks=False)
             if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_uid != os.geteuid():
@@ -158,32 +157,41 @@ class RunFolder:
                 raise self._refusal("it has another name than files of a run", name)
         return names
 
-    def _check_resumable(self, header: bytes, count: int, *, resume: bool) -> None:
-        """Raise an error if a run of ``count`` finished windows must not be continued with this header."""
+    def _read_journal(self, header: dict[str, Any], names: Iterable[str], *, resume: bool) -> None:
+        """Find the windows whose files are as they were written; a journal without windows begins anew."""
         start_over = f"delete {self.path} to start over"
-        if not resume:
+        stored, end = None, 0
+        with self.open(_JOURNAL) as lines:
+            for line in lines:
+                if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
+                    break
+                digest, _, body = line[:-1].partition(b" ")
+                if digest != _keyed(body, self._digest):
+                    raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
+                entry = json.loads(body)
+                if end == 0:
+                    stored = entry
+                else:
+                    self._windows[entry["record"]["window"]] = end, len(line), entry["record"]["written"]
+                self._digest, end = digest, end + len(line)
+        if end == 0 and set(names) > {_JOURNAL}:
+            raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
+        if not self._windows:
+            end, self._digest = 0, b""
+        elif not resume:
             raise FileExistsError(
-                f"{self.sink}: a run was interrupted here after {count} windows; resume it (--resume), or {start_over}"
+                f"{self.sink}: a run was interrupted here after {self.count} windows; resume it (--resume), or "
+                f"{start_over}"
             )
-        with self.open(_HEADER) as file:
-            stored = file.read()
-        if stored != header:
-            try:
-                difference = describe_difference(json.loads(stored), json.loads(header))
-            except (ValueError, RecursionError):
-                difference = None
-            if difference is None:
-                raise ValueError(f"{self.path / _HEADER} is damaged; {start_over}")
+        elif difference := _difference(stored, header):
             raise ValueError(f"{self.sink}: cannot resume: {difference}; {start_over}")
-
-    def _find_finished(self, windows: Iterable[int]) -> None:
-        """Find the windows whose files are as they were written, and remove the markers of the others."""
-        entries = [(self._entry(window)["record"]["written"], window) for window in windows]  # before any change
-        for written, window in entries:
-            if self._is_whole(window):
-                self._written[window] = written
-            else:
-                self._delete(_marker(window))
+        os.ftruncate(self._journal, end)
+        if not self._windows:
+            self._append(header)
+            os.fsync(self._folder)
+        for window in list(self._windows):
+            if not self._is_whole(window):
+                del self._windows[window]
 
     def _is_whole(self, window: int) -> bool:
         """Whether the files of a window are those that were written."""
@@ -192,84 +200,75 @@ class RunFolder:
         except OSError:
             return False
 
+    def _entry(self, window: int) -> dict[str, Any]:
+        """The line of a window, which is not kept in memory."""
+        place, size, _ = self._windows[window]
+        entry: dict[str, Any] = json.loads(os.pread(self._journal, size, place).partition(b" ")[2])
+        return entry
+
+    def _append(self, entry: Mapping[str, Any]) -> tuple[int, int]:
+        """Write a line of the journal, which is on the disk when the function returns; its place and size."""
+        body = json.dumps(entry).encode()
+        self._digest = _keyed(body, self._digest)
+        line = self._digest + b" " + body + b"\n"
+        place, remaining = os.fstat(self._journal).st_size, memoryview(line)
+        while remaining:
+            remaining = remaining[os.write(self._journal, remaining) :]
+        os.fsync(self._journal)
+        return place, len(line)
+
     def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
         with self.open(name) as file:
             if synchronised:
                 os.fsync(file.fileno())
-            digest = hashlib.blake2b(digest_size=16)
-            for block in iter(lambda: file.read(1 << 20), b""):
-                digest.update(block)
-            return digest.hexdigest()
-
-    def _entry(self, window: int) -> dict[str, Any]:
-        """Content of the marker of a window.
-
-        Raises:
-            ValueError: If it is not what this run wrote.
-        """
-        with self.open(_marker(window)) as file:
-            body, _, checksum = file.read().rpartition(b"\n")
-        if checksum == self._checksum(body):
-            entry: dict[str, Any] = json.loads(body)
-            if entry["record"]["window"] == window:
-                return entry
-        raise ValueError(f"{self.path / _marker(window)} is damaged; delete {self.path} to start over")
-
-    def _checksum(self, body: bytes) -> bytes:
-        return hashlib.blake2b(body, key=self._key, digest_size=16).hexdigest().encode()
-
-    def _delete(self, name: str) -> None:
-        with suppress(FileNotFoundError):
-            os.unlink(name, dir_fd=self._folder)
+            return hashlib.file_digest(file, _blake2b).hexdigest()
 
     def create(self, name: str) -> BinaryIO:
         """A new file of a window, whose name begins with the number of the window in six digits."""
-        self._delete(name)
+        with suppress(FileNotFoundError):
+            os.unlink(name, dir_fd=self._folder)
         return os.fdopen(os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | _SAFELY, 0o600, dir_fd=self._folder), "w+b")
 
-    def open(self, name: str) -> BinaryIO:
+    def open(self, name: str) -> BufferedReader:
         """A file of the folder for reading."""
         return os.fdopen(os.open(name, os.O_RDONLY | _SAFELY, dir_fd=self._folder), "rb")
 
-    def add(self, record: Mapping[str, Any], names: Iterable[str]) -> None:
-        """Enter the ``WindowRecord`` of a window with its closed files; it is on the disk when the function returns."""
-        digests = {name: self._digest_of(name, synchronised=True) for name in names}
-        os.fsync(self._folder)  # their names
-        body = json.dumps({"record": record, "files": digests}, allow_nan=False).encode()
-        self._write(_marker(record["window"]), body + b"\n" + self._checksum(body))
-        self._written[record["window"]] = record["written"]
+    def add(self, record: Mapping[str, Any], names: Sequence[str] = (), array: NDArray[Any] | None = None) -> None:
+        """Enter the ``WindowRecord`` of a window with its closed files, and an array, which becomes the last of them.
 
-    def _write(self, name: str, content: bytes) -> None:
-        """Write a file, which gets its name when its content is on the disk."""
-        with self.create(f"{name}.part") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(f"{name}.part", name, src_dir_fd=self._folder, dst_dir_fd=self._folder)
-        os.fsync(self._folder)
+        It is on the disk when the function returns.
+        """
+        names = list(names)
+        with disk_errors_named(self):
+            if array is not None:
+                names.append(f"{record['window']:06d}.npy")
+                with self.create(names[-1]) as file:
+                    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+                    file.write(array.data)  # errors of np.save do not contain the reason
+            digests = {name: self._digest_of(name, synchronised=True) for name in names}
+            os.fsync(self._folder)  # their names
+            self._windows[record["window"]] = *self._append({"record": record, "files": digests}), record["written"]
 
     def __contains__(self, window: int) -> bool:
-        return window in self._written
+        return window in self._windows
 
     @property
     def count(self) -> int:
         """Number of finished windows."""
-        return len(self._written)
+        return len(self._windows)
 
     @property
     def written(self) -> int:
         """Number of their frames."""
-        return sum(self._written.values())
+        return sum(frames for *_, frames in self._windows.values())
 
     def records(self) -> Iterator[dict[str, Any]]:
         """Records of the finished windows in order."""
-        for window in sorted(self._written):
-            yield self._entry(window)["record"]
+        return (self._entry(window)["record"] for window in sorted(self._windows))
 
     def files(self) -> Iterator[str]:
         """Names of the files of the finished windows in order."""
-        for window in sorted(self._written):
-            yield from self._entry(window)["files"]
+        return (name for window in sorted(self._windows) for name in self._entry(window)["files"])
 
     def remove(self) -> None:
         """Remove the folder, and the empty folders above it that were created for it.
@@ -277,7 +276,7 @@ class RunFolder:
         It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
         """
         hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{PART}")
-        self._written.clear()
+        self._windows.clear()
         if self._has_its_name():
             self.path.rename(hidden)
             sync(hidden.parent)
@@ -290,15 +289,14 @@ class RunFolder:
 
     def close(self) -> None:
         """Release the folder; it is removed if it contains no finished window."""
-        try:
-            if not self._written:
+        with self._opened:
+            if not self._windows:
                 self.remove()
-        finally:
-            os.close(self._folder)
 
 
-def _marker(window: int) -> str:
-    return f"{window:06d}.done"
+def _keyed(body: bytes, key: bytes) -> bytes:
+    """Digest of a line of the journal; the key is that of the line before."""
+    return _blake2b(body, key=key).hexdigest().encode()
 
 
 @contextmanager
@@ -314,3 +312,115 @@ def disk_errors_named(folder: RunFolder) -> Iterator[None]:
         # the words of the system: libraries add long descriptions
         reason = os.strerror(number) if number else " ".join(str(error).split())
         raise OSError(number, f"{reason}{kept}", str(folder.sink)) from error
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StackReport(Summarised):
+    """Summary of a run.
+
+    Attributes:
+        frames: Number of frames written, including those of an interrupted run that was resumed.
+        windows: Number of windows of the stack.
+        restored: Number of windows whose frames were restored.
+        failed: Number of windows in which detection or restoration failed.
+        bad_frames: Number of frames that could not be used.
+        resumed: Number of windows that were complete before.
+        seconds: Duration of the run.
+        first: Result of the first window, if it was computed in this process.
+        manifest: Path of the manifest.
+        not_kept: Metadata of the input that the output does not contain.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> report = rsv.process_stack("frames.tif", "restored.tif", timing)  # doctest: +SKIP
+        >>> report.frames, report.windows, report.restored, report.failed  # doctest: +SKIP
+        (200, 28, 28, 0)
+    """
+
+    frames: int
+    windows: int
+    restored: int
+    failed: int
+    bad_frames: int
+    resumed: int
+    seconds: float
+    first: WindowResult | None
+    manifest: Path
+    not_kept: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def summary(self) -> str:
+        """Numbers of frames and windows, and the time."""
+        lines = [f"{number_of(self.frames, 'frame')} in {number_of(self.windows, 'window')}, {self.restored} restored"]
+        if self.frames and not self.resumed:
+            lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
+        if self.resumed:
+            lines.append(f"windows complete before this run: {self.resumed}")
+        if self.failed:
+            lines.append(
+                f"detection or restoration failed in {number_of(self.failed, 'window')}: see {self.manifest.name}"
+            )
+        if self.bad_frames:
+            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
+        return "\n".join(lines)
+
+
+def run_to_file(
+    sink: Path,
+    options: RunOptions,
+    header: dict[str, Any],
+    *,
+    inputs: Iterable[Path],
+    windows: int,
+    compute: Callable[[RunFolder], dict[str, Any]],
+    write: Callable[[RunFolder], None],
+) -> StackReport:
+    """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.
+
+    ``compute`` adds the missing windows to the folder and returns further keys of the manifest, among them the metadata
+    that are ``not_kept``; ``write`` writes the output from the folder.
+    """
+    start = time.perf_counter()
+    manifest = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
+    check_outputs([*stack_files(sink), work_folder(sink), manifest], inputs)
+
+    def report(windows_done: Iterable[Mapping[str, Any]], resumed: int, lost: Sequence[str]) -> StackReport:
+        records = list(windows_done)
+        return StackReport(
+            frames=sum(record["written"] for record in records),
+            windows=windows,
+            restored=sum(record["frames"] == "restored" for record in records),
+            failed=sum(record["error"] is not None for record in records),
+            bad_frames=sum(len(record["bad_frames"]) for record in records),
+            resumed=resumed,
+            seconds=time.perf_counter() - start,
+            first=None,
+            manifest=manifest,
+            not_kept=tuple(lost),
+        )
+
+    if options.resume and not work_folder(sink).exists() and sink.exists() and manifest.exists():
+        complete = read_manifest(manifest)
+        difference = _difference({name: getattr(complete, name) for name in header}, header)
+        if difference:
+            raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
+        for path in (sink, manifest):
+            remove_abandoned(path)
+        return report(map(vars, complete.windows), windows, complete.not_kept)
+    folder = RunFolder(sink, header, resume=options.resume)
+    try:
+        resumed = folder.count
+        results = compute(folder)
+        with disk_errors_named(folder):
+            make_folder(manifest.parent)
+            with whole_file(manifest) as part:
+                part.write_text(manifest_text(header, folder.records(), **results), encoding="utf-8")
+                write(folder)
+            sync(manifest.absolute().parent)  # the temporary folder is gone as well
+        summary = report(folder.records(), resumed, results["not_kept"])
+        folder.remove()
+        return summary
+    finally:
+        folder.close()

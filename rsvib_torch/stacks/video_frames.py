@@ -15,12 +15,14 @@ from torch import Tensor
 
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.io.video import Picture
 from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration.restore import METHODS, restore_prepared
+from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.tracking import Margins
 
 Frame = NDArray[Any]
@@ -36,20 +38,55 @@ class FrameTrack:
     fault: str | None = None  # why the frame could not be used; None if it was used
 
 
-@dataclass(frozen=True)
-class FrameLayout:
-    """How the pixels of a frame are stored."""
+@dataclass(frozen=True, eq=False)
+class RestoredFrame:
+    """A restored frame."""
 
-    shape: tuple[int, ...]  # (H, W) or (C, H, W) of the pixels
-    planar: bool  # whether a frame is the planes Y, U and V of a 4:2:0 video (``PlaneReader``), instead of pixels
-    full_scale: float | None  # count that corresponds to 1.0; None for floats
-    white: float | None  # count from which pixels are saturated; None for none
-    dtype: np.dtype[Any]  # data type of the counts
+    planes: list[Frame] | None  # those of the frame as taken if it could not be used, if there are any
+    visible: list[NDArray[np.bool_]] | None  # of each plane, the pixels (H, W) that the sensor recorded; None: all
+    fault: str | None = None  # why the frame could not be used
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrames:
+    """How the frames of a video are stored, and how they are restored one by one.
+
+    ``"dewarp"`` interpolates once, in the frame as stored. Of other methods, the vibration is undone first, and then
+    the frame is moved; chroma of half the resolution is only dewarped, because its blur is half as wide.
+    """
+
+    job: StackJob  # source and settings
+    options: RestorationOptions
+    picture: Picture | None  # if frames are the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
+    masks: bool  # whether ``RestoredFrame.visible`` is needed
+
+    @property
+    def planar(self) -> bool:
+        """Whether a frame is the planes of a video instead of pixels."""
+        return self.picture is not None
 
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of the frames in px."""
-        return self.shape[-2], self.shape[-1]
+        return self.job.info.shape[-2], self.job.info.shape[-1]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Data type of the counts."""
+        return np.dtype(self.job.info.dtype)
+
+    @property
+    def full_scale(self) -> float | None:
+        """Count that corresponds to 1.0; None for floats."""
+        return self.job.full_scale if self.picture is None else 255.0
+
+    @property
+    def white(self) -> float | None:
+        """Count from which pixels are saturated; None for none."""
+        if not isinstance(self.options.saturation, float):
+            return None
+        black, full = (0.0, self.job.full_scale or 1.0) if self.picture is None else self.picture.levels
+        return black + self.options.saturation * (full - black)
 
     def luma(self, frame: Frame) -> Frame:
         """The part of a frame in which motion is measured."""
@@ -79,7 +116,7 @@ class FrameLayout:
     def black(self) -> list[Frame]:
         """Planes of a frame without content."""
         if not self.planar:
-            return [np.zeros(self.shape, self.dtype)]
+            return [np.zeros(self.job.info.shape[1:], self.dtype)]
         height, width = self.size
         return [np.full((height, width), 16, self.dtype), np.full((2, height // 2, width // 2), 128, self.dtype)]
 
@@ -89,47 +126,11 @@ class FrameLayout:
             return margins
         return Margins(*(side + side % 2 for side in (margins.top, margins.bottom, margins.left, margins.right)))
 
-
-@dataclass(frozen=True, eq=False)
-class RestoredFrame:
-    """A restored frame.
-
-    Attributes:
-        planes: Its planes.
-        visible: For each plane, the pixels (H, W) that the sensor recorded; None if it recorded all.
-        fault: Why the frame could not be used; its planes are then those of the frame as taken, if there are any.
-    """
-
-    planes: list[Frame] | None
-    visible: list[NDArray[np.bool_]] | None
-    fault: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class VideoRestorer:
-    """Restores the frames of a video one by one.
-
-    Args:
-        layout: Layout of the frames.
-        timing: The sensor.
-        options: Method of ``restore`` and its options. ``"dewarp"`` interpolates once, in the frame as stored. Of other
-            methods, the vibration is undone first, and then the frame is moved; chroma of half the resolution is only
-            dewarped, because its blur is half as wide.
-        device: Device for the computation.
-        masks: Whether ``RestoredFrame.visible`` is needed.
-    """
-
-    layout: FrameLayout
-    timing: SensorTiming
-    options: RestorationOptions
-    device: str = "cpu"
-    masks: bool = True
-
     def restored(self, frame: Frame | str, track: FrameTrack) -> RestoredFrame:
         """Restore a frame as stored, or the reason why it cannot be read."""
         if isinstance(frame, str):
             return RestoredFrame(None, None, frame)
-        planes = self.layout.planes(frame)
+        planes = self.planes(frame)
         if track.fault is not None or not bool(track.motion.moving_axes().any()):
             return RestoredFrame(planes, None, track.fault)
         results: list[Frame] = []
@@ -153,7 +154,8 @@ class VideoRestorer:
 
     def timing_of(self, plane: int) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
-        timing, rows = self.timing, self.layout.size[0 if self.timing.scan_axis == -2 else 1]
+        timing = self.job.timing
+        rows = self.size[0 if timing.scan_axis == -2 else 1]
         half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
         if plane == 0:
             return replace(timing, frame_start_times=(-half,))
@@ -166,14 +168,14 @@ class VideoRestorer:
         )
 
     def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
-        scale = self.layout.full_scale
-        level = self.layout.white if "clipped" in METHODS[self.options.method].masks else None
-        images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.device)
+        scale = self.full_scale
+        level = self.white if "clipped" in METHODS[self.options.method].masks else None
+        images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.device)
         saturation = None if level is None else level / (scale or 1.0)
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
             restored = restore_prepared(prepared, motion, self.options)
-        return frames_to_counts(prepared.from_row_order(restored)[0], self.layout.dtype, scale)
+        return frames_to_counts(prepared.from_row_order(restored)[0], self.dtype, scale)
 
 
 def moved_back(plane: Frame, source: NDArray[np.float32]) -> Frame:

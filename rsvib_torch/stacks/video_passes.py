@@ -12,15 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from rsvib_torch.core.prefetch import prefetched
-from rsvib_torch.core.presentation import AXIS_NAMES, plain_values
+from rsvib_torch.core.presentation import AXIS_NAMES
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.tables import Array, tensor
 from rsvib_torch.detection.recorded.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
-from rsvib_torch.io.stack_info import FrameError
-from rsvib_torch.io.stack_reading import open_stack
-from rsvib_torch.io.video_parts import planes_of
+from rsvib_torch.io.video import VideoReader
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.sampling import recorded_offsets
@@ -28,9 +26,10 @@ from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.restoration import RestorationVerdict
-from rsvib_torch.stacks.job import StackJob
-from rsvib_torch.stacks.video_frames import FrameLayout, FrameTrack, VideoRestorer
+from rsvib_torch.stacks.job import stored_frame
+from rsvib_torch.stacks.video_frames import FrameTrack, VideoFrames
 from rsvib_torch.stacks.window_restoration import pair_verdict
+from rsvib_torch.stacks.windows import window_record
 from rsvib_torch.tracking import Margins
 from rsvib_torch.tracking.camera_path import CameraPath, Tone, camera_path, shake
 from rsvib_torch.tracking.recorded_rotation import RecordedRotation
@@ -62,9 +61,7 @@ class VideoMotion:
 class VideoPasses:
     """What the passes through a video have in common: how frames are read, moved, judged and recorded."""
 
-    job: StackJob  # source and settings
-    layout: FrameLayout  # layout of the frames
-    restorer: VideoRestorer  # restores them
+    frames: VideoFrames  # source, settings, and how frames are restored
     starts: list[float]  # s, exposure start of every frame, from the first one
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
@@ -75,27 +72,15 @@ class VideoPasses:
         """Number of parts."""
         return -(-len(self.starts) // PART_FRAMES)
 
-    def ends_part(self, index: int) -> bool:
-        """Whether a frame is the last one of a part."""
-        return index % PART_FRAMES == PART_FRAMES - 1 or index == len(self.starts) - 1
-
     def decoded(self) -> Generator[Frame | str, None, None]:
         """Every frame, or why it cannot be read; decoded ahead in a thread."""
         return prefetched(self._decoded(), _AHEAD)
 
     def _decoded(self) -> Generator[Frame | str, None, None]:
-        reader = open_stack(self.job.source)
-        try:
-            if reader.info != self.job.info:
-                raise ValueError(f"{self.job.source} has changed since it was first opened; start again")
-            source: Any = planes_of(reader) or reader if self.layout.planar else reader
+        with closing(self.frames.job.open()) as reader:
+            read = reader.planes if self.frames.planar and isinstance(reader, VideoReader) else reader.frame
             for index in range(len(self.starts)):
-                try:
-                    yield source.frame(index)
-                except FrameError as error:
-                    yield " ".join(str(error).split())
-        finally:
-            reader.close()
+                yield stored_frame(read, index)
 
     # First pass: the motion
 
@@ -108,14 +93,14 @@ class VideoPasses:
 
         def pairs() -> Iterator[Corners | None]:
             before: tuple[int, NDArray[np.uint8]] | None = None
-            follower = CornerFollower(self.job.timing)
+            follower = CornerFollower(self.frames.job.timing)
             with closing(self.decoded()) as frames:
                 for index, frame in enumerate(frames):
                     progress()
                     if isinstance(frame, str):
                         faults[index] = frame
                         continue
-                    grey = self.layout.grey(frame)
+                    grey = self.frames.grey(frame)
                     if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
                         faults[index] = f"frame {index} is constant, or a copy of the frame before"
                         continue
@@ -125,16 +110,16 @@ class VideoPasses:
                             shakes[index - 1] = shake(corners)
                         if before[0] == index - 1 in chosen:
                             starts = self.starts[index - 1 : index + 1]
-                            compared[index - 1] = followed_pair(before[1], grey, starts, self.job.timing)
+                            compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
                         yield corners
                     before = index, grey
 
-        timing = self.job.timing
-        rows = self.layout.size[0 if timing.scan_axis == -2 else 1]
+        timing = self.frames.job.timing
+        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
         half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
         times = np.array(self.starts) + half
         if self.rates is None:
-            path = camera_path(pairs(), timing, self.layout.size)
+            path = camera_path(pairs(), timing, self.frames.size)
             places = path.places(times)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])
             polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
@@ -151,14 +136,14 @@ class VideoPasses:
         return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
 
     def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
-        return steady_shifts(times, apart, self.steady, self.layout.size, self.crop_limit)
+        return steady_shifts(times, apart, self.steady, self.frames.size, self.crop_limit)
 
     def _alignment(self, rates: AngularRates, pairs: dict[int, Corners]) -> RotationAlignment:
         """The alignment of the gyroscope by the corners between some frames, by number, and the next ones."""
         source = f"the gyroscope ({rates.source})"
         if not pairs:
             raise ValueError(f"{source} cannot be compared with the video: it has no two different frames in sequence")
-        timing, size = self.job.timing, self.layout.size
+        timing, size = self.frames.job.timing, self.frames.size
         starts = np.array([self.starts[index : index + 2] for index in pairs])
         tracks = tracks_of_pairs(list(pairs.values()), starts, timing, size)
         found = align_rates(tracks, tensor(starts), size if timing.scan_axis == -2 else size[::-1], timing, rates)
@@ -170,8 +155,8 @@ class VideoPasses:
         """The tones, skew and wobble by the path, and what the path is not smooth by."""
         if self.steady == 0:  # axes without vibration stay as taken
             polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
-        height, width = self.layout.size
-        seconds = 0.5 * self.job.timing.row_time * max(height, width)
+        height, width = self.frames.size
+        seconds = 0.5 * self.frames.job.timing.row_time * max(height, width)
         reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
         axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
         amplitude, frequency, phase = tone_tables(tones, axes)
@@ -186,21 +171,21 @@ class VideoPasses:
         widest = np.zeros(4)
         for index in range(len(self.starts)):
             if index not in motion.faults:
-                track, timing = self.track(motion, index), self.restorer.timing_of(0)
-                (x, y), _ = recorded_offsets(track.motion, timing, self.layout.size)
+                track, timing = self.track(motion, index), self.frames.timing_of(0)
+                (x, y), _ = recorded_offsets(track.motion, timing, self.frames.size)
                 x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
                 sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
                 widest = np.maximum(widest, sides)
-        return self.layout.margins(Margins(*(math.ceil(side + 0.5) if side > 0.01 else 0 for side in widest)))
+        return self.frames.margins(Margins(*(math.ceil(side + 0.5) if side > 0.01 else 0 for side in widest)))
 
     # Verdict and record of a part
 
     def shaking(self, motion: VideoMotion, first: int, frames: list[Frame]) -> dict[str, list[float]] | None:
         """``WindowRecord.shaking`` from frames of the output, the first of which has a number; None if unknown."""
         measured: list[tuple[tuple[Array, float], tuple[Array, float]]] = []  # of neighbouring frames, before and after
-        follower = CornerFollower(self.job.timing)
+        follower = CornerFollower(self.frames.job.timing)
         for number, frame in enumerate(frames, first):
-            corners, raw = follower.next(self.layout.grey(frame), self.starts[number]), motion.shakes.get(number - 1)
+            corners, raw = follower.next(self.frames.grey(frame), self.starts[number]), motion.shakes.get(number - 1)
             if number > first:
                 if raw is None or corners is None:
                     break
@@ -219,11 +204,11 @@ class VideoPasses:
         (first, one), (_, other) = frames
         if not isinstance(first.motion, Vibration):
             return None
-        pixels = np.stack([self.layout.luma(one), self.layout.luma(other)])
-        images = counts_to_frames(pixels, self.layout.full_scale, str(self.job.source)).to(self.job.device)
+        pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
+        images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)
         motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
         interval = frames[1][0].time - first.time
-        return pair_verdict(images, self.job.timing, motion, interval, self.restorer.options)
+        return pair_verdict(images, self.frames.job.timing, motion, interval, self.frames.options)
 
     def record(
         self,
@@ -236,29 +221,25 @@ class VideoPasses:
         """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
         path = motion.path
         detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
-        faults = {str(track.index): track.fault for track in tracks if track.fault is not None}
-        moved = any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None)
         left = [
             Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
             for name, why in zip(AXIS_NAMES, detection.reasons if detection else (), strict=False)
             if why
         ]
-        return {
-            "window": part,
-            "first": tracks[0].index,
-            "last": tracks[-1].index,
-            "start_time": tracks[0].time,
-            "written": len(tracks),
-            "frames": "restored" if moved else "as taken",
-            "detection": detection and plain_values(detection),
-            "left_alone": plain_values(left),
-            "outcome": None if verdict is None else verdict.overall,
-            "summary": None if verdict is None else verdict.sentence,
-            "predicted_gain": None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
-            "error": None,
-            "bad_frames": faults,
-            "shaking": self.shaking(motion, tracks[0].index, first_frames),
-        }
+        return window_record(
+            verdict,
+            {track.index: track.fault for track in tracks if track.fault is not None},
+            restored=any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None),
+            window=part,
+            first=tracks[0].index,
+            last=tracks[-1].index,
+            start_time=tracks[0].time,
+            written=len(tracks),
+            detection=detection,
+            left_alone=left,
+            error=None,
+            shaking=self.shaking(motion, tracks[0].index, first_frames),
+        )
 
     def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
         """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
@@ -284,7 +265,7 @@ class VideoPasses:
         return DetectedVibration(
             vibration=vibration,
             std=VibrationStd(*(torch.from_numpy(np.array(value)) for value in values)),
-            gain=vibration.gain(self.job.timing.frame_period),
+            gain=vibration.gain(self.frames.job.timing.frame_period),
             residual=torch.full((2,), window.residual, dtype=torch.float64),
             reliable=torch.tensor([not reasons for reasons in findings]),
             findings=findings,
@@ -301,7 +282,7 @@ class VideoPasses:
         if not frequencies:
             return (Reason("no_tone", AXIS_NAMES[axis]),)
         for first, second in combinations(frequencies, 2):
-            cycles = abs(first - second) * self.job.timing.frame_period
+            cycles = abs(first - second) * self.frames.job.timing.frame_period
             if round(cycles) > 0 and abs(cycles - round(cycles)) < _SAME_ALIAS:
                 return (Reason("tones_alias", AXIS_NAMES[axis], first, second),)
         return ()

@@ -1,12 +1,18 @@
-"""Windows: consecutive frames that are processed together. They depend only on the length of the stack."""
+"""Windows: consecutive frames that are processed together, and the records of their results."""
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 
 from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.core.presentation import plain_values
+from rsvib_torch.core.reason import Reason
+from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.restoration import RestorationVerdict
 
 
 @dataclass(frozen=True)
@@ -15,20 +21,13 @@ class Window:
 
     Neighbouring windows share one frame, so that every pair of consecutive frames belongs to exactly one window; the
     later window writes the shared frame.
-
-    Attributes:
-        index: Number of the window.
-        first: Index of its first frame.
-        last: Index of its last frame (inclusive).
-        kept: Number of frames that it writes.
-        before: Number of frames before the first that are read as well, to begin to follow the vibration.
     """
 
     index: int
     first: int
-    last: int
-    kept: int
-    before: int = 0
+    last: int  # inclusive
+    kept: int  # number of frames that it writes
+    before: int = 0  # frames before the first that are read as well, to begin to follow the vibration
 
     @property
     def frames(self) -> range:
@@ -48,6 +47,8 @@ class Window:
 
 def cut_windows(num_frames: int, window: int, before: int = 0) -> list[Window]:
     """Cut a stack into windows of at most ``window`` frames, of equal length to within one frame.
+
+    They depend only on the arguments.
 
     Args:
         num_frames: Number of frames of the stack.
@@ -78,3 +79,43 @@ def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> Se
         return timing
     starts = timing.frame_starts(window.last + 1)
     return replace(timing, frame_start_times=starts[torch.tensor(frames, device="cpu")] - starts[window.first])
+
+
+@dataclass(frozen=True, eq=False)
+class WindowRecord:
+    """Result of one window."""
+
+    window: int  # its number
+    first: int  # frame
+    last: int  # frame
+    start_time: float  # s, exposure start of its first row, the time origin of its detection
+    written: int  # number of frames written
+    frames: Literal["restored", "as taken"]  # those that are written
+    detection: DetectedVibration | None  # None if it failed
+    left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
+    outcome: str | None  # ``RestorationVerdict.overall``; None if the frames could not be compared
+    summary: str | None  # ``RestorationVerdict.sentence``
+    predicted_gain: float | None  # dB, mean of ``RestorationVerdict.predicted_gain``; None if unknown
+    error: str | None  # why detection or restoration failed
+    bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
+    # Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``, changes of the
+    # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
+    shaking: dict[str, tuple[float, ...]] | None = None
+    middle: int | None = None  # with ``follow=True``, the frame whose vibration is stated; None if it is not known
+    restored_frames: int | None = None  # with ``follow=True``, number of frames written that are restored
+
+
+def window_record(
+    verdict: RestorationVerdict | None, bad_frames: Mapping[int, str], *, restored: bool, **known: Any
+) -> dict[str, Any]:
+    """Content of a ``WindowRecord`` as JSON, from a verdict and the other fields."""
+    record = {
+        **known,
+        "frames": "restored" if restored else "as taken",
+        "outcome": None if verdict is None else verdict.overall,
+        "summary": None if verdict is None else verdict.sentence,
+        "predicted_gain": None if verdict is None else verdict.predicted_gain.nanmean(),
+        "bad_frames": bad_frames,
+    }
+    plain: dict[str, Any] = plain_values(record)
+    return plain

@@ -54,7 +54,7 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         files: list[Path] = []
         while not files:
             kill_run(reference, place, kind, choice, windows=2)
-            files = sorted(file for file in work.iterdir() if file.suffix not in (".json", ".done", ".part"))
+            files = sorted(file for file in work.iterdir() if file.name != "journal")
         file = choice.choice(files)
         where = _damage(file, [other for other in files if other != file], damage, choice)
         yield resumed_trial(reference, place, kind, f"{kind}: {file.relative_to(work)} {damage}{where}")

@@ -1,4 +1,4 @@
-"""Damaged markers and headers of interrupted runs: a one-line refusal without any change, or the right result."""
+"""Damaged journals of interrupted runs: a one-line refusal without any change, or the right result."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from attacks.trial import Trial
 
 __all__ = ["trials"]
 
-_MARKER = "000000.done"
+_JOURNAL = "journal"
 _VALUES: dict[str, str] = {
     "null": "null", "true": "true", "text": '"text"', "empty text": '""', "negative": "-1", "fraction": "0.5",
     "huge": "9" * 400, "very huge": "9" * 5000, "infinite": "1e999", "NaN": "NaN", "Infinity": "-Infinity",
@@ -22,30 +22,27 @@ _VALUES: dict[str, str] = {
 }  # fmt: skip
 
 
-def _with_value(line: bytes, key: str, text: str) -> bytes:
-    """A line of JSON with another value of a key."""
-    table = json.loads(line)
-    mark = "\0value\0"
-    return json.dumps({**table, key: mark}).replace(json.dumps(mark), text).encode() + b"\n"
+def _of_lines(work: Path, change: Callable[[list[bytes]], list[bytes]]) -> None:
+    """Change the lines of the journal: the header and those of the windows."""
+    (work / _JOURNAL).write_bytes(b"".join(change((work / _JOURNAL).read_bytes().splitlines(keepends=True))))
 
 
-def _of_values(work: Path, name: str, key: str, text: str) -> None:
-    """Replace a value in the first line of a file, which is JSON."""
-    first, *rest = (work / name).read_bytes().splitlines(keepends=True)
-    (work / name).write_bytes(_with_value(first, key, text) + b"".join(rest))
+def _of_values(work: Path, number: int, keys: tuple[str, ...], text: str) -> None:
+    """Replace a value in a line of the journal, which is a digest and JSON."""
+    lines = (work / _JOURNAL).read_bytes().splitlines(keepends=True)
+    digest, _, body = lines[number].partition(b" ")
+    entry, mark = json.loads(body), "\0value\0"
+    table = entry
+    for key in keys[:-1]:
+        table = table[key]
+    table[keys[-1]] = mark
+    lines[number] = digest + b" " + json.dumps(entry).replace(json.dumps(mark), text).encode() + b"\n"
+    (work / _JOURNAL).write_bytes(b"".join(lines))
 
 
-def _of_record(work: Path, key: str, text: str) -> None:
-    """Replace a value of the record of the first window."""
-    body, checksum = (work / _MARKER).read_bytes().splitlines()
-    entry = json.loads(body)
-    mark = "\0value\0"
-    changed = json.dumps({**entry, "record": {**entry["record"], key: mark}}).replace(json.dumps(mark), text)
-    (work / _MARKER).write_bytes(changed.encode() + b"\n" + checksum)
-
-
-def _of_marker(work: Path, change: Callable[[bytes], bytes]) -> None:
-    (work / _MARKER).write_bytes(change((work / _MARKER).read_bytes()))
+def _of_window(work: Path, change: Callable[[bytes], bytes]) -> None:
+    """Change the line of the first window."""
+    _of_lines(work, lambda lines: [lines[0], change(lines[1]), *lines[2:]])
 
 
 def _copied(work: Path, source: str, target: str) -> None:
@@ -66,39 +63,42 @@ def _attacks() -> dict[str, Callable[[Path], None]]:
 
     for value, text in _VALUES.items():
         for key in ("window", "first", "written", "detection", "bad_frames"):
-            add(f"{key} of a record: {value}", _of_record, key, text)
+            add(f"{key} of a record: {value}", _of_values, 1, ("record", key), text)
         for key in ("record", "files"):
-            add(f"{key} of a marker: {value}", _of_values, _MARKER, key, text)
+            add(f"{key} of a window: {value}", _of_values, 1, (key,), text)
         for key in ("settings", "input"):
-            add(f"{key} of the header: {value}", _of_values, "run.json", key, text)
+            add(f"{key} of the header: {value}", _of_values, 0, (key,), text)
     changes: dict[str, Callable[[bytes], bytes]] = {
-        "marker is empty": lambda data: b"",
-        "marker is incomplete": lambda data: data[: len(data) // 2],
-        "marker without checksum": lambda data: data.splitlines()[0],
-        "marker with another checksum": lambda data: data.splitlines()[0] + b"\n" + b"0" * 32,
-        "marker twice": lambda data: data + b"\n" + data,
-        "zeros after the marker": lambda data: data + bytes(4096),
-        "zeros before the marker": lambda data: bytes(4096) + data,
-        "marker is text": lambda data: b"window 0\n",
-        "marker is nested": lambda data: b"[" * 100_000 + b"\n",
-        "a very long marker": lambda data: b"9" * 20_000_000 + b"\n",
+        "line is empty": lambda line: b"\n",
+        "line is missing": lambda line: b"",
+        "line is incomplete": lambda line: line[: len(line) // 2],
+        "line without digest": lambda line: line.partition(b" ")[2],
+        "line with another digest": lambda line: b"0" * 32 + b" " + line.partition(b" ")[2],
+        "line twice": lambda line: line + line,
+        "zeros after the line": lambda line: line + bytes(4096),
+        "zeros before the line": lambda line: bytes(4096) + line,
+        "line is text": lambda line: b"window 0\n",
+        "line is nested": lambda line: b"[" * 100_000 + b"\n",
+        "a very long line": lambda line: b"9" * 20_000_000 + b"\n",
     }
     for title, change in changes.items():
-        add(title, _of_marker, change)
-    add("window 0 as window 1", _copied, _MARKER, "000001.done")
-    add("window 0 as a window that does not exist", _copied, _MARKER, "000099.done")
-    add("a file of another name", _copied, _MARKER, "more.txt")
-    for name in (_MARKER, "run.json", "000000.npy"):
+        add(title, _of_window, change)
+    add("windows in another order", _of_lines, lambda lines: [lines[0], *lines[:0:-1]])
+    add("window 0 again at the end", _of_lines, lambda lines: [*lines, lines[1]])
+    add("last line is incomplete", _of_lines, lambda lines: [*lines[:-1], lines[-1][:-9]])
+    add("a file of another name", _copied, _JOURNAL, "more.txt")
+    for name in (_JOURNAL, "000000.npy"):
         add(f"{name} is a folder", _as, name, lambda path: path.mkdir())
         add(f"{name} is a pipe", _as, name, os.mkfifo)
         add(f"{name} is a link to a device", _as, name, lambda path: path.symlink_to("/dev/zero"))
         add(f"{name} is a link to nothing", _as, name, lambda path: path.symlink_to("missing"))
         add(f"{name} is a link to itself", _as, name, lambda path: path.symlink_to(path.name))
-    add("header is empty", lambda work: (work / "run.json").write_bytes(b""))
-    add("header is missing", lambda work: (work / "run.json").unlink())
-    add("header is a list", lambda work: (work / "run.json").write_bytes(b"[]"))
-    add("header is nested", lambda work: (work / "run.json").write_bytes(b"[" * 200_000))
-    add("header of another run", lambda work: (work / "run.json").write_bytes((work / "run.json").read_bytes() + b" "))
+    add("journal is empty", _of_lines, lambda lines: [])
+    add("journal is missing", lambda work: (work / _JOURNAL).unlink())
+    add("header is missing", _of_lines, lambda lines: lines[1:])
+    add("header is a list", _of_lines, lambda lines: [b"[]\n", *lines[1:]])
+    add("header is nested", _of_lines, lambda lines: [b"[" * 200_000 + b"\n", *lines[1:]])
+    add("header is longer", _of_lines, lambda lines: [lines[0][:-1] + b" \n", *lines[1:]])
     return found
 
 

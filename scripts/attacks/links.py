@@ -26,14 +26,14 @@ __all__ = ["trials"]
 
 _TARGETS = dict.fromkeys(
     ("TIFF", "npy, frames skipped", "video"),
-    ("run.json", "000000.done", "000000.npy", "000004.npy", "000004.done.part", "out.tif"),
+    ("journal", "000000.npy", "000004.npy", "out.tif"),
 )
 
 
 def _victim(folder: Path) -> Path:
     """A folder of the user, with files of the names that a run uses."""
     shutil.rmtree(folder, ignore_errors=True)
-    for name in ("precious.txt", "run.json", "out.tif", "out/zarr.json", "000000.npy", "000000.done"):
+    for name in ("precious.txt", "journal", "out.tif", "out/zarr.json", "000000.npy"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(b"precious\n")
     return folder

@@ -212,8 +212,10 @@ def calls_of(reference: Reference, kind: str) -> int:
 
 
 def finished_windows(folder: Path, name: str) -> int:
-    """Number of windows of an interrupted run that have a marker."""
-    return len(list((folder / f".{name}.rsvib").glob("*.done")))
+    """Number of windows of an interrupted run that have a complete line in the journal."""
+    journal = folder / f".{name}.rsvib" / "journal"
+    lines = journal.read_bytes().partition(b"\0")[0].count(b"\n") if journal.exists() else 0
+    return max(0, lines - 1)
 
 
 def kill_run(reference: Reference, folder: Path, kind: str, choice: random.Random, *, windows: int) -> None:

@@ -71,6 +71,14 @@ def test_the_oldest_waiting_frames_are_dropped_and_counted():
     assert source.closed
 
 
+@pytest.mark.parametrize("drops", [True, False])
+def test_a_reader_that_is_stopped_releases_the_source_with_the_next_frame(drops):
+    reader = FrameReader(source := Numbers(10**9), waiting=10**6, drops=drops)
+    reader.start()
+    reader.close()
+    assert source.closed
+
+
 def test_a_source_that_may_wait_loses_no_frame():
     reader = FrameReader(Numbers(), waiting=8, drops=False)
     reader.start()
@@ -300,7 +308,8 @@ def test_signals_end_a_session(tmp_path, number):
         saved.append(rsv.read_stack(tmp_path / "video.mkv"))
 
     report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
-    assert report.frames == len(saved[0]) == 6
+    assert report.frames == len(saved[0])
+    assert 6 <= report.frames <= 8  # at most two frames are tracked ahead of the written one
     assert signal.getsignal(number) == before
 
 

@@ -12,7 +12,8 @@ from detections import detection_of, result_of
 
 import rsvib_torch as rsv
 from rsvib_torch.core.reason import Reason
-from rsvib_torch.stacks.manifest import StackManifest, WindowRecord
+from rsvib_torch.stacks.manifest import StackManifest
+from rsvib_torch.stacks.windows import WindowRecord
 
 TIMING = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
 TWO_TONES = rsv.Vibration(

@@ -72,6 +72,27 @@ def test_an_interrupted_run_is_not_overwritten_or_resumed_with_other_settings(in
     assert not (interrupted / "out.tif").exists()
 
 
+def test_an_edited_journal_is_refused(interrupted):
+    journal = work_folder(interrupted / "out.tif") / "journal"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    edited = b"".join([*lines[:-1], lines[-1].replace(b'"restored"', b'"as taken"')])
+    journal.write_bytes(edited)
+    with pytest.raises(ValueError, match="journal is damaged; delete"):
+        process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
+    assert journal.read_bytes() == edited
+
+
+@pytest.mark.parametrize("written", [slice(0, -9), slice(0, 0)])
+def test_the_window_of_an_incomplete_line_of_the_journal_is_computed_again(interrupted, whole, written):
+    journal = work_folder(interrupted / "out.tif") / "journal"
+    *lines, last = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(b"".join([*lines, last[written], bytes(100)]))
+    report = process_small(interrupted / "frames.tif", interrupted / "out.tif", resume=True)
+    assert report.resumed == len(lines) - 1  # the first line is the header
+    for name in ("out.tif", "out.tif.manifest.json"):
+        assert (interrupted / name).read_bytes() == (whole / name).read_bytes()
+
+
 def test_resuming_a_complete_run_changes_nothing(whole, tmp_path):
     process_small(whole / "frames.tif", tmp_path / "out.npy")
     before = (tmp_path / "out.npy").stat().st_mtime_ns

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.core.checks import needed_package
-from rsvib_torch.io.gyroscope.gcsv_log import check_orientation, oriented
-from rsvib_torch.io.gyroscope.rates_table import angular_rates
+from rsvib_torch.io.gyroscope.text_logs import angular_rates, check_orientation, oriented
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 
 Array = NDArray[np.float64]
@@ -87,27 +86,16 @@ def _packets(path: Path) -> Iterator[_Packet]:
 
 @dataclass(frozen=True)
 class _Part:
-    """Samples of one packet.
+    """Samples of one packet."""
 
-    Attributes:
-        rates: (N, 3) rad/s.
-        start: Time of the packet in s.
-        duration: Its duration in s.
-        stamp: Time of the first sample in s on the clock of the camera (STMP); None if the packet does not state it.
-        earliest: The earliest time that any stream of the packet states; None if none states one.
-        total: Samples up to the end of the packet that it states; None if it states none.
-        orientation: Axes in the order of the file; empty if they are not stated.
-        stabilised: Whether the images are turned against the camera.
-    """
-
-    rates: Array
-    start: float
-    duration: float
-    stamp: float | None
-    earliest: float | None
-    total: int | None
-    orientation: str
-    stabilised: bool = False
+    rates: Array  # (N, 3) rad/s
+    start: float  # s, time of the packet
+    duration: float  # s
+    stamp: float | None  # s, time of the first sample on the clock of the camera (STMP); None: not stated
+    earliest: float | None  # s, the earliest time that any stream of the packet states
+    total: int | None  # samples up to the end of the packet that it states
+    orientation: str  # axes in the order of the file; empty if they are not stated
+    stabilised: bool = False  # whether the images are turned against the camera
 
 
 def _entries(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
@@ -157,38 +145,43 @@ def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
                 break
 
 
+def _found(stream: bytes, key: bytes) -> Array | None:
+    """Values (N, C) of the entry of a stream that has a key; None if there is none."""
+    found = next(((kind, size, content) for name, kind, size, _, content in _entries(stream) if name == key), None)
+    return None if found is None else _values(*found)
+
+
 def _stamp(stream: bytes) -> float | None:
     """Time of the first sample of a stream in s on the clock of the camera; None if it is not stated."""
-    found = next(((kind, size, content) for key, kind, size, _, content in _entries(stream) if key == b"STMP"), None)
-    return None if found is None else float(_values(*found)[0, 0]) * 1e-6
+    stamp = _found(stream, b"STMP")
+    return None if stamp is None else float(stamp[0, 0]) * 1e-6
 
 
 def _turns_images(stream: bytes) -> bool:
     """Whether a stream has orientations of the images against the camera (IORI, quaternions w, x, y, z) that differ."""
-    found = next(((kind, size, content) for key, kind, size, _, content in _entries(stream) if key == b"IORI"), None)
-    if found is None:
+    quaternions = _found(stream, b"IORI")
+    if quaternions is None:
         return False
-    quaternions = _values(*found)
     return bool((np.abs(quaternions[:, 1:]) > _SMALLEST_TURN * np.abs(quaternions[:, :1])).any())
 
 
 def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | None:
     """Samples of a stream; None if it has no angular rates."""
-    found = {key: (kind, size, content) for key, kind, size, _, content in _entries(stream)}
-    if b"GYRO" not in found:
-        return None
-    rates = _values(*found[b"GYRO"])
-    if not len(rates):
+    rates = _found(stream, b"GYRO")
+    if rates is None or not len(rates):
         return None
     if rates.shape[1] != 3:
         raise IndexError(f"GYRO with {rates.shape[1]} values per sample")
-    scale = _values(*found[b"SCAL"]).ravel() if b"SCAL" in found else np.ones(1)
+    scale, total = _found(stream, b"SCAL"), _found(stream, b"TSMP")
+    scale = np.ones(1) if scale is None else scale.ravel()
     if len(scale) not in (1, 3) or not (scale != 0).all():
         raise IndexError("GYRO with a wrong SCAL")
-    letters = found[b"ORIN"][2].decode("latin-1").strip("\0 ") if b"ORIN" in found else ""
-    total = int(_values(*found[b"TSMP"])[0, 0]) if b"TSMP" in found else None
-    orientation = check_orientation(letters) if letters else ""
-    return _Part(rates / scale, packet.start, packet.duration, _stamp(stream), earliest, total, orientation)
+    letters = next((content for name, *_, content in _entries(stream) if name == b"ORIN"), b"")
+    orientation = letters.decode("latin-1").strip("\0 ")
+    if orientation:
+        check_orientation(orientation)
+    samples = None if total is None else int(total[0, 0])
+    return _Part(rates / scale, packet.start, packet.duration, _stamp(stream), earliest, samples, orientation)
 
 
 def _sample_times(parts: list[_Part]) -> Array:

@@ -9,9 +9,8 @@ from typing import Literal, get_args
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.reading import check_regular
-from rsvib_torch.io.gyroscope.gcsv_log import is_gcsv, read_gcsv
 from rsvib_torch.io.gyroscope.gpmf_track import is_mp4, read_gpmf
-from rsvib_torch.io.gyroscope.rates_table import read_rates_table
+from rsvib_torch.io.gyroscope.text_logs import is_gcsv, read_gcsv, read_rates_table
 from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.recorded import check_times
 from rsvib_torch.options import TimeUnit
@@ -23,18 +22,14 @@ RateUnit = Literal["rad/s", "deg/s"]
 class _GyroscopeFormat:
     """A format of gyroscope files.
 
-    Attributes:
-        name: Name in messages.
-        matches: Whether the first 64 bytes of a file are those of this format.
-        read: Function that reads a file of this format: its times in s, and its rates in rad/s. It refuses files that
-            are damaged with a one-line ``ValueError``; time and memory are linear in the size of the file.
-        has_units: Whether the format states its units.
+    ``read`` refuses damaged files with a one-line ``ValueError``; its time and memory are linear in the size of the
+    file.
     """
 
-    name: str
-    matches: Callable[[bytes], bool]
-    read: Callable[[Path, RateUnit | None, TimeUnit | None], AngularRates]
-    has_units: bool = True
+    name: str  # in messages
+    matches: Callable[[bytes], bool]  # whether the first 64 bytes of a file are those of this format
+    read: Callable[[Path, RateUnit | None, TimeUnit | None], AngularRates]  # times in s and rates in rad/s
+    has_units: bool = True  # whether the format states its units
 
 
 # A new format is one module and one line. The first that matches is used: CSV has no mark and comes last.
