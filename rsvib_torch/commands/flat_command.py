@@ -108,16 +108,17 @@ def _is_argument(stated: Any) -> bool:
 
 @contextmanager
 def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
-    """Errors name the arguments of Python functions: name the options that were given instead."""
+    """Errors name the arguments of Python functions and the keys of files: name the option that was given instead."""
     try:
         yield
     except (TypeError, ValueError) as error:
-        found = re.match(r"(?:the command line: sensor: )?(\w+)[.\w]*( must .*?)(?: \((?:int|float)\))?$", str(error))
+        # options replace the keys of [sensor], in a file as well
+        name = re.split(r"[.[]", getattr(error, "argument", "").removeprefix("sensor."))[0]
         for parameter in parameters:
             info = get_args(parameter.annotation)[1]
-            if found is not None and parameter.name == found[1] and isinstance(info, typer.models.OptionInfo):
-                option = info.default if isinstance(info.default, str) else f"--{parameter.name.replace('_', '-')}"
-                raise ValueError(f"{option}{found[2]}") from error
+            if parameter.name == name and isinstance(info, typer.models.OptionInfo):
+                option = info.default if isinstance(info.default, str) else f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} {vars(error)['problem']}") from error
         raise
 
 

@@ -328,8 +328,8 @@ class CalibrateOptions(RangeOptions):
     """Options of ``calibrate``."""
 
     frames: list[Path] = argument("One or more stacks of frames: TIFF, PNG, video ...")
-    frequency: float | None = option(
-        None, "Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."
+    flicker_frequency: float | None = option(
+        None, "Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency.", "--frequency"
     )
     exposure: list[float] | None = option(
         None,
@@ -397,13 +397,13 @@ def calibrate(given: CalibrateOptions) -> Answer:
                 scan_axis=axis,
                 readout_direction=given.readout_direction,
             )
-        elif given.frequency is None:
+        elif given.flicker_frequency is None:
             exposure = given.exposure or []
             result = calibration.calibrate_row_time_by_exposure(stack, exposure, scan_axis=axis, gamma=given.gamma)
         else:
             result = calibration.calibrate_row_time(
                 stack,
-                given.frequency,
+                given.flicker_frequency,
                 frame_rate=given.frame_rate,
                 on_fraction=given.on_fraction,
                 light_contrast=given.light_contrast,
@@ -436,16 +436,20 @@ def _check_given(given: CalibrateOptions) -> None:
     if not given.by_motion:
         if given.row_time or given.readout_direction is not None:
             raise ValueError("--row-time and --readout-direction of calibrate are limits for --by-motion")
-        if (given.frequency is None) == (not given.exposure):
+        if (given.flicker_frequency is None) == (not given.exposure):
             raise ValueError(
                 "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
                 "--by-motion and --frame-rate for frames of a vibrating camera"
             )
         return
-    for name in ("frequency", "on_fraction", "light_contrast"):
-        if getattr(given, name) is not None:
-            option = name.replace("_", "-")
-            raise ValueError(f"--{option} describes a flickering light; leave it out with --by-motion")
+    light = {
+        "--frequency": given.flicker_frequency,
+        "--on-fraction": given.on_fraction,
+        "--light-contrast": given.light_contrast,
+    }
+    for name, value in light.items():
+        if value is not None:
+            raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
     if given.frame_rate is None:
         raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
     if given.exposure and len(given.exposure) > 1:

@@ -239,7 +239,7 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         if not torch.compiler.is_compiling():
-            kinds = _hints(function)
+            kinds = hints_of(function)
             for name, value in (*zip(names, args, strict=False), *kwargs.items()):
                 if name in kinds:
                     _checked(name, value, kinds[name])
@@ -265,7 +265,7 @@ def check_fields(value: Any) -> None:
     Raises:
         TypeError: If a field has another type; numbers may be infinite or NaN.
     """
-    kinds = _hints(value.__class__)
+    kinds = hints_of(value.__class__)
     for name in (field.name for field in fields(value)):
         given = getattr(value, name)
         made = _checked(name, given, kinds[name], finite=False)
@@ -275,7 +275,7 @@ def check_fields(value: Any) -> None:
 
 
 @cache
-def _hints(owner: Any) -> dict[str, Any]:
+def hints_of(owner: Any) -> dict[str, Any]:
     """Annotations of the arguments of a function, or of the fields of a class."""
     given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
     if isinstance(owner, type):

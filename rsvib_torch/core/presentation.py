@@ -4,9 +4,7 @@ A result is a dataclass of tensors, numbers, texts and other results. ``Result``
 its own ``summary`` with the functions below.
 """
 
-import base64
 import html
-import io
 import itertools
 import math
 import os
@@ -25,7 +23,8 @@ from rsvib_torch.core.arguments import check_fields, check_shapes, checked_metho
 from rsvib_torch.core.checks import check_number, described, needed_package
 from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reason import texts
-from rsvib_torch.core.text import text_table, wrapped
+from rsvib_torch.core.result_files import figure_png, load_result, save_result, write_figure
+from rsvib_torch.core.text import data_uri, text_table, wrapped
 
 if TYPE_CHECKING:
     import pandas
@@ -296,8 +295,6 @@ class Result(Summarised):
         Raises:
             OSError: If the file cannot be written.
         """
-        from rsvib_torch.core.result_files import save_result  # noqa: PLC0415 - algorithms do not write files
-
         save_result(self, Path(path))
 
     @classmethod
@@ -311,8 +308,6 @@ class Result(Summarised):
             OSError: If the file cannot be opened.
             ValueError: If it does not contain a result of this class.
         """
-        from rsvib_torch.core.result_files import load_result  # noqa: PLC0415
-
         result: Self = load_result(cls, Path(path))
         return result
 
@@ -415,18 +410,14 @@ class Result(Summarised):
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
-            from rsvib_torch.core.result_files import save_figure  # noqa: PLC0415
-
-            save_figure(figure, Path(path))
+            write_figure(figure, path)
         return figure
 
     def _repr_html_(self) -> str:
         text = super()._repr_html_()
         if figure_of(type(self), len(self.batch_shape)) is None:
             return text
-        picture = io.BytesIO()
-        self.plot().savefig(picture, format="png", dpi=70, facecolor="white")
-        return f'{text}<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
+        return f'{text}<img src="{data_uri(figure_png(self.plot(), dpi=70), "image/png")}">'
 
 
 class JudgedResult(Result):

@@ -1,5 +1,6 @@
 """Numbers, tables and JSON as text, without torch."""
 
+import base64
 import json
 import math
 import shutil
@@ -145,6 +146,11 @@ def wrapped(text: str) -> str:
     """Text in lines of the width of the terminal, at most 100 characters; all but the first are indented."""
     width = min(100, shutil.get_terminal_size((100, 24)).columns) - 2  # an answer of the program is indented by 2
     return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    """Data URI of bytes of a MIME type."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def json_text(content: Mapping[str, Any]) -> str:

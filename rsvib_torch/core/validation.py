@@ -17,7 +17,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError, core_schema
 
-from rsvib_torch.core.checks import MAX_NUMBER, described
+from rsvib_torch.core.checks import MAX_NUMBER, Error, described, named
 from rsvib_torch.core.reading import read_text
 from rsvib_torch.core.text import one_line, quoted
 
@@ -32,6 +32,7 @@ _TYPE_NAMES: dict[Any, str] = {
     bool: "true or false",
     Sequence: "a sequence",
     Mapping: "a dictionary",
+    dict: "a dictionary",
     os.PathLike: "a path",
 }
 _CLASS_NAMES = {"Tensor": "a tensor", "ndarray": "a NumPy array"}
@@ -54,11 +55,7 @@ Count = Annotated[int, Field(ge=1, le=2**31)]
 
 
 class MistakesError(ValueError):
-    """Mistakes in one file.
-
-    Attributes:
-        lines: One line for each.
-    """
+    """Mistakes in one file; ``lines`` has one line for each."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self.lines = tuple(lines)
@@ -114,8 +111,7 @@ def options(group: type[_Group]) -> type[_Group]:
         try:
             initialise(self, **values)
         except ValidationError as error:
-            first = next(iter(_mistakes(made, values, error)))
-            raise first.in_python() from None
+            raise _mistakes(made, values, error)[0].in_python() from None
 
     made.__init__ = __init__
     return made  # type: ignore[no-any-return]
@@ -149,7 +145,9 @@ def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result
     try:
         return build(*args, **kwargs)
     except TypeError as error:
-        raise ValueError(str(error)) from error
+        changed = ValueError(str(error))
+        vars(changed).update(vars(error))
+        raise changed from error
 
 
 def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Result:
@@ -157,9 +155,10 @@ def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Res
     try:
         return TypeAdapter(model).validate_python(data, context={"file": source})
     except ValidationError as error:
-        lines = [mistake.in_file(source) for mistake in _mistakes(model, data, error)]
+        mistakes = _mistakes(model, data, error)
+        lines = [mistake.in_file(source) for mistake in mistakes]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        raise MistakesError([*lines[:_MAX_LINES], *more]) from error
+        raise mistakes[0].named(MistakesError([*lines[:_MAX_LINES], *more])) from error
 
 
 def validated(name: str, value: Any, adapter: TypeAdapter[Any], kind: Any) -> Any:
@@ -167,7 +166,7 @@ def validated(name: str, value: Any, adapter: TypeAdapter[Any], kind: Any) -> An
     try:
         return adapter.validate_python(_plain(value))
     except ValidationError as error:
-        mistake = next(iter(_mistakes(kind, value, error)))
+        mistake = _mistakes(kind, value, error)[0]
         mistake.path = f"{name}.{mistake.path}".removesuffix(".").replace(".[", "[")
         raise mistake.in_python() from None
 
@@ -185,16 +184,28 @@ class _Mistake:
     accepts_none: bool = False  # whether None is possible in Python
     kind: type[Exception] = ValueError  # the exception in Python
     is_bound: bool = False  # whether the value has the right type and is out of bounds
+    cause: Exception | None = None  # the error of a validator, which may state its argument
 
     def in_python(self) -> Exception:
         """The exception."""
         if self.known:
             return TypeError(f"unknown option {quoted(self.path)}; the options are {', '.join(self.known)}")
+        error = self.kind(self.text or f"{self.path} {self._problem} {described(self.value)}")
+        return self.named(error)
+
+    def named(self, error: Error) -> Error:
+        """An error with the argument that this mistake is about, for the options of commands."""
+        if self.cause is not None:
+            path = ".".join(filter(None, (self.path, getattr(self.cause, "argument", ""))))
+            return named(error, path, getattr(self.cause, "problem", str(self.cause)))
+        return error if self.text else named(error, self.path, f"{self._problem} {quoted(self.value)}")
+
+    @property
+    def _problem(self) -> str:
         if self.choices:
-            names = ", ".join(map(repr, self.choices))
-            return ValueError(f"{self.path} must be one of {names}; got {described(self.value)}")
-        expected = self.expected.replace("true or false", "True or False") + " or None" * self.accepts_none
-        return self.kind(self.text or f"{self.path} must be {expected}, got {described(self.value)}")
+            return f"must be one of {', '.join(map(repr, self.choices))}; got"
+        expected = self.expected.replace("true or false", "True or False")
+        return f"must be {expected}{' or None' * self.accepts_none}, got"
 
     def in_file(self, source: str) -> str:
         """The line about a file."""
@@ -204,14 +215,14 @@ class _Mistake:
         return f"{place}: {self.text or f'expected {self.expected}, got {quoted(self.value)}'}"
 
 
-def _mistakes(model: Any, data: Any, error: ValidationError) -> Iterable[_Mistake]:
+def _mistakes(model: Any, data: Any, error: ValidationError) -> list[_Mistake]:
     """The mistakes that pydantic found, one for each key: of the members of a union, that of the fitting type."""
     found: dict[str, _Mistake] = {}
     for entry in error.errors(include_url=False):
         mistake = _mistake(model, data, entry)
         if mistake.path not in found or (mistake.is_bound and not found[mistake.path].is_bound):
             found[mistake.path] = mistake
-    return found.values()
+    return list(found.values())
 
 
 def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
@@ -242,13 +253,14 @@ def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
     if kind == _NOT_AN_OPTION:
         return _Mistake(".".join(filter(None, (path, context["name"]))), text=context["message"], kind=TypeError)
     if kind == "value_error":
-        return _Mistake(path, text=str(context["error"]))
+        return _Mistake(path, text=str(context["error"]), cause=context["error"])
     if kind in _BOUNDS:
         return _Mistake(path, value, _BOUNDS[kind].format(**context), is_bound=True)
     choices = [member for member in members_of(expected) if get_origin(member) is Literal]
     only = tuple(name for member in choices for name in get_args(member)) if choices == [*members_of(expected)] else ()
     accepts_none = type(None) in get_args(expected)
-    return _Mistake(path, value, expected_text(expected), kind=TypeError, choices=only, accepts_none=accepts_none)
+    error = ValueError if only else TypeError
+    return _Mistake(path, value, expected_text(expected), kind=error, choices=only, accepts_none=accepts_none)
 
 
 def members_of(annotation: Any) -> tuple[Any, ...]:
@@ -293,7 +305,7 @@ def expected_text(annotation: Any) -> str:
         origin, arguments = get_origin(member), get_args(member)
         if origin is Literal:
             words.extend(repr(choice) for choice in arguments)
-        elif origin is list:
+        elif origin is list or (origin is tuple and arguments[-1] is ...):
             item = members_of(arguments[0])[0]
             words.append(f"a list of {_LIST_NAMES.get(item, 'lists' if get_origin(item) is list else 'tables')}")
         elif origin is tuple:

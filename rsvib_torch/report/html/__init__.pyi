@@ -1,5 +1,5 @@
 from .page import Box, Report, write_report_page
-from .template import BeforeAfter, Blink, Drawing, before_after, blink, data_uri, drawing, write_page
+from .template import BeforeAfter, Blink, Drawing, before_after, blink, drawing, write_page
 
 __all__ = [
     "BeforeAfter",
@@ -9,7 +9,6 @@ __all__ = [
     "Report",
     "before_after",
     "blink",
-    "data_uri",
     "drawing",
     "write_page",
     "write_report_page",

@@ -1,6 +1,5 @@
 """Self-contained HTML pages: images as data URIs, and templates that escape all text."""
 
-import base64
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.report.plots import figure_png, picture
+from rsvib_torch.core.result_files import figure_png
+from rsvib_torch.core.text import data_uri
+from rsvib_torch.report.plots import picture
 
 GreyLevels = tuple[float, float]  # values that are drawn black and white, full scale 1
 PERCENTILES = (0.2, 99.8)  # of the values of the images; few saturated or dead pixels do not reduce the contrast
@@ -65,11 +66,6 @@ class Blink:
     caption: str  # description
     width: int  # width of the images in px
     height: int  # height of the images in px
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    """Data URI of bytes of a MIME type."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def drawing(figure: Figure) -> Drawing:
