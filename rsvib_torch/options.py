@@ -387,12 +387,7 @@ METHOD_OPTIONS: dict[str, type] = {
 
 
 def method_options(method: str) -> tuple[str, ...]:
-    """Names of the options of a restoration method.
-
-    Example:
-        >>> method_options("dewarp")
-        ('chunk_rows',)
-    """
+    """Names of the options of a restoration method."""
     return tuple(fields_of(METHOD_OPTIONS[method]))
 
 

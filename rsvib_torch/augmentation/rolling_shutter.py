@@ -169,12 +169,7 @@ class ImageMotion:
 def _axis_ranges(
     name: str, value: Range, *, at_least: float = -math.inf
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Lowest and highest value of the axes x and y, from a number or a range for both or for each.
-
-    Example:
-        >>> _axis_ranges("amplitude", (1.0, 2.0))
-        ((1.0, 2.0), (1.0, 2.0))
-    """
+    """Lowest and highest value of the axes x and y, from a number or a range for both or for each."""
     if not isinstance(value, Sequence):
         number = check_number(name, value, at_least=at_least)
         return (number, number), (number, number)

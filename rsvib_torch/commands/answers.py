@@ -24,12 +24,7 @@ def command_text(*parts: str | Path) -> str:
 
 
 def _shell_word(text: str) -> str:
-    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are.
-
-    Example:
-        >>> _shell_word("a b"), _shell_word("a\nb")
-        ("'a b'", "$'a\\nb'")
-    """
+    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are."""
     if printable(text) == text:
         return shlex.quote(text)
     return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
@@ -141,11 +136,6 @@ def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> s
 
 
 def step_parts(step: str) -> tuple[str, str]:
-    r"""Sentence and command of a step; the command is empty if there is none.
-
-    Example:
-        >>> step_parts("restore the frames:\n  rsvib restore")
-        ('Restore the frames:', 'rsvib restore')
-    """
+    r"""Sentence and command of a step; the command is empty if there is none."""
     sentence, _, command = step.partition("\n")
     return f"{sentence[0].upper()}{sentence[1:]}{'' if command else '.'}", command.strip()

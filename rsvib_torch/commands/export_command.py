@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsvib_torch import detection, io, restoration
+from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
 from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new
@@ -82,8 +82,7 @@ def export(given: ExportOptions) -> Answer:
     frames = [] if given.frames is None else io.stack_files(given.frames)
     check_new([out], given.overwrite, [given.vibration, *frames, given.camera_isd])
     check_writable(out, folder=chosen == "stmap")
-    reports.read_vibration(given.vibration)  # its errors name what to give instead
-    detected = detection.DetectionResult.load(given.vibration)
+    detected = reports.load_detection(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)
         return Answer({"Offsets before and after correction": _residuals(detected)}, {"format": chosen}, [out])

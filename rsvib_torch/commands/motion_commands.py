@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -86,11 +85,9 @@ def motion(given: MotionOptions) -> Answer:
     if isinstance(result, detection.MotionDetection):
         rows, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
         columns |= {f"std_{name}": np.interp(times, rows, stds[:, axis]) for axis, name in enumerate("xy")}
-    with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
-        writer = csv.writer(text)
-        writer.writerow(columns)
-        for time, *row in np.column_stack(list(columns.values())):
-            writer.writerow([f"{time:.9f}", *(f"{value:.5f}" for value in row)])
+    digits = {"time": 9}
+    texts = {name: [f"{value:.{digits.get(name, 5)}f}" for value in values] for name, values in columns.items()}
+    reports.write_columns(out, texts)
     recording = ("--motion", out, "--unit", "px", "--offset", "0")
     restore_it = command_text("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *recording)
     return Answer(

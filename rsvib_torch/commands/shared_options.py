@@ -54,22 +54,12 @@ def seconds(text: str) -> float:
 
 
 def metres(text: str) -> float:
-    """A length in metres: a number with a unit.
-
-    Example:
-        >>> metres("12.5um"), metres("0.3 mm")
-        (1.25e-05, 0.0003)
-    """
+    """A length in metres: a number with a unit."""
     return _with_unit(text.replace(" ", ""), _LENGTH_UNITS, "a length with its unit such as 12.5um or 0.3mm")
 
 
 def rate(text: str) -> float:
-    """Frames per second: a number or a fraction.
-
-    Example:
-        >>> round(rate("30000/1001"), 6)
-        29.97003
-    """
+    """Frames per second: a number or a fraction."""
     return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 

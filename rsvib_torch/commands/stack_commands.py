@@ -305,15 +305,13 @@ def restore_frames(given: RestoreOptions) -> Answer:
 def _restore_windows(given: RestoreOptions) -> Answer:
     """Restore a stack with the detections of its windows."""
     from rsvib_torch.core.result_files import decode  # noqa: PLC0415
-    from rsvib_torch.motion.timing import SensorTiming  # noqa: PLC0415
-    from rsvib_torch.report.results import check_same_timing  # noqa: PLC0415
 
     vibration, timing = given.vibration, given.settings.timing
     manifest = stacks.read_manifest(vibration)
-    stored = decode(SensorTiming, manifest.settings.get("sensor"), f"{vibration}: settings.sensor")
+    stored = decode(rsvib_torch.SensorTiming, manifest.settings.get("sensor"), f"{vibration}: settings.sensor")
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
         timing = replace(timing, frame_start_times=stored.frame_start_times)
-    check_same_timing(str(vibration), stored, timing)
+    reports.check_same_timing(str(vibration), stored, timing)
     window = manifest.settings.get("window")
     if "video" in manifest.settings:
         raise ValueError(

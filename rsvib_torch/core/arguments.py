@@ -42,14 +42,7 @@ _PLAIN = (bool, float, str, type(None), object)  # types that pydantic checks it
 
 
 def check_tensor(name: str, value: object) -> Tensor:
-    """Return ``value`` if it is a dense tensor of real numbers that has data.
-
-    Example:
-        >>> check_tensor("frames", torch.zeros(2, 3, device="meta"))
-        Traceback (most recent call last):
-        ...
-        TypeError: frames must be a tensor with data, got a meta tensor; load the data onto a device first
-    """
+    """Return ``value`` if it is a dense tensor of real numbers that has data."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {described(value)}")
     if value.is_nested:
@@ -71,10 +64,6 @@ def as_numbers(name: str, value: object, device: torch.device | None = None) -> 
     """Return a copy of a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
 
     By default on the device of a tensor.
-
-    Example:
-        >>> as_numbers("amplitude", [3, 5]).dtype
-        torch.float64
     """
     if isinstance(value, Tensor):
         return check_tensor(name, value).to(dtype=torch.float64, device=device, copy=True)
@@ -143,14 +132,7 @@ def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
 
 
 def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> None:
-    """Check that tensors are floating-point images of the shapes of ``check_shapes``.
-
-    Example:
-        >>> check_images({"scene": torch.zeros(4, 5, dtype=torch.uint8)}, {"scene": "... H W"})
-        Traceback (most recent call last):
-        ...
-        TypeError: scene must be a floating-point tensor, got torch.uint8; divide counts by their full scale
-    """
+    """Check that tensors are floating-point images of the shapes of ``check_shapes``."""
     for name, image in images.items():
         if not image.is_floating_point():
             raise TypeError(
@@ -160,14 +142,7 @@ def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> Non
 
 
 def check_pixels(name: str, pixels: Tensor) -> None:
-    """Raise a ``ValueError`` if a pixel of a floating-point tensor is NaN, infinite or beyond all scales.
-
-    Example:
-        >>> check_pixels("frames", torch.tensor([[0.0, torch.inf]]))
-        Traceback (most recent call last):
-        ...
-        ValueError: frames must be finite, but pixel (0, 1) is inf
-    """
+    """Raise a ``ValueError`` if a pixel of a floating-point tensor is NaN, infinite or beyond all scales."""
     if not pixels.numel():
         return
     ends = torch.stack(pixels.detach().aminmax())  # one pass; propagates NaN and infinity
@@ -182,14 +157,7 @@ def check_pixels(name: str, pixels: Tensor) -> None:
 
 
 def check_broadcast(**tensors: Any) -> None:
-    """Raise a ``ValueError`` unless tensors broadcast; other values are omitted.
-
-    Example:
-        >>> check_broadcast(u=torch.zeros(3), v=torch.zeros(2))
-        Traceback (most recent call last):
-        ...
-        ValueError: u and v do not fit together: (3,), (2,)
-    """
+    """Raise a ``ValueError`` unless tensors broadcast; other values are omitted."""
     given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
     if len(given) < 2:
         return
@@ -201,12 +169,7 @@ def check_broadcast(**tensors: Any) -> None:
 
 
 def check_device(name: str, value: object) -> torch.device:
-    """Return ``value`` as a device on which tensors can be computed.
-
-    Example:
-        >>> check_device("device", "cpu")
-        device(type='cpu')
-    """
+    """Return ``value`` as a device on which tensors can be computed."""
     if not isinstance(value, (str, torch.device)):
         raise TypeError(f"{name} must be a device such as 'cpu' or 'cuda', got {described(value)}")
     try:

@@ -128,14 +128,7 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 
 
 def check_not_special(path: str | os.PathLike[str]) -> None:
-    """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one.
-
-    Example:
-        >>> check_not_special(os.devnull)
-        Traceback (most recent call last):
-        ...
-        FileExistsError: cannot write /dev/null: it is a device, pipe or socket; choose another name
-    """
+    """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise FileExistsError(f"cannot write {os.fspath(path)}: it is a device, pipe or socket; choose another name")
 

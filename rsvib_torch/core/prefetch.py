@@ -16,10 +16,6 @@ def prefetched(items: Generator[Item, None, None], count: int) -> Generator[Item
 
     The thread uses one thread of PyTorch. It ends with the generator, or when this one is closed. Errors are raised
     behind the items before them.
-
-    Example:
-        >>> list(prefetched((letter for letter in "abc"), 2))
-        ['a', 'b', 'c']
     """
     threads = torch.get_num_threads()
     pool = ThreadPoolExecutor(1, "rsvib-ahead", initializer=torch.set_num_threads, initargs=(1,))

@@ -23,8 +23,9 @@ from rsvib_torch.core.arguments import check_fields, check_shapes, checked_metho
 from rsvib_torch.core.checks import check_number, described, needed_package
 from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reason import texts
-from rsvib_torch.core.result_files import figure_png, load_result, save_result, write_figure
+from rsvib_torch.core.result_files import figure_png, result_of, save_result, write_figure
 from rsvib_torch.core.text import data_uri, text_table, wrapped
+from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
     import pandas
@@ -39,14 +40,7 @@ AXIS_UNITS = ("px", "px", "rad", "of the scale")
 
 
 def axis_rows(batch_shape: Sequence[int], axes: int = 2) -> list[tuple[tuple[int, ...], list[str]]]:
-    """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table.
-
-    Example:
-        >>> axis_rows(())
-        [((0,), ['x']), ((1,), ['y'])]
-        >>> axis_rows((1,))
-        [((0, 0), ['0', 'x']), ((0, 1), ['0', 'y'])]
-    """
+    """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table."""
     indices = itertools.product(*map(range, batch_shape), range(axes))
     return [(at, [", ".join(map(str, at[:-1]))] * bool(batch_shape) + [AXIS_NAMES[at[-1]]]) for at in indices]
 
@@ -71,12 +65,7 @@ def verdict_table(
 
 
 def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
-    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons.
-
-    Example:
-        >>> verdict_lines([True, False], [(), ("too short", "noisy")])
-        ['x: reliable', 'y: not reliable:', ' - too short', ' - noisy']
-    """
+    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons."""
     lines = []
     for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):
         lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
@@ -111,12 +100,7 @@ def plain_values(value: Any) -> Any:
 
 
 def joined_columns(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Columns of a table from its lines; a cell that a line does not have is None.
-
-    Example:
-        >>> joined_columns([{"axis": "x", "amplitude_px": 3.1}, {"axis": "y"}])
-        {'axis': ['x', 'y'], 'amplitude_px': [3.1, None]}
-    """
+    """Columns of a table from its lines; a cell that a line does not have is None."""
     names = dict.fromkeys(name for line in lines for name in line)
     return {name: [line.get(name) for line in lines] for name in names}
 
@@ -128,10 +112,6 @@ def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict
         amplitude: A in px.
         frequency: f in Hz.
         pixel_size: Size of a pixel in m.
-
-    Example:
-        >>> {name: round(value, 3) for name, value in physical_tone(2.0, 50.0, 10e-6).items()}
-        {'amplitude_um': 20.0, 'velocity_um_per_s': 6283.185, 'acceleration_m_per_s2': 1.974}
     """
     angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
     return {
@@ -157,12 +137,7 @@ Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dime
 
 
 def _dimensions(stated: str, count: int, name: str) -> tuple[str, ...]:
-    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``.
-
-    Example:
-        >>> _dimensions("... A=2-4 K", 3, "amplitude"), _dimensions("P 2", 2, "pairs")
-        (('index', 'axis', 'tone'), ('pair', 'pairs_2'))
-    """
+    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``."""
     symbols = [entry.partition("=")[0] for entry in stated.split() if "..." not in entry]
     batch = count - len(symbols)
     leading = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
@@ -308,7 +283,7 @@ class Result(Summarised):
             OSError: If the file cannot be opened.
             ValueError: If it does not contain a result of this class.
         """
-        result: Self = load_result(cls, Path(path))
+        result: Self = result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
         return result
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:

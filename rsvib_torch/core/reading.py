@@ -13,14 +13,7 @@ _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a d
 
 
 def check_regular(path: Path) -> None:
-    """Raise an error if a path is neither a regular file nor a folder: reading others can wait or go on forever.
-
-    Example:
-        >>> check_regular(Path("/dev/null"))
-        Traceback (most recent call last):
-        ...
-        ValueError: /dev/null: expected a regular file, this is a device
-    """
+    """Raise an error if a path is neither a regular file nor a folder: reading others can wait or go on forever."""
     mode = path.stat().st_mode
     for is_kind, name in _KINDS.items():
         if is_kind(mode):

@@ -135,12 +135,7 @@ def texts(findings: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def read_findings(values: Any) -> Any:
-    """Reasons in nested lists as JSON files have them.
-
-    Example:
-        >>> texts(read_findings([[], [{"code": "of a later version", "text": "blind"}]]))
-        ((), ('blind',))
-    """
+    """Reasons in nested lists as JSON files have them."""
     if isinstance(values, Mapping):
         return Reason.from_dict(values)
     if not isinstance(values, (list, tuple)):

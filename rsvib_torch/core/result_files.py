@@ -15,7 +15,7 @@ from rsvib_torch.core.arguments import check_fields, hints_of
 from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.reason import read_findings
 from rsvib_torch.core.text import quoted
-from rsvib_torch.core.validation import members_of, read_json
+from rsvib_torch.core.validation import members_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,9 +26,8 @@ def save_result(result: Any, path: Path) -> None:
     write_json(path, {"format": result.file_format, "version": 1, **result.to_dict(), "units": dict(result.units)})
 
 
-def load_result(kind: type[Any], path: Path) -> Any:
-    """Read a result of a class from a file that ``save_result`` wrote, see ``Result.load``."""
-    data = read_json(path, f"file of {kind.__name__}.save")
+def result_of(kind: type[Any], data: dict[str, Any], path: Path) -> Any:
+    """A result of a class from the content of a file that ``save_result`` wrote, see ``Result.load``."""
     if data.get("format") != kind.file_format or data.get("version") != 1:
         raise ValueError(
             f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "

@@ -84,44 +84,22 @@ def measured_text(
 
 
 def shortened(text: str, most: int = 1000) -> str:
-    """A text without its middle if it is longer than ``most`` characters: it may repeat an option, or what a file has.
-
-    Example:
-        >>> shortened("a" * 100 + "b", 8)
-        'aaaaaa…ab'
-    """
+    """A text without its middle if it is longer than ``most`` characters, as options and contents of files can be."""
     return text if len(text) <= most else f"{text[: most - most // 4]}…{text[-(most // 4) :]}"
 
 
 def one_line(message: object, most: int = 400) -> str:
-    """A message in one line of about ``most`` characters.
-
-    Example:
-        >>> one_line(" two  words ")
-        'two words'
-    """
+    """A message in one line of about ``most`` characters."""
     return shortened(" ".join(str(message).split()), most)
 
 
 def quoted(value: object) -> str:
-    """A value of the user in a message: as in Python, in at most 200 characters.
-
-    Example:
-        >>> quoted("a"), quoted([1.5]), len(quoted("a" * 10**6))
-        ("'a'", '[1.5]', 201)
-    """
+    """A value of the user in a message: as in Python, in at most 200 characters."""
     return one_line(repr(value), 200)
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:
-    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept.
-
-    Example:
-        >>> print(text_table(("axis", "amplitude (px)"), [("x", "3.1"), ("y", "5.2")]))
-        axis  amplitude (px)
-        x     3.1
-        y     5.2
-    """
+    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept."""
     rows = [tuple(row) for row in rows]
     if len(rows) > most:
         omitted = (f"… {len(rows) - most} more",) + ("",) * (len(head) - 1)
@@ -133,12 +111,7 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int 
 
 
 def number_of(count: int, noun: str) -> str:
-    """A number and its noun.
-
-    Example:
-        >>> number_of(1, "frame"), number_of(2, "frame")
-        ('1 frame', '2 frames')
-    """
+    """A number and its noun."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
