@@ -223,10 +223,6 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         same_on_batch: Whether all images share one draw.
         keepdim: Whether the output keeps the rank of the input.
 
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a range is out of bounds.
-
     Example:
         >>> timing = SensorTiming(row_time=20e-6, exposure_rows=20, frame_rows=1080)
         >>> augmentation = RollingShutterVibration(timing, amplitude=(0.5, 3.0), frequency=(40.0, 200.0))
@@ -309,9 +305,6 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
 
         Args:
             params: Parameters of another call (``augmentation._params`` after that call).
-
-        Raises:
-            ValueError: If nothing was drawn yet.
         """
         params = self._params if params is None else params
         if "amplitude" not in params:
@@ -334,11 +327,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Distort and blur images (B, C, H, W).
-
-        Raises:
-            ValueError: If the images appear to have their channels last.
-        """
+        """Distort and blur images (B, C, H, W)."""
         if channels_appear_last(input.shape):
             raise ValueError(
                 f"images of shape {tuple(input.shape)} appear to have their channels last: pass images.movedim(-1, -3)"

@@ -153,7 +153,6 @@ def calibrate_row_time(
         Row time with its standard deviation, and the other values that the arguments determine.
 
     Raises:
-        TypeError: If an argument is not a number.
         ValueError: If there is no flicker in the frames, it is too fast or too slow for the camera, or the frames are
             black or saturated.
 
@@ -227,10 +226,6 @@ def calibrate_row_time_by_exposure(
 
     Returns:
         Row time with its standard deviation, and the frequency of the strobe.
-
-    Raises:
-        TypeError: If an argument is not a number.
-        ValueError: If there are no bands, exposures do not fit the frames or are all the same.
     """
     exposures = [float(exposure) for exposure in exposure_times]
     profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)

@@ -7,20 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsvib_torch import detection, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.core.text import number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
-    from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
     from rsvib_torch.motion.detected_vibration import DetectedVibration
-    from rsvib_torch.stacks import RestoredFrames, StackManifest, StackReport
-
-
-def command_text(*parts: str | Path) -> str:
-    """A command line of the program that can be copied into a shell."""
-    return " ".join(["rsvib", *map(_shell_word, map(str, parts))])
 
 
 def _shell_word(text: str) -> str:
@@ -30,12 +24,14 @@ def _shell_word(text: str) -> str:
     return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
 
 
-def detection_data(result: DetectionResult) -> dict[str, Any]:
+def detection_data(result: detection.DetectionResult) -> dict[str, Any]:
     """A detection without its offset curve."""
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
 
 
-def verdicts(found: Sequence[DetectedVibration | MotionDetection | SweptTone | None]) -> dict[str, bool]:
+def verdicts(
+    found: Sequence[DetectedVibration | detection.MotionDetection | detection.SweptTone | None],
+) -> dict[str, bool]:
     """Whether each axis is reliable in all detections; None is one that failed."""
     from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415 - loads PyTorch
 
@@ -45,9 +41,9 @@ def verdicts(found: Sequence[DetectedVibration | MotionDetection | SweptTone | N
 
 def stack_answer(
     frames: Path,
-    found: DetectionResult,
+    found: detection.DetectionResult,
     pixel_size: float | None = None,
-    restored: RestoredFrames | None = None,
+    restored: stacks.RestoredFrames | None = None,
     count: int = 0,
 ) -> Answer:
     """The vibration in a stack, also in units of length if the size of a pixel in m is given, and its restoration."""
@@ -62,7 +58,10 @@ def stack_answer(
 
 
 def windows_answer(
-    title: str, manifest: StackManifest, report: StackReport | None = None, pixel_size: float | None = None
+    title: str,
+    manifest: stacks.StackManifest,
+    report: stacks.StackReport | None = None,
+    pixel_size: float | None = None,
 ) -> Answer:
     """The vibration in the windows of a stack, and what was restored."""
     vibration, restoration = manifest.lines(pixel_size)
@@ -72,7 +71,7 @@ def windows_answer(
     return answer
 
 
-def warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
+def warn_of_restoration(result: stacks.RestoredFrames, output: str = "frames") -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     forced = "writes" if output == "frames" else "shows"
@@ -83,7 +82,7 @@ def warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
         error_line(result.verdict.sentence + unchanged, "warning")
 
 
-def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
+def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
     """What was restored of ``count`` frames and its gain, and which axes were left unchanged and why."""
     frames = number_of(count, "frame") if len(result.frames) == count else f"1 image of {number_of(count, 'frame')}"
     if not result.restored:
@@ -106,24 +105,24 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     return [wrapped(line) for line in lines]
 
 
-def next_step(sentence: str, command: str) -> str:
-    """A step: a sentence, and the command that does it."""
-    return f"{sentence}:\n  {command}"
+def next_step(sentence: str, *command: object) -> str:
+    """A step: a sentence, and the command that does it, which can be copied into a shell."""
+    return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
 
 
 def steps_after_detection(
-    result: DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
+    result: detection.DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
     """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
     steps = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
         target = frames.with_name("restored.tif")
-        restore = command_text("restore", frames, target, *settings.arguments, "--vibration", vibration)
-        steps.append(next_step("restore the frames", restore))
+        restore = ("restore", frames, target, *settings.arguments, "--vibration", vibration)
+        steps.append(next_step("restore the frames", *restore))
     reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
-        motion = command_text("motion", frames, *settings.arguments, "--out", "motion.csv")
-        steps.append(next_step("detect a motion that is not a steady vibration (model='free')", motion))
+        motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
+        steps.append(next_step("detect a motion that is not a steady vibration (model='free')", *motion))
     if reasons:
         steps.append("follow the remedies that the reasons above name")
     return steps
@@ -131,8 +130,8 @@ def steps_after_detection(
 
 def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
     """The step to write a page about a restored stack."""
-    page = command_text("report", frames, out, *settings.arguments, *more)
-    return next_step("write a page with all figures and the sharpness before and after", page)
+    sentence = "write a page with all figures and the sharpness before and after"
+    return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 
 def step_parts(step: str) -> tuple[str, str]:

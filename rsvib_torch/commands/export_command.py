@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import rsvib_torch
 from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
 from rsvib_torch.commands.flat_command import argument, option
@@ -15,11 +16,6 @@ from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.validation import options, read_json
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
-
-if TYPE_CHECKING:
-    from rsvib_torch.detection import DetectionResult
-    from rsvib_torch.motion.timing import SensorTiming
-    from rsvib_torch.motion.vibration import Vibration
 
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
 
@@ -101,9 +97,8 @@ def export(given: ExportOptions) -> Answer:
         written = reports.write_isd(
             out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
         )
-        form = (
-            "frame camera with jitter polynomials" if written == "frame" else "line scanner with one quaternion per row"
-        )
+        form = "frame camera with jitter polynomials"
+        form = form if written == "frame" else "line scanner with one quaternion per row"
         data |= {"model": written, "frame": given.frame}
         return Answer({"Sensor model": [f"frame {given.frame} as a {form}"]}, data, [out])
     shape, count = _extent(given)
@@ -131,14 +126,10 @@ def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
     return size, count
 
 
-def _trusted(given: ExportOptions, detected: DetectionResult, timing: SensorTiming, count: int, rows: int) -> Vibration:
-    """The accurate part of a detected vibration, or all of it with ``force``, with a camera if a focal length is given.
-
-    Raises:
-        ValueError: If nothing of it is accurate enough, or there are two focal lengths.
-    """
-    from rsvib_torch.motion.camera import Camera  # noqa: PLC0415
-
+def _trusted(
+    given: ExportOptions, detected: rsvib_torch.DetectionResult, timing: rsvib_torch.SensorTiming, count: int, rows: int
+) -> rsvib_torch.Vibration:
+    """The accurate part of a detected vibration, or all of it with ``force``; with a camera if its lens is given."""
     motion = detected.vibration
     if not given.force:
         motion, reasons = restoration.trusted_vibration(detected, timing, count, rows)
@@ -155,10 +146,10 @@ def _trusted(given: ExportOptions, detected: DetectionResult, timing: SensorTimi
         raise ValueError(
             f"the vibration was detected with focal_length={motion.camera.focal_length:g} px; omit --focal-length"
         )
-    return motion.with_camera(Camera(given.focal_length))
+    return motion.with_camera(rsvib_torch.Camera(given.focal_length))
 
 
-def _residuals(detected: DetectionResult) -> list[str]:
+def _residuals(detected: rsvib_torch.DetectionResult) -> list[str]:
     """A line for each axis: root mean square of the offsets and of the residuals."""
     from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415
 

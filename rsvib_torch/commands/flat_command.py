@@ -88,22 +88,15 @@ def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:
     """Name of each field of a command with its parameters: arguments, own options, then those that commands share."""
     depth = {name: place for place, kind in enumerate(group.__mro__) for name in inspect.get_annotations(kind)}
     fields = fields_of(group)
-    for name in sorted(fields, key=lambda name: -1 if _is_argument(fields[name]) else depth[name]):
-        mark = next((mark for mark in fields[name].metadata if isinstance(mark, Given)), None)
+    forms = {name: {"text": stated.description, **(stated.json_schema_extra or {})} for name, stated in fields.items()}
+    for name in sorted(fields, key=lambda name: -1 if forms[name].get("positional") else depth[name]):
+        stated = fields[name]
+        mark = next((mark for mark in stated.metadata if isinstance(mark, Given)), None)
         if mark is not None:
             yield from ((name, parameter) for parameter in mark.parameters())
         else:
-            stated = fields[name]
             default = inspect.Parameter.empty if stated.is_required() else stated.default
-            yield name, _parameter(name, stated.annotation, default, {"text": stated.description, **_form(stated)})
-
-
-def _form(stated: Any) -> dict[str, Any]:
-    return stated.json_schema_extra or {}
-
-
-def _is_argument(stated: Any) -> bool:
-    return bool(_form(stated).get("positional"))
+            yield name, _parameter(name, stated.annotation, default, forms[name])
 
 
 @contextmanager

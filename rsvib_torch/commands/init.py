@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsvib_torch import io
-from rsvib_torch.commands.answers import command_text, next_step
+from rsvib_torch.commands.answers import next_step
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_rate
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
@@ -85,8 +85,8 @@ def init(given: InitOptions) -> Answer:
         text = _describe_camera(frames, sensor, camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
-    step = command_text("run", frames or "FRAMES", "results", "--config", out)
-    return Answer({}, {}, [out], [next_step("detect the vibration and restore the frames", step)])
+    run = ("run", frames or "FRAMES", "results", "--config", out)
+    return Answer({}, {}, [out], [next_step("detect the vibration and restore the frames", *run)])
 
 
 def _first_comment(text: str) -> str:

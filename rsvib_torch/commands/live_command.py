@@ -27,8 +27,6 @@ from rsvib_torch.options import BorderName, TrackerOptions, method_options
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
-    from rsvib_torch.live import FrameOutput, FrameSource, LiveReport
-    from rsvib_torch.tracking import TrackedFrame
 
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 _AT_LEAST_2 = Annotated[int, Field(ge=2)]
@@ -156,7 +154,7 @@ def live_session(given: LiveOptions) -> Answer:
     return _answer(given.source, report, [*files, *saved], drops=drops)
 
 
-def _source(given: LiveOptions, settings: Config) -> FrameSource:
+def _source(given: LiveOptions, settings: Config) -> live.FrameSource:
     """The source of the frames."""
     if given.is_camera:
         return live.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
@@ -184,9 +182,9 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
 
 
-def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[FrameOutput]:
+def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[live.FrameOutput]:
     """The outputs that the options name."""
-    outputs: list[FrameOutput] = []
+    outputs: list[live.FrameOutput] = []
     if given.written is not None:
         outputs.append(live.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
     if stream is not None:
@@ -227,7 +225,7 @@ class _StateText:
     def __init__(self, page: live.PageOutput) -> None:
         self._page, self._next, self._lock = page, 0.0, threading.Lock()
 
-    def __call__(self, tracked: TrackedFrame, report: LiveReport) -> None:
+    def __call__(self, tracked: tracking.TrackedFrame, report: live.LiveReport) -> None:
         now = time.perf_counter()
         if now < self._next:
             return
@@ -237,7 +235,7 @@ class _StateText:
         self._page.show_state("\n".join([*lines, *([] if found is None else [found.summary()])]))
 
 
-def _missing(report: LiveReport) -> str:
+def _missing(report: live.LiveReport) -> str:
     parts = []
     if report.dropped:
         parts.append(f"{number_of(report.dropped, 'frame')} dropped, because processing was too slow (fewer --columns)")
@@ -246,7 +244,7 @@ def _missing(report: LiveReport) -> str:
     return "; ".join(parts)
 
 
-def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) -> Answer:
+def _answer(source: str, report: live.LiveReport, files: list[Path], *, drops: bool) -> Answer:
     rate = report.frames / report.seconds
     lines = [
         f"{number_of(report.frames, 'frame')} in {report.seconds:.1f} s ({rate:.1f} per second), "

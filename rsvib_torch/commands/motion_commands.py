@@ -10,20 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import command_text, next_step, restoration_lines, verdicts
+from rsvib_torch.commands import shared_options as shared
+from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
-from rsvib_torch.commands.shared_options import (
-    SENSOR_FORMS,
-    TIME,
-    PixelSizeOptions,
-    RangeOptions,
-    StackCommand,
-    VerdictOptions,
-    check_new,
-    restored_argument,
-    restored_shape,
-)
 from rsvib_torch.commands.stack_commands import load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.core.atomic import check_writable, whole_file
@@ -34,16 +24,11 @@ from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit,
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rsvib_torch.calibration import RowTimeCalibration
     from rsvib_torch.core.presentation import Result
-    from rsvib_torch.detection import MotionCheck, MotionDetection, SweptTone
-    from rsvib_torch.motion.gyroscope_rates import AngularRates
-    from rsvib_torch.motion.spline import FreeMotion
-    from rsvib_torch.motion.timing import SensorTiming
 
 
 @options
-class MotionOptions(StackCommand, VerdictOptions):
+class MotionOptions(shared.StackCommand, shared.VerdictOptions):
     """Options of ``motion``."""
 
     out: Path = option(..., "CSV file to write: time in s, x and y in px, and their standard deviations (model free).")
@@ -64,11 +49,11 @@ def motion(given: MotionOptions) -> Answer:
     import torch  # noqa: PLC0415
 
     out, frames = given.out, given.stack
-    check_new([out], given.overwrite, given.inputs)
+    shared.check_new([out], given.overwrite, given.inputs)
     check_writable(out)
     chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
     stack = load(given)
-    result: MotionDetection | SweptTone
+    result: detection.MotionDetection | detection.SweptTone
     with working("detecting the motion"):
         if given.model == "free":
             result = detection.detect_motion(stack.frames, stack.timing, **chosen)
@@ -88,13 +73,13 @@ def motion(given: MotionOptions) -> Answer:
     digits = {"time": 9}
     texts = {name: [f"{value:.{digits.get(name, 5)}f}" for value in values] for name, values in columns.items()}
     reports.write_columns(out, texts)
-    recording = ("--motion", out, "--unit", "px", "--offset", "0")
-    restore_it = command_text("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *recording)
+    known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
+    restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
     return Answer(
         {f"Motion in {frames.name}": [result.summary()]},
         {"motion": _without_curve(result), "columns": list(columns)},
         [out],
-        [next_step("restore the frames", restore_it)] * bool(result.reliable.any()),
+        [next_step("restore the frames", *restore)] * bool(result.reliable.any()),
         verdicts([result]),
     )
 
@@ -108,10 +93,10 @@ def _without_curve(result: Result) -> dict[str, Any]:
 
 
 @options
-class KnownOptions(StackCommand):
+class KnownOptions(shared.StackCommand):
     """Options of ``known``."""
 
-    restored: Path = restored_argument()
+    restored: Path = shared.restored_argument()
     motion: Path = option(
         ...,
         "CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow "
@@ -156,20 +141,18 @@ def known(given: KnownOptions) -> Answer:
     frames, and refused if it does not explain them. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given.
     """
-    check_new(io.stack_files(given.restored), given.overwrite, [*given.inputs, given.motion])
-    from rsvib_torch.motion.spline import FreeMotion  # noqa: PLC0415
-
+    shared.check_new(io.stack_files(given.restored), given.overwrite, [*given.inputs, given.motion])
     recorded = _recorded(given)
     camera = None
     if given.unit is None and given.focal_length is not None:
         camera = rsvib_torch.Camera(given.focal_length)
     info, scale, options = given.planned_restoration()
-    shape = restored_shape(info, options)
+    shape = shared.restored_shape(info, options)
     io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     results: dict[str, list[str]] = {}
     data: dict[str, Any] = {"alignment": None, "check": None}
     stack = load(given, options)
-    if given.offset is None or not isinstance(recorded, FreeMotion):
+    if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
         with working("aligning the recording"):
             found = detection.align_motion(
                 stack.frames,
@@ -196,8 +179,8 @@ def known(given: KnownOptions) -> Answer:
                 f"{given.offset + first:.6g} to {given.offset + last:.6g} s"
             )
     check = None
-    if isinstance(recorded, FreeMotion):  # rates were compared by the alignment
-        check = _check_motion(given, stack.frames, stack.timing, placed)
+    if isinstance(recorded, rsvib_torch.FreeMotion):  # rates were compared by the alignment
+        check = _check_motion(given, stack, placed)
     if check is not None:
         results["Motion of the frames"] = [check.summary()]
         data["check"] = _without_curve(check)
@@ -207,7 +190,7 @@ def known(given: KnownOptions) -> Answer:
     return Answer(results, data, [given.restored])
 
 
-def _recorded(given: KnownOptions) -> FreeMotion | AngularRates:
+def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The recording."""
     if given.offset is not None and given.offsets is not None:
         raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
@@ -229,7 +212,7 @@ def _recorded(given: KnownOptions) -> FreeMotion | AngularRates:
     return rsvib_torch.read_gyroscope(given.motion)
 
 
-def _with_row_time(timing: SensorTiming, row_time: float) -> SensorTiming:
+def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float) -> rsvib_torch.SensorTiming:
     """The timing with another row time, and the same exposure and frame period in seconds."""
     rows = timing.row_time / row_time
     return replace(
@@ -245,17 +228,17 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
         error_line(reason, "warning")
 
 
-def _check_motion(given: KnownOptions, frames: Tensor, timing: SensorTiming, motion: FreeMotion) -> MotionCheck | None:
+def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMotion) -> detection.MotionCheck | None:
     """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
 
     If the clock is stated, an error of the comparison is a warning.
     """
-    if len(frames) < 2:
+    if len(stack.frames) < 2:
         error_line("cannot determine whether the motion fits: the comparison needs two frames", "warning")
         return None
     try:
         with working("comparing the motion"):
-            check = detection.check_motion(frames, timing, motion)
+            check = detection.check_motion(stack.frames, stack.timing, motion)
     except ValueError as error:
         if given.offset is None:
             raise
@@ -270,7 +253,7 @@ def _check_motion(given: KnownOptions, frames: Tensor, timing: SensorTiming, mot
 
 
 @options
-class CompareOptions(PixelSizeOptions):
+class CompareOptions(shared.PixelSizeOptions):
     """Options of ``compare``."""
 
     vibration: Path = argument("The vibration.json written by detect or run.")
@@ -300,7 +283,7 @@ def compare(given: CompareOptions) -> Answer:
     from rsvib_torch.motion.recorded import read_acceleration  # noqa: PLC0415
 
     if given.out is not None:
-        check_new([given.out], given.overwrite, [given.vibration, given.record])
+        shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
     times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
@@ -321,7 +304,7 @@ def compare(given: CompareOptions) -> Answer:
 
 
 @options
-class CalibrateOptions(RangeOptions):
+class CalibrateOptions(shared.RangeOptions):
     """Options of ``calibrate``."""
 
     frames: list[Path] = argument("One or more stacks of frames: TIFF, PNG, video ...")
@@ -332,21 +315,21 @@ class CalibrateOptions(RangeOptions):
         None,
         "Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, "
         "if known.",
-        **TIME,
+        **shared.TIME,
     )
     by_motion: bool = option(False, "Use the motion of the camera instead of a light; needs --frame-rate.")
     row_time: list[float] | None = option(
         None,
         "With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us.",
         show_default="a readout within a tenth to the whole of the frame period",
-        **TIME,
+        **shared.TIME,
     )
     readout_direction: Literal["forward", "reverse"] | None = option(
         None,
-        f"With --by-motion, if known. {SENSOR_FORMS['readout_direction']['text']}",
+        f"With --by-motion, if known. {shared.SENSOR_FORMS['readout_direction']['text']}",
         show_default="determined from the frames",
     )
-    frame_rate: float | None = option(None, **SENSOR_FORMS["frame_rate"])
+    frame_rate: float | None = option(None, **shared.SENSOR_FORMS["frame_rate"])
     on_fraction: float | None = option(
         None, "Duty cycle of a light that is switched on and off; determines the exposure time."
     )
@@ -371,7 +354,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     _check_given(given)
     paths = [given.part_of(path) for path in given.frames]
     if given.out is not None:
-        check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
+        shared.check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
         check_writable(given.out)
     infos = [io.read_stack_info(path) for path in paths]
     for path, info in zip(paths, infos, strict=True):
@@ -418,8 +401,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     else:
         with whole_file(given.out) as file:
             file.write_text(table, encoding="utf-8")
-        detect_it = command_text("detect", "FRAMES", "--config", given.out, "--out", "FOLDER")
-        steps.append(next_step("detect a vibration", detect_it))
+        steps.append(next_step("detect a vibration", "detect", "FRAMES", "--config", given.out, "--out", "FOLDER"))
     return Answer(
         {"Camera": [result.summary(), f"{rows} rows are read in {readout} ms"], "Configuration": [table]},
         {"calibration": _without_curve(result)},
@@ -455,7 +437,7 @@ def _check_given(given: CalibrateOptions) -> None:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
 
 
-def _calibrated_toml(result: RowTimeCalibration, scan_axis: str) -> str:
+def _calibrated_toml(result: calibration.RowTimeCalibration, scan_axis: str) -> str:
     """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
     period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {

@@ -119,11 +119,7 @@ class DeviceOptions:
 
     @cached_property
     def torch_device(self) -> "torch.device":
-        """The device.
-
-        Raises:
-            ValueError: If there is no CUDA device.
-        """
+        """The device."""
         import torch  # noqa: PLC0415
 
         if self.device == "cuda" and not torch.cuda.is_available():
@@ -214,14 +210,10 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
     def planned_restoration(
         self, given: Mapping[str, Any] | None = None
     ) -> "tuple[StackInfo, float | None, dict[str, Any]]":
-        """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``.
-
-        Raises:
-            ValueError: If a value is out of range.
-        """
+        """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
         info = io.read_stack_info(self.stack)
         scale = full_scale_of(self.stack, info, self.settings, self.full_scale)
-        return info, scale, _restoration_options(info, scale, self.settings, given or {})
+        return info, scale, _restoration_options(info, scale, self.settings.restoration, given or {})
 
 
 @options
@@ -317,11 +309,7 @@ def check_new(
 
 
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
-    """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration.
-
-    Raises:
-        ValueError: If file and configuration differ and there is no option.
-    """
+    """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration."""
     if option is not None or not info.is_integer:
         return option
     if info.full_scale is None:
@@ -335,10 +323,10 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
 
 
 def _restoration_options(
-    info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any]
+    info: "StackInfo", full_scale: float | None, options: Mapping[str, Any], given: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
-    options, given = dict(config.restoration), dict(given)
+    options, given = dict(options), dict(given)
     method = given.get("method", options.get("method", "exact"))
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
@@ -350,13 +338,10 @@ def _restoration_options(
         given["joint"] = given["joint"] == "all" or int(given["joint"])
     options |= given
     checked = RestorationOptions(**options)
-    if options.get("saturation", "auto") == "auto":
-        options.pop("saturation", None)
-    if options.get("saturation") is not None:
-        if info.is_integer and full_scale is not None:
-            options["saturation"] /= full_scale
-    elif info.is_integer and full_scale is not None:
-        options["saturation"] = 1.0
+    if options.get("saturation") == "auto":
+        del options["saturation"]
+    if info.is_integer and full_scale is not None:  # of frames whose full scale is 1
+        options["saturation"] = (options.get("saturation") or full_scale) / full_scale
     if checked.mosaic is not None:
         from rsvib_torch.frames.mosaic import check_mosaic  # noqa: PLC0415
 

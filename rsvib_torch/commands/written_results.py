@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import rsvib_torch
 from rsvib_torch import io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
@@ -16,8 +17,6 @@ from rsvib_torch.core.text import number_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rsvib_torch.detection import DetectionResult
-    from rsvib_torch.motion.timing import SensorTiming
 
 OF_DETECTION = ("vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png")
 OF_WINDOWS = ("manifest.json", "tones.csv", "windows.json", "windows.png")
@@ -49,7 +48,7 @@ def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
 
 
 def write_detection(
-    folder: Path, result: DetectionResult, timing: SensorTiming, pixel_size: float | None = None
+    folder: Path, result: rsvib_torch.DetectionResult, timing: rsvib_torch.SensorTiming, pixel_size: float | None = None
 ) -> list[str]:
     """Write a detection as JSON, tables and figures, and return the names of the files."""
     with working("drawing the offset curve"):

@@ -223,11 +223,7 @@ def checked_methods(kind: type[R]) -> type[R]:
 
 
 def check_fields(value: Any) -> None:
-    """Check the types of the fields of a dataclass against their annotations; lists become tuples, tensors are copied.
-
-    Raises:
-        TypeError: If a field has another type; numbers may be infinite or NaN.
-    """
+    """Check the fields of a dataclass against their annotations; lists become tuples, tensors are copied."""
     kinds = hints_of(value.__class__)
     for name in (field.name for field in fields(value)):
         given = getattr(value, name)

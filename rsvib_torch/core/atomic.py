@@ -218,10 +218,6 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-    """Write a table as JSON with one key per line, atomically.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Write a table as JSON with one key per line, atomically."""
     with whole_file(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")

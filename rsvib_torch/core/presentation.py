@@ -266,9 +266,6 @@ class Result(Summarised):
 
         Args:
             path: The file to write; its folder must exist.
-
-        Raises:
-            OSError: If the file cannot be written.
         """
         save_result(self, Path(path))
 
@@ -278,10 +275,6 @@ class Result(Summarised):
 
         Args:
             path: The file.
-
-        Raises:
-            OSError: If the file cannot be opened.
-            ValueError: If it does not contain a result of this class.
         """
         result: Self = result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
         return result
@@ -305,10 +298,6 @@ class Result(Summarised):
 
         Args:
             pixel_size: As in ``table``.
-
-        Raises:
-            ModuleNotFoundError: If pandas is not installed, with the extra to install.
-            TypeError: If this kind of result has no table.
         """
         frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
             self.table(pixel_size=pixel_size)
@@ -320,9 +309,6 @@ class Result(Summarised):
 
         Tensors of a result within this one have the name of its field in front (``std_amplitude``); those of a motion
         have their own. ``index`` counts the results of a batch.
-
-        Raises:
-            ModuleNotFoundError: If xarray is not installed, with the extra to install.
         """
         package = needed_package("xarray", "to_xarray", "tables")
         variables = dict(self._variables(()))
@@ -369,11 +355,6 @@ class Result(Summarised):
 
         Returns:
             The figure, which notebooks show.
-
-        Raises:
-            OSError: If the picture cannot be written.
-            TypeError: If there is no figure of this kind of result.
-            ValueError: If it is a batch that has no figure.
         """
         draw = figure_of(type(self), len(self.batch_shape))
         if draw is None:

@@ -18,6 +18,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch import detection
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_single
@@ -26,16 +27,7 @@ from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
 from rsvib_torch.core.result_files import figure_png, write_figure
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import Count
-from rsvib_torch.detection import (
-    AccelerometerComparison,
-    ClockAlignment,
-    DetectionResult,
-    DisplacementSpectrum,
-    MotionCheck,
-    MotionDetection,
-    RotationAlignment,
-    SweptTone,
-)
+from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
@@ -91,9 +83,6 @@ def save_figure(
         figure: The figure.
         path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
         dpi: Pixels per inch.
-
-    Raises:
-        OSError: If the file cannot be written.
     """
     write_figure(figure, path, dpi)
 
@@ -353,7 +342,7 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     return figure
 
 
-def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
+def _title_refusal(panel: Axes, result: detection.MotionDetection | detection.SweptTone) -> None:
     """State above a figure which axes are not reliable, with the first reason."""
     lines = [
         textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
@@ -363,13 +352,13 @@ def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
     panel.set_title("\n".join(lines), **_TITLE)
 
 
-def _swept_figure(result: SweptTone) -> Figure:
+def _swept_figure(result: detection.SweptTone) -> Figure:
     figure = motion_figure(result.motion)
     _title_refusal(figure.axes[0], result)
     return figure
 
 
-def free_motion_figure(result: MotionDetection) -> Figure:
+def free_motion_figure(result: detection.MotionDetection) -> Figure:
     """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
     figure, ((panel,),) = _panels(8, 3.6)
     for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
@@ -689,7 +678,7 @@ _BLIND_COLOUR = "#ececec"
 _LABELLED_LINES = 6  # per axis; more labels would cover each other
 
 
-def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
+def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     """Draw amplitude spectrum and power spectral density of each axis, their noise, and the blind bands in grey."""
     axes = len(result.amplitude)
     figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True)
@@ -731,7 +720,7 @@ def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
     return figure
 
 
-def _check_figure(result: MotionCheck) -> Figure:
+def _check_figure(result: detection.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
     figure, panels = _two_panels()
     for axis, name, panel in panels:
@@ -747,7 +736,7 @@ def _check_figure(result: MotionCheck) -> Figure:
     return figure
 
 
-def _accelerometer_figure(result: AccelerometerComparison) -> Figure:
+def _accelerometer_figure(result: detection.AccelerometerComparison) -> Figure:
     """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
     figure, panels = _two_panels()
     times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
@@ -763,7 +752,7 @@ def _accelerometer_figure(result: AccelerometerComparison) -> Figure:
     return figure
 
 
-def _rotation_figure(result: RotationAlignment) -> Figure:
+def _rotation_figure(result: detection.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
     times = result.times.cpu()
@@ -784,14 +773,14 @@ FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
-        (DisplacementSpectrum, 0): _spectrum_figure,
-        (MotionDetection, 0): free_motion_figure,
-        (SweptTone, 0): _swept_figure,
+        (detection.DisplacementSpectrum, 0): _spectrum_figure,
+        (detection.MotionDetection, 0): free_motion_figure,
+        (detection.SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,
-        (ClockAlignment, 0): lambda result: motion_figure(result.motion),
-        (RotationAlignment, 0): _rotation_figure,
-        (MotionCheck, 0): _check_figure,
-        (AccelerometerComparison, 0): _accelerometer_figure,
+        (detection.ClockAlignment, 0): lambda result: motion_figure(result.motion),
+        (detection.RotationAlignment, 0): _rotation_figure,
+        (detection.MotionCheck, 0): _check_figure,
+        (detection.AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(

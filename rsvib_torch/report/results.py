@@ -31,9 +31,6 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         path: The file to write; an existing file is replaced.
         result: A detection (not a batch).
         timing: The sensor; by default ``result.timing``.
-
-    Raises:
-        ValueError: If the result is a batch, or the timing is unknown.
     """
     check_single("result", result)
     timing = timing or result.timing
@@ -149,9 +146,6 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
         path: The file to write; an existing file is replaced.
         result: A result that has a table. Its unknown values are empty cells.
         pixel_size: Size of a pixel in m, to add columns in um, um/s and m/s^2.
-
-    Raises:
-        TypeError: If the result has no table.
 
     Example:
         >>> import tempfile

@@ -101,9 +101,6 @@ class MtfCurve(
 
         Returns:
             float64 tensor in the shape of ``frequency``.
-
-        Raises:
-            ValueError: If a frequency is negative, above 1 or not finite.
         """
         if not isinstance(frequency, Tensor):
             check_number("frequency", frequency, at_least=0.0, at_most=1.0)
@@ -135,7 +132,6 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
         The curve up to 1 cycle/px, with MTF50, standard deviations, and the spread functions.
 
     Raises:
-        TypeError: If the ROI does not hold real numbers.
         ValueError: If it is not one finite image, too small, contains no edge, the edge is not slanted or too close to
             45 degrees or to a border alongside it, or is clipped.
 

@@ -90,10 +90,6 @@ def find_slanted_edges(
     Returns:
         The edges, those of the largest contrast times length first; no two of them overlap by more than half.
 
-    Raises:
-        TypeError: If the image does not hold real numbers.
-        ValueError: If it is not one finite image, or an option is out of range.
-
     Example:
         >>> from rsvib_torch.evaluation import resolution_chart
         >>> edges = find_slanted_edges(resolution_chart(512, 512))

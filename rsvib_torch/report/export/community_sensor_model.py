@@ -79,9 +79,6 @@ def camera_isd(
     Returns:
         The ISD, which ``json.dump`` can write.
 
-    Raises:
-        ValueError: If the look direction is zero, or a number is out of range.
-
     Example:
         >>> isd = camera_isd(Camera(2e5), (1024, 1024), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
         >>> isd["focal_length_model"], isd["detector_center"]
@@ -174,7 +171,6 @@ def write_isd(
         The model that was written.
 
     Raises:
-        OSError: If a file cannot be read or written.
         ValueError: If the motion is a batch, the ISD lacks a field or has another focal length, columns are exposed one
             after another, or no permitted model is accurate enough; the message states the errors and their reasons.
 

@@ -262,10 +262,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
 
     Returns:
         Names of the files.
-
-    Raises:
-        OSError: If a file cannot be written.
-        ValueError: If an edge is not inside the frame.
     """
     result, timing = report.detection, report.timing
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
