@@ -14,7 +14,7 @@ from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
-from rsvib_torch.commands.stack_commands import load, restore_and_save
+from rsvib_torch.commands.stack_commands import Stack, load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, error_line, note, working
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.text import measured_text
@@ -22,7 +22,6 @@ from rsvib_torch.core.validation import options
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
 
 if TYPE_CHECKING:
-    from torch import Tensor
 
     from rsvib_torch.core.presentation import Result
 
