@@ -22,7 +22,6 @@ from rsvib_torch.core.validation import options
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
 
 if TYPE_CHECKING:
-
     from rsvib_torch.core.presentation import Result
 
 

@@ -1,4 +1,4 @@
-"""Functions whose options are a group, and flat keyword arguments for their callers."""
+"""Functions whose options are a group, with flat keyword arguments for their callers."""
 
 import inspect
 from collections.abc import Callable
@@ -17,26 +17,20 @@ def flat_options(
     Its signature and its docstring list them; the line ``options:`` of the docstring is replaced. ``build`` makes the
     options of the arguments, if it is not the group.
     """
-    parameters = inspect.signature(function).parameters
-    names = parameters.keys() - {"options"}
+    direct = [one for name, one in inspect.signature(function).parameters.items() if name != "options"]
+    names = {parameter.name for parameter in direct}
 
     @wraps(function)
     def flat(*args: Any, **given: Any) -> Any:
-        direct = {name: given.pop(name) for name in names & given.keys()}
-        return function(*args, **direct, options=(build or group)(**given))
+        own = {name: given.pop(name) for name in names & given.keys()}
+        return function(*args, **own, options=(build or group)(**given))
 
-    flat.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [parameter for name, parameter in parameters.items() if name != "options"]
-        + [
-            inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.get_default(),
-                annotation=_without_bounds(field.annotation),
-            )
-            for name, field in fields_of(group).items()
-        ]
-    )
+    kind = inspect.Parameter.KEYWORD_ONLY
+    of_group = [
+        inspect.Parameter(name, kind, default=field.get_default(), annotation=_without_bounds(field.annotation))
+        for name, field in fields_of(group).items()
+    ]
+    flat.__signature__ = inspect.Signature([*direct, *of_group])  # type: ignore[attr-defined]
     flat.__doc__ = _with_options(inspect.getdoc(function) or "", group)
     return flat
 

@@ -68,8 +68,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
     return [
         f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
         f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
-        for tone in range(vibration.amplitude.shape[-1])
-        if float(vibration.amplitude[axis, tone]) > 0
+        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist()
     ]
 
 
@@ -193,7 +192,7 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def _offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Panels]:
+def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Panels]:
     """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
     check_single("result", result)
     sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
@@ -231,7 +230,7 @@ def offset_figure(result: DetectionResult) -> Figure:
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     axes = result.vibration.num_axes
-    figure, panels = _offset_panels(result, range(axes), 6.5 * axes, 6.4)
+    figure, panels = offset_panels(result, range(axes), 6.5 * axes, 6.4)
     for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
         heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
         upper.set_title(heading, **_HEADING, pad=36)
@@ -388,11 +387,6 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
         panel.xaxis.get_major_locator().set_params(integer=True)
         plain_axes(panel, "pair of frames", title=title)
     return figure
-
-
-def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
-    """Draw the offset curve of one axis of a detection (not a batch) with its fit and residuals."""
-    return _offset_panels(result, [axis], 5.6, 4.4)[0]
 
 
 @checks_arguments

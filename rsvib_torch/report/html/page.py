@@ -99,13 +99,13 @@ def _region(top: int, left: int, height: int, width: int) -> str:
     return f"rows {top} … {top + height - 1}, columns {left} … {left + width - 1}"
 
 
-def _find_edges(image: Tensor, per_direction: int = 3, searched: int = 2048) -> list[Box]:
-    """The strongest edges of each direction in the central ``searched`` px of a frame."""
+def _find_edges(image: Tensor) -> list[Box]:
+    """The three strongest edges of each direction in the central part of a frame."""
+    searched = 2048  # px
     top, left = (max(0, (size - searched) // 2) for size in image.shape)
     edges = find_slanted_edges(image[top : top + searched, left : left + searched])
-    vertical = [edge for edge in edges if edge.near_vertical][:per_direction]
-    horizontal = [edge for edge in edges if not edge.near_vertical][:per_direction]
-    return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in vertical + horizontal]
+    chosen = [edge for vertical in (True, False) for edge in [e for e in edges if e.near_vertical is vertical][:3]]
+    return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in chosen]
 
 
 def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = None) -> tuple[list[Edge], list[str]]:
@@ -123,22 +123,21 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
                 f"{columns} px"
             )
     edges, notes = [], []
+
+    def measured(frame: Tensor, box: Box, scale: int, where: str) -> MtfCurve | None:
+        top, left, height, width = (scale * side for side in box)
+        try:
+            return slanted_edge_mtf(frame[top : top + height, left : left + width])
+        except ValueError as error:
+            notes.append(f"The edge at {_region(*box)} was not measured{where}: {error}.")
+            return None
+
     for box in _find_edges(after[::points, ::points]) if boxes is None else boxes:
-        top, left, height, width = box
-        crop = (slice(top, top + height), slice(left, left + width))
-        finer = tuple(slice(points * side.start, points * side.stop) for side in crop)
-        try:
-            restored = slanted_edge_mtf(after[finer])
-        except ValueError as error:
-            if boxes is not None:
-                notes.append(f"The edge at {_region(*box)} was not measured: {error}.")
-            continue
-        raw = None
-        try:
-            raw = slanted_edge_mtf(before[crop])
-        except ValueError as error:
-            notes.append(f"The edge at {_region(*box)} was not measured in the input: {error}.")
-        edges.append(Edge(box, raw, restored, points))
+        restored = measured(after, box, points, "")
+        if restored is not None:
+            edges.append(Edge(box, measured(before, box, 1, " in the input"), restored, points))
+        elif boxes is None:  # an edge that was found by a search
+            notes.pop()
     return edges, notes
 
 
@@ -152,12 +151,11 @@ def _edge_row(edge: Edge, restored: bool) -> list[str]:
 def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> dict[str, Drawing]:
     """Figures of the edges of each direction, by the name of their file."""
     drawings = {}
-    for direction in ("horizontal", "vertical"):
+    for direction in sorted({edge.direction for edge in edges}):
         chosen = [edge for edge in edges if edge.direction == direction]
-        if chosen:
-            before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
-            curves = dict(zip(names, (before, after), strict=False))
-            drawings[f"mtf_{direction}"] = drawing(plots.mtf_figure(curves, points={names[-1]: chosen[0].points}))
+        before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
+        curves = dict(zip(names, (before, after), strict=False))
+        drawings[f"mtf_{direction}"] = drawing(plots.mtf_figure(curves, points={names[-1]: chosen[0].points}))
     return drawings
 
 
@@ -184,22 +182,20 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
     grey = _grey(frames[-1]).float()
     place = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)[0]
     pair = before_after(*frames, names=names, caption="", full_at=(place[0] + 48, place[1] + 48))
-    parts = [
-        f"Frame {index}"
-        if len(report.restored) > 1 or not report.was_restored
-        else f"Frame {index}, and one image restored jointly from all frames"
-    ]
+    caption = f"Frame {index}"
+    if report.was_restored and len(report.restored) == 1:
+        caption += ", and one image restored jointly from all frames"
     if pair.scale < 1:
-        parts[0] += f", reduced to {100 * pair.scale:.2g} %"
+        caption += f", reduced to {100 * pair.scale:.2g} %"
     if pair.full is not None:
         part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
-        parts.append(f"The magnifier shows {part}")
+        caption += f". The magnifier shows {part}"
     (black, white), (low, high) = pair.levels, PERCENTILES
-    parts.append(
-        f"Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} "
-        f"and {high:g}{' of both images' if len(frames) > 1 else ''}."
+    caption += (
+        f". Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles "
+        f"{low:g} and {high:g}{' of both images' if len(frames) > 1 else ''}."
     )
-    return replace(pair, caption=". ".join(parts))
+    return replace(pair, caption=caption)
 
 
 def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
@@ -233,23 +229,14 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
     pairs = [(part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for stack in frames]
     caption = f"Frames {first} and {first + 1}, {_region(row, column, size, size)}."
     if any(moved):
-        caption += (
-            f" Frame {first + 1} is moved by {-moved[0]} px along x and {-moved[1]} px along y, the uniform motion."
-        )
+        shift = f"{-moved[0]} px along x and {-moved[1]} px along y"
+        caption += f" Frame {first + 1} is moved by {shift}, the uniform motion."
     if len(frames) > 1:
         caption += (
             " The motion between the input frames is the vibration; it is absent from the restored frames where "
             "restoration is right."
         )
     return blink(pairs, names=names, frames=(first, first + 1), caption=caption)
-
-
-def _windows(manifest: StackManifest) -> dict[str, Any]:
-    """Lines and table of the tones of all windows of a stack."""
-    vibration, restoration = manifest.lines()
-    head, rows = manifest.tone_table()
-    lines = [*vibration[1:], *(restoration if manifest.output is not None else [])]
-    return {"lines": lines, "head": head, "rows": rows}
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
@@ -275,7 +262,9 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     after = report.restored[last] if report.was_restored else None
     detail = finer[last] if report.was_restored else before
     axes = AXIS_NAMES[: result.vibration.num_axes]
-    figures = {f"offsets_{name}": drawing(plots.axis_offset_figure(result, axis)) for axis, name in enumerate(axes)}
+    figures = {
+        f"offsets_{name}": drawing(plots.offset_panels(result, [axis], 5.6, 4.4)[0]) for axis, name in enumerate(axes)
+    }
     figures["offset_gain"] = drawing(plots.gain_figure(result, timing))
     if bool(centre.moving_axes().any()):
         figures["rows"] = drawing(plots.rows_figure(centre, timing, num_rows))
@@ -286,20 +275,19 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     figures |= _mtf_drawings(measured, names)
     restored = report.was_restored
     sentences = words.verdict_sentences(
-        result,
-        removed,
-        timing,
-        num_rows,
-        restored=restored,
-        left_alone=report.left_alone,
-        verdict=report.verdict,
+        result, removed, timing, num_rows, restored=restored, left_alone=report.left_alone, verdict=report.verdict
     )
     if not restored and report.windows is not None and report.windows.totals()["restored"]:
         sentences[0] = words.WINDOWS_RESTORED
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
-    if report.windows is not None and report.windows.gyroscope is None:  # no tones are searched for otherwise
-        starts = [record.start_time for record in report.windows.windows]
-        figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
+    windows = None
+    if report.windows is not None:
+        vibration, restoration = report.windows.lines()
+        lines = [*vibration[1:], *(restoration if report.windows.output is not None else [])]
+        windows = {"lines": lines, "table": report.windows.tone_table()}
+        if report.windows.gyroscope is None:  # no tones are searched for otherwise
+            starts = [record.start_time for record in report.windows.windows]
+            figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
         "report": report,
@@ -317,7 +305,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         ],
         "tones": words.detected_tones(result),
         "at_centre": " at the centre of the frame" if removed.num_axes > 2 else "",
-        "windows": None if report.windows is None else _windows(report.windows),
+        "windows": windows,
         "mtf_head": mtf_head,
         "mtf_rows": [_edge_row(edge, restored) for edge in measured],
         "mtf_notes": notes,

@@ -95,19 +95,16 @@ def _axis_sentences(result: DetectionResult, axis: int) -> list[str]:
 def _blind_sentences(result: DetectionResult, timing: SensorTiming, within: float = 3.0) -> list[str]:
     """A sentence for every tone that is less than ``within`` Hz away from a blind frequency."""
     sentences = []
-    for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes]):
-        for tone in range(result.vibration.amplitude.shape[-1]):
-            frequency = float(result.vibration.frequency[axis, tone])
-            if float(result.vibration.amplitude[axis, tone]) <= 0:
-                continue
-            blind = blind_frequencies(timing, frequency + 2 * within)
-            nearest = float(blind[(blind - frequency).abs().argmin()]) if len(blind) else math.inf
-            if abs(nearest - frequency) < within:
-                sentences.append(
-                    f"The tone at {frequency:.1f} Hz along {name} is {abs(nearest - frequency):.1f} Hz from the blind "
-                    f"frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified "
-                    f"(offset gain {abs(float(result.gain[axis, tone])):.2f})."
-                )
+    for axis, tone in result.vibration.amplitude.nonzero().tolist():
+        frequency = float(result.vibration.frequency[axis, tone])
+        blind = blind_frequencies(timing, frequency + 2 * within)
+        nearest = float(blind[(blind - frequency).abs().argmin()]) if len(blind) else math.inf
+        if abs(nearest - frequency) < within:
+            sentences.append(
+                f"The tone at {frequency:.1f} Hz along {AXIS_NAMES[axis]} is {abs(nearest - frequency):.1f} Hz from "
+                f"the blind frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified "
+                f"(offset gain {abs(float(result.gain[axis, tone])):.2f})."
+            )
     return sentences
 
 
