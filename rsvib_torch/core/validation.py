@@ -62,10 +62,14 @@ class MistakesError(ValueError):
         super().__init__("\n".join(self.lines))
 
 
-class Section(BaseModel):
-    """Table with a fixed set of keys and strict types: unknown keys are refused, and values are not converted."""
+# unknown keys are refused, and values are not converted; the text below a field is its description
+_CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
+
+class Section(BaseModel):
+    """Table with a fixed set of keys and strict types."""
+
+    model_config = ConfigDict(_CONFIG, frozen=True)
 
 
 class Extensible:
@@ -94,16 +98,19 @@ def options(group: type[_Group]) -> type[_Group]:
     Example:
         >>> @options
         ... class Bands:
-        ...     band_rows: int = Field(default=32, ge=4, description="Rows of a band.")
+        ...     band_rows: int = Field(default=32, ge=4)
         >>> Bands(band_rows=2)
         Traceback (most recent call last):
         ...
         ValueError: band_rows must be at least 4, got 2 (int)
     """
-    config = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
     group.__get_pydantic_core_schema__ = classmethod(_accepts_tables)  # type: ignore[attr-defined]
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=config)(group)
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
     initialise = made.__init__
+    for name, field in fields_of(made).items():
+        stated = (getattr(kind, "__pydantic_fields__", {}).get(name) for kind in made.__mro__)
+        described_by = next((one for one in stated if one is not None and one.description), field)
+        field.description = " ".join((described_by.description or "").split())  # of this group, or of one below it
 
     def __init__(self: Any, *args: Any, **given: Any) -> None:  # noqa: N807
         by_place = dict(zip(fields_of(made), args, strict=False))
