@@ -83,14 +83,13 @@ def simulation_section() -> Any:
 
     class SimulationSection(Section):
         vibration: VibrationSection
-        num_frames: Count = Field(default=2, description="Number of frames.")
-        frame_size: tuple[Count, Count] | None = Field(
-            default=None,
-            strict=False,
-            description="(height, width) of the frames in px; None for the largest size that the scene allows.",
-        )
+        num_frames: Count = 2
+        """Number of frames."""
+        frame_size: tuple[Count, Count] | None = Field(default=None, strict=False)
+        """(height, width) of the frames in px; None for the largest size that the scene allows."""
         noise: SensorNoise | None = None
-        seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Seed of the noise.")
+        seed: int = Field(default=0, ge=0, le=2**63 - 1)
+        """Seed of the noise."""
 
     return SimulationSection
 

@@ -32,38 +32,40 @@ def _size(text: str) -> tuple[int, int]:
 class ExportOptions:
     """Options of ``export``."""
 
-    vibration: Path = argument("The vibration.json written by detect or run.")
-    out: Path = argument("File to write; for stmap a folder.")
+    vibration: Path = argument()
+    """The vibration.json written by detect or run."""
+    out: Path = argument()
+    """File to write; for stmap a folder."""
     file_format: ExportFormat | None = option(
-        None,
-        "gcsv: angular rates, for Gyroflow; stmap: a position per pixel and frame, for compositing programs and "
-        "OpenCV; isd: image support data, for the Community Sensor Model; csv: offsets of the rows before and after "
-        "correction.",
-        "--format",
-        show_default="from the extension: .gcsv, .csv, .json for isd",
+        None, "--format", show_default="from the extension: .gcsv, .csv, .json for isd"
     )
-    frames: Path | None = option(None, "The stack of frames, for their size and number (gcsv, stmap).")
-    size: str | None = option(None, "Size of the frames in px, in place of --frames.", metavar="HEIGHTxWIDTH")
-    num_frames: int | None = option(None, "Number of frames, in place of --frames.")
-    focal_length: float | None = option(
-        None, "Focal length in px, for a vibration that was detected without one; required for gcsv."
-    )
-    camera_isd: Path | None = option(None, "ISD of the camera at rest (JSON), which isd requires.", "--isd")
-    frame: int = option(0, "Number of the frame that isd describes, from 0.")
-    model: IsdModel = option(
-        "auto",
-        "Sensor model of isd: frame, a frame camera with jitter polynomials; line-scan, one quaternion per row; auto, "
-        "the first of them that is accurate enough.",
-    )
-    tolerance: float = option(0.005, "Largest error of a position by isd, in px.")
-    convention: StmapConvention = option(
-        "nuke", "Positions of stmap: nuke, 0 to 1 from the bottom left corner; opencv, px from the first pixel."
-    )
-    sample_rate: float | None = option(
-        None, "Samples per second of gcsv.", show_default="chosen for an attitude within 2e-7 rad"
-    )
-    force: bool = option(False, "Export axes as well that are not reliable or not accurate.")
-    overwrite: bool = option(False, "Replace results that exist already.")
+    """gcsv: angular rates, for Gyroflow; stmap: a position per pixel and frame, for compositing programs and OpenCV;
+    isd: image support data, for the Community Sensor Model; csv: offsets of the rows before and after correction."""
+    frames: Path | None = None
+    """The stack of frames, for their size and number (gcsv, stmap)."""
+    size: str | None = option(None, metavar="HEIGHTxWIDTH")
+    """Size of the frames in px, in place of --frames."""
+    num_frames: int | None = None
+    """Number of frames, in place of --frames."""
+    focal_length: float | None = None
+    """Focal length in px, for a vibration that was detected without one; required for gcsv."""
+    camera_isd: Path | None = option(None, "--isd")
+    """ISD of the camera at rest (JSON), which isd requires."""
+    frame: int = 0
+    """Number of the frame that isd describes, from 0."""
+    model: IsdModel = "auto"
+    """Sensor model of isd: frame, a frame camera with jitter polynomials; line-scan, one quaternion per row; auto, the
+    first of them that is accurate enough."""
+    tolerance: float = 0.005
+    """Largest error of a position by isd, in px."""
+    convention: StmapConvention = "nuke"
+    """Positions of stmap: nuke, 0 to 1 from the bottom left corner; opencv, px from the first pixel."""
+    sample_rate: float | None = option(None, show_default="chosen for an attitude within 2e-7 rad")
+    """Samples per second of gcsv."""
+    force: bool = False
+    """Export axes as well that are not reliable or not accurate."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
 
 def export(given: ExportOptions) -> Answer:

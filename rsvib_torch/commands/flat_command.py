@@ -17,14 +17,14 @@ from rsvib_torch.options import COMMAND_LINE
 _NOT_RELIABLE = 3  # exit code
 
 
-def argument(text: str, **form: Any) -> Any:
-    """An argument of a command; ``form`` has ``default`` and arguments of ``typer.Argument``."""
-    return Field(form.pop("default", ...), description=text, json_schema_extra={"positional": True, **form})
+def argument(default: Any = ..., **form: Any) -> Any:
+    """An argument of a command; ``form`` has arguments of ``typer.Argument``."""
+    return Field(default, json_schema_extra={"positional": True, **form})
 
 
-def option(default: Any, text: str, *names: str, **form: Any) -> Any:
-    """An option of a command, by default of the name of its field; ``form`` has arguments of ``typer.Option``."""
-    return Field(default, description=text, json_schema_extra={"names": list(names), **form})
+def option(default: Any, *names: str, **form: Any) -> Any:
+    """An option of a command that is not named as its field, or has arguments ``form`` of ``typer.Option``."""
+    return Field(default, json_schema_extra={"names": list(names), **form})
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,12 @@ class Given:
 class _OutputOptions:
     """Options of all commands; ``--debug`` is read where errors are printed."""
 
-    as_json: bool = option(False, "Print the answer as JSON on standard output, and nothing else there.", "--json")
-    quiet: bool = option(False, "Print nothing but warnings and errors, and no progress.", "--quiet", "-q")
-    debug: bool = option(False, "Print the traceback of an error.")
+    as_json: bool = option(False, "--json")
+    """Print the answer as JSON on standard output, and nothing else there."""
+    quiet: bool = option(False, "--quiet", "-q")
+    """Print nothing but warnings and errors, and no progress."""
+    debug: bool = False
+    """Print the traceback of an error."""
 
 
 def _parameter(name: str, annotation: Any, default: Any, form: Mapping[str, Any]) -> inspect.Parameter:

@@ -34,10 +34,10 @@ _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(S
 class InitOptions:
     """Options of ``init``."""
 
-    frames: Path | None = argument(
-        "Stack of frames of the camera; its size, frame rate and times are read.", default=None
-    )
-    out: Path = option(Path("camera.toml"), "Configuration file to write.")
+    frames: Path | None = argument(default=None)
+    """Stack of frames of the camera; its size, frame rate and times are read."""
+    out: Path = Path("camera.toml")
+    """Configuration file to write."""
     sensor: Annotated[
         dict[str, Any],
         Given(
@@ -51,10 +51,13 @@ class InitOptions:
             },
         ),
     ]
-    camera: str | None = option(None, "Model of the camera, for its measured row time (rsvib cameras lists them).")
-    preset: str | None = option(None, f"Copy a preset instead: {', '.join(presets())}.")
-    list_presets: bool = option(False, "List the presets and exit.")
-    overwrite: bool = option(False, "Replace an existing configuration file.")
+    camera: str | None = None
+    """Model of the camera, for its measured row time (rsvib cameras lists them)."""
+    preset: str | None = option(None, text=f"Copy a preset instead: {', '.join(presets())}.")
+    list_presets: bool = False
+    """List the presets and exit."""
+    overwrite: bool = False
+    """Replace an existing configuration file."""
 
 
 def init(given: InitOptions) -> Answer:
@@ -100,7 +103,8 @@ def _first_comment(text: str) -> str:
 class CamerasOptions:
     """Options of ``cameras``."""
 
-    search: list[str] | None = argument("Words of its name, e.g. iphone 12.", default=None)
+    search: list[str] | None = argument(default=None)
+    """Words of its name, e.g. iphone 12."""
 
 
 def cameras(given: CamerasOptions) -> Answer:

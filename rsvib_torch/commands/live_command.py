@@ -36,19 +36,24 @@ _AT_LEAST_2 = Annotated[int, Field(ge=2)]
 class LiveOptions(CameraOptions, RangeOptions):
     """Options of ``live``."""
 
-    source: str = argument("Number or URL of a camera, - for raw frames on standard input, or a file with frames.")
-    out: Path | None = option(None, "Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout.")
-    page: Annotated[int, Field(ge=0, le=65535)] | None = option(
-        None, "Show the restored frames at http://127.0.0.1:PORT.", metavar="PORT"
-    )
-    preview: bool = option(False, "Show the restored frames in a window.")
-    spectrogram: Path | None = option(
-        None, "Write the spectrogram of both axes: NAME.png and NAME.zarr.", metavar="NAME"
-    )
-    max_frequency: float = option(250.0, "Highest frequency of the spectrogram.", metavar="HZ")
-    size: str | None = option(None, "Size of the frames on standard input, e.g. 1024x768.", metavar="WIDTHxHEIGHT")
-    pixel_format: PixelFormatName = option("gray8", "Pixels of the frames on standard input.")
-    realtime: bool = option(False, "Read a file at its own rate, and drop frames like a camera.")
+    source: str = argument()
+    """Number or URL of a camera, - for raw frames on standard input, or a file with frames."""
+    out: Path | None = None
+    """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
+    page: Annotated[int, Field(ge=0, le=65535)] | None = option(None, metavar="PORT")
+    """Show the restored frames at http://127.0.0.1:PORT."""
+    preview: bool = False
+    """Show the restored frames in a window."""
+    spectrogram: Path | None = option(None, metavar="NAME")
+    """Write the spectrogram of both axes: NAME.png and NAME.zarr."""
+    max_frequency: float = option(250.0, metavar="HZ")
+    """Highest frequency of the spectrogram."""
+    size: str | None = option(None, metavar="WIDTHxHEIGHT")
+    """Size of the frames on standard input, e.g. 1024x768."""
+    pixel_format: PixelFormatName = "gray8"
+    """Pixels of the frames on standard input."""
+    realtime: bool = False
+    """Read a file at its own rate, and drop frames like a camera."""
     tracker: Annotated[
         dict[str, Any],
         Given(
@@ -57,18 +62,15 @@ class LiveOptions(CameraOptions, RangeOptions):
             forms={"method": {"show_default": "from the configuration, or dewarp"}},
         ),
     ]
-    steady: NotNegative = option(
-        0.0,
-        "Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime).",
-        metavar="SECONDS",
-    )
-    border: BorderName = option(
-        "mirror",
-        "Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available "
-        "for videos (rsvib run --video).",
-    )
-    waiting: Count = option(64, "Frames that wait before the oldest ones are dropped.")
-    num_frames: _AT_LEAST_2 | None = option(None, "Stop after this number of frames.")
+    steady: NotNegative = option(0.0, metavar="SECONDS")
+    """Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime)."""
+    border: BorderName = "mirror"
+    """Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available for
+    videos (rsvib run --video)."""
+    waiting: Count = 64
+    """Frames that wait before the oldest ones are dropped."""
+    num_frames: _AT_LEAST_2 | None = None
+    """Stop after this number of frames."""
 
     @cached_property
     def file(self) -> Path | None:

@@ -29,12 +29,11 @@ if TYPE_CHECKING:
 class MotionOptions(shared.StackCommand, shared.VerdictOptions):
     """Options of ``motion``."""
 
-    out: Path = option(..., "CSV file to write: time in s, x and y in px, and their standard deviations (model free).")
-    model: Literal["free", "swept"] = option(
-        "free",
-        "free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose "
-        "frequency changes linearly.",
-    )
+    out: Path = option(...)
+    """CSV file to write: time in s, x and y in px, and their standard deviations (model free)."""
+    model: Literal["free", "swept"] = "free"
+    """free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose
+    frequency changes linearly."""
     detection: Annotated[dict[str, Any], Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
@@ -95,41 +94,33 @@ class KnownOptions(shared.StackCommand):
     """Options of ``known``."""
 
     restored: Path = shared.restored_argument()
-    motion: Path = option(
-        ...,
-        "CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow "
-        "log (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit.",
-    )
-    unit: MotionUnit | None = option(
-        None, "Unit of x and y: px, an angle, or an angular rate.", show_default="the rates of a gyroscope"
-    )
-    focal_length: float | None = option(
-        None,
-        "Focal length in px; required for angles and angular rates.",
-        show_default="for a gyroscope, estimated from the frames",
-    )
-    time_unit: TimeUnit = option("s", "Unit of the times.")
-    flip_x: bool = option(False, "Positive x moves the image towards smaller x.")
-    flip_y: bool = option(False, "Positive y moves the image towards smaller y.")
-    offset: float | None = option(
-        None,
-        "Time of the recording, in s, at the exposure start of the first row of frame 0.",
-        show_default="estimated from the frames",
-    )
+    motion: Path = option(...)
+    """CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow log
+    (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."""
+    unit: MotionUnit | None = option(None, show_default="the rates of a gyroscope")
+    """Unit of x and y: px, an angle, or an angular rate."""
+    focal_length: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
+    """Focal length in px; required for angles and angular rates."""
+    time_unit: TimeUnit = "s"
+    """Unit of the times."""
+    flip_x: bool = False
+    """Positive x moves the image towards smaller x."""
+    flip_y: bool = False
+    """Positive y moves the image towards smaller y."""
+    offset: float | None = option(None, show_default="estimated from the frames")
+    """Time of the recording, in s, at the exposure start of the first row of frame 0."""
     offsets: tuple[float, float] | None = option(
-        None,
-        "Smallest and largest time of the recording, in s, at the exposure start of the first row of frame 0, between "
-        "which it is estimated.",
-        metavar="LOW HIGH",
-        show_default="all for which the recording covers the frames",
+        None, metavar="LOW HIGH", show_default="all for which the recording covers the frames"
     )
-    fit_gain: bool = option(False, "Estimate the focal length from the frames as well.")
-    fit_row_time: bool = option(False, "With a gyroscope: estimate the row time from the frames as well.")
-    force: bool = option(
-        False,
-        "Restore even if the recording does not explain the motion of the frames, or the restored frames are judged "
-        "no better than the input.",
-    )
+    """Smallest and largest time of the recording, in s, at the exposure start of the first row of frame 0, between
+    which it is estimated."""
+    fit_gain: bool = False
+    """Estimate the focal length from the frames as well."""
+    fit_row_time: bool = False
+    """With a gyroscope: estimate the row time from the frames as well."""
+    force: bool = False
+    """Restore even if the recording does not explain the motion of the frames, or the restored frames are judged no
+    better than the input."""
 
 
 def known(given: KnownOptions) -> Answer:
@@ -254,22 +245,26 @@ def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMot
 class CompareOptions(shared.PixelSizeOptions):
     """Options of ``compare``."""
 
-    vibration: Path = argument("The vibration.json written by detect or run.")
-    record: Path = argument("CSV file with the columns time, x (right) and y (down), evenly sampled.")
-    unit: AccelerationUnit = option(..., "Unit of x and y.")
-    out: Path | None = option(None, "Picture of both to write (PNG, SVG, PDF).")
-    offset: float | None = option(
-        None,
-        "Time of the accelerometer, in s, at the exposure start of the first row of frame 0.",
-        show_default="that at which both resemble each other most",
-    )
-    offsets: tuple[float, float] | None = option(
-        None, "Smallest and largest offset to try.", metavar="LOW HIGH", show_default="all that cover the frames"
-    )
-    time_unit: TimeUnit = option("s", "Unit of the times.")
-    flip_x: bool = option(False, "Positive x is to the left of the image, or the accelerometer is on the camera.")
-    flip_y: bool = option(False, "Positive y is upwards in the image, or the accelerometer is on the camera.")
-    overwrite: bool = option(False, "Replace results that exist already.")
+    vibration: Path = argument()
+    """The vibration.json written by detect or run."""
+    record: Path = argument()
+    """CSV file with the columns time, x (right) and y (down), evenly sampled."""
+    unit: AccelerationUnit = option(...)
+    """Unit of x and y."""
+    out: Path | None = None
+    """Picture of both to write (PNG, SVG, PDF)."""
+    offset: float | None = option(None, show_default="that at which both resemble each other most")
+    """Time of the accelerometer, in s, at the exposure start of the first row of frame 0."""
+    offsets: tuple[float, float] | None = option(None, metavar="LOW HIGH", show_default="all that cover the frames")
+    """Smallest and largest offset to try."""
+    time_unit: TimeUnit = "s"
+    """Unit of the times."""
+    flip_x: bool = False
+    """Positive x is to the left of the image, or the accelerometer is on the camera."""
+    flip_y: bool = False
+    """Positive y is upwards in the image, or the accelerometer is on the camera."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
 
 def compare(given: CompareOptions) -> Answer:
@@ -305,40 +300,39 @@ def compare(given: CompareOptions) -> Answer:
 class CalibrateOptions(shared.RangeOptions):
     """Options of ``calibrate``."""
 
-    frames: list[Path] = argument("One or more stacks of frames: TIFF, PNG, video ...")
-    flicker_frequency: float | None = option(
-        None, "Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency.", "--frequency"
-    )
-    exposure: list[float] | None = option(
-        None,
-        "Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, "
-        "if known.",
-        **shared.TIME,
-    )
-    by_motion: bool = option(False, "Use the motion of the camera instead of a light; needs --frame-rate.")
+    frames: list[Path] = argument()
+    """One or more stacks of frames: TIFF, PNG, video ..."""
+    flicker_frequency: float | None = option(None, "--frequency")
+    """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
+    exposure: list[float] | None = option(None, **shared.TIME)
+    """Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, if
+    known."""
+    by_motion: bool = False
+    """Use the motion of the camera instead of a light; needs --frame-rate."""
     row_time: list[float] | None = option(
-        None,
-        "With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us.",
-        show_default="a readout within a tenth to the whole of the frame period",
-        **shared.TIME,
+        None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
+    """With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us."""
     readout_direction: Literal["forward", "reverse"] | None = option(
         None,
-        f"With --by-motion, if known. {shared.SENSOR_FORMS['readout_direction']['text']}",
         show_default="determined from the frames",
+        text=f"With --by-motion, if known. {shared.SENSOR_FORMS['readout_direction']['text']}",
     )
     frame_rate: float | None = option(None, **shared.SENSOR_FORMS["frame_rate"])
-    on_fraction: float | None = option(
-        None, "Duty cycle of a light that is switched on and off; determines the exposure time."
-    )
-    light_contrast: float | None = option(
-        None, "Amplitude over mean of a sinusoidal light; determines the exposure time."
-    )
-    scan_axis: Literal["y", "x"] = option("y", "Image axis along which the rows follow each other.")
-    gamma: float = option(1.0, "Exponent that makes pixel values proportional to light.")
-    full_scale: float | None = option(None, "Count that corresponds to full scale.")
-    out: Path | None = option(None, "Configuration file to write, with the table [sensor].")
-    overwrite: bool = option(False, "Replace results that exist already.")
+    on_fraction: float | None = None
+    """Duty cycle of a light that is switched on and off; determines the exposure time."""
+    light_contrast: float | None = None
+    """Amplitude over mean of a sinusoidal light; determines the exposure time."""
+    scan_axis: Literal["y", "x"] = "y"
+    """Image axis along which the rows follow each other."""
+    gamma: float = 1.0
+    """Exponent that makes pixel values proportional to light."""
+    full_scale: float | None = None
+    """Count that corresponds to full scale."""
+    out: Path | None = None
+    """Configuration file to write, with the table [sensor]."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
 
 def calibrate(given: CalibrateOptions) -> Answer:

@@ -9,7 +9,7 @@ from rsvib_torch import detection, io, stacks, tracking
 from rsvib_torch import report as reports
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import written_results as written
-from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, error_line, working
@@ -31,18 +31,15 @@ _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``run``."""
 
-    out: Path = argument("Folder for the restored frames, the vibration and the figures.")
-    output: str = option(
-        "restored.tif",
-        "Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video "
-        "with the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a "
-        "folder of TIFF files, TIFF files of the same names, georeference, tiles and compression.",
-    )
-    video: bool = option(
-        False,
-        "Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without "
-        "loss). Videos are followed frame by frame instead of in windows.",
-    )
+    out: Path = argument()
+    """Folder for the restored frames, the vibration and the figures."""
+    output: str = "restored.tif"
+    """Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video with
+    the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a folder of TIFF
+    files, TIFF files of the same names, georeference, tiles and compression."""
+    video: bool = False
+    """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
+    Videos are followed frame by frame instead of in windows."""
     moved: Annotated[
         dict[str, Any],
         Given(

@@ -98,13 +98,9 @@ class RangeOptions:
     """A part of the frames of a stack."""
 
     frame_range: str | None = option(
-        None,
-        "Use only the frames START to END - 1, counted from 0; times count from the first of them.",
-        "--frames",
-        parser=_range_of_frames,
-        metavar="START:END",
-        show_default="all frames",
+        None, "--frames", parser=_range_of_frames, metavar="START:END", show_default="all frames"
     )
+    """Use only the frames START to END - 1, counted from 0; times count from the first of them."""
 
     def part_of(self, path: Path) -> Path:
         """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
@@ -115,7 +111,8 @@ class RangeOptions:
 class DeviceOptions:
     """Where it is computed."""
 
-    device: DeviceName = option("auto", "Device for the computation; auto uses a GPU if there is one.")
+    device: DeviceName = "auto"
+    """Device for the computation; auto uses a GPU if there is one."""
 
     @cached_property
     def torch_device(self) -> "torch.device":
@@ -131,20 +128,15 @@ class DeviceOptions:
 class CameraOptions:
     """The camera, and what all commands have that use one."""
 
-    config: Path | None = option(
-        None,
-        "TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate.",
-    )
+    config: Path | None = None
+    """TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate."""
     sensor: Annotated[dict[str, Any], Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
-    readout_time: float | None = option(
-        None, "Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time.", **TIME
-    )
-    full_scale: float | None = option(
-        None,
-        "Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits.",
-        show_default="from the file, or the configuration",
-    )
-    overwrite: bool = option(False, "Replace results that exist already.")
+    readout_time: float | None = option(None, **TIME)
+    """Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time."""
+    full_scale: float | None = option(None, show_default="from the file, or the configuration")
+    """Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
     def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
         """Configuration file and the options that replace its keys, or the options alone.
@@ -188,9 +180,8 @@ class CameraOptions:
 class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
     """A command that reads a stack of frames."""
 
-    frames: Path = argument(
-        "Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."
-    )
+    frames: Path = argument()
+    """Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."""
 
     @cached_property
     def stack(self) -> Path:
@@ -241,14 +232,15 @@ class RestorationCommand(StackCommand):
             },
         ),
     ]
-    force: bool = option(False, "Write the restored frames even if they are judged no better than the input.")
+    force: bool = False
+    """Write the restored frames even if they are judged no better than the input."""
 
 
 def restored_argument() -> Any:
     """The stack that commands write."""
     return argument(
-        "Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and "
-        ".mkv are videos with the time stamps and the sound of the input."
+        text="Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 "
+        "and .mkv are videos with the time stamps and the sound of the input."
     )
 
 
@@ -256,25 +248,17 @@ def restored_argument() -> Any:
 class PixelSizeOptions:
     """Units of length."""
 
-    pixel_size: float | None = option(
-        None,
-        "Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s².",
-        parser=metres,
-        metavar="LENGTH",
-    )
+    pixel_size: float | None = option(None, parser=metres, metavar="LENGTH")
+    """Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s²."""
 
 
 @options
 class VerdictOptions:
     """What a script requires of the result."""
 
-    require_reliable: str | None = option(
-        None,
-        "For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results "
-        "are written all the same.",
-        parser=_axes,
-        metavar="AXES",
-    )
+    require_reliable: str | None = option(None, parser=_axes, metavar="AXES")
+    """For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results are
+    written all the same."""
 
 
 def stated_rate(info: "StackInfo") -> float | None:

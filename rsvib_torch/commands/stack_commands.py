@@ -108,10 +108,14 @@ def restore_and_save(
 class SimulateOptions(shared.CameraOptions, shared.DeviceOptions):
     """Options of ``simulate``."""
 
-    scene: Path = argument("Image of the scene at rest, larger than the frames.")
-    frames: Path = argument("Stack to write.")
-    full_scale: float | None = option(None, "Count of the scene's file that corresponds to full scale.")
-    seed: Seed | None = option(None, "Seed of the noise.", show_default="from the configuration")
+    scene: Path = argument()
+    """Image of the scene at rest, larger than the frames."""
+    frames: Path = argument()
+    """Stack to write."""
+    full_scale: float | None = None
+    """Count of the scene's file that corresponds to full scale."""
+    seed: Seed | None = option(None, show_default="from the configuration")
+    """Seed of the noise."""
 
 
 def simulate(given: SimulateOptions) -> Answer:
@@ -162,7 +166,8 @@ def simulate(given: SimulateOptions) -> Answer:
 class DetectOptions(shared.StackCommand, shared.PixelSizeOptions, shared.VerdictOptions):
     """Options of ``detect``."""
 
-    out: Path = option(..., "Folder for vibration.json, tables (tones, offsets, spectrum) and figures.")
+    out: Path = option(...)
+    """Folder for vibration.json, tables (tones, offsets, spectrum) and figures."""
     windows: Annotated[
         dict[str, Any],
         Given(
@@ -231,8 +236,10 @@ class RestoreOptions(shared.RestorationCommand):
     """Options of ``restore``."""
 
     restored: Path = shared.restored_argument()
-    vibration: Path = option(..., "The vibration.json, or manifest.json of windows, written by detect or run.")
-    report: Path | None = option(None, "JSON file to write: whether restoration helped, with the measured values.")
+    vibration: Path = option(...)
+    """The vibration.json, or manifest.json of windows, written by detect or run."""
+    report: Path | None = None
+    """JSON file to write: whether restoration helped, with the measured values."""
 
 
 def restore_frames(given: RestoreOptions) -> Answer:
@@ -315,17 +322,14 @@ def _restore_windows(given: RestoreOptions) -> Answer:
 class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
     """Options of ``report``."""
 
-    out: Path = argument("Folder for report.html and its figures.")
-    edge: list[str] | None = option(
-        None,
-        "Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times.",
-        metavar="EDGE",
-        show_default="edges are searched for",
-    )
-    manifest: Path | None = option(
-        None, "The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."
-    )
-    force: bool = option(False, "Show the restored frames even if they are judged no better than the input.")
+    out: Path = argument()
+    """Folder for report.html and its figures."""
+    edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
+    """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
+    manifest: Path | None = None
+    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."""
+    force: bool = False
+    """Show the restored frames even if they are judged no better than the input."""
 
 
 def report(given: ReportOptions) -> Answer:

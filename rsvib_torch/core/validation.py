@@ -69,7 +69,11 @@ _CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, 
 class Section(BaseModel):
     """Table with a fixed set of keys and strict types."""
 
-    model_config = ConfigDict(_CONFIG, frozen=True)
+    model_config = ConfigDict(**_CONFIG, frozen=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: object) -> None:
+        _describe(cls)
 
 
 class Extensible:
@@ -107,10 +111,7 @@ def options(group: type[_Group]) -> type[_Group]:
     group.__get_pydantic_core_schema__ = classmethod(_accepts_tables)  # type: ignore[attr-defined]
     made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
     initialise = made.__init__
-    for name, field in fields_of(made).items():
-        stated = (getattr(kind, "__pydantic_fields__", {}).get(name) for kind in made.__mro__)
-        described_by = next((one for one in stated if one is not None and one.description), field)
-        field.description = " ".join((described_by.description or "").split())  # of this group, or of one below it
+    _describe(made)
 
     def __init__(self: Any, *args: Any, **given: Any) -> None:  # noqa: N807
         by_place = dict(zip(fields_of(made), args, strict=False))
@@ -122,6 +123,14 @@ def options(group: type[_Group]) -> type[_Group]:
 
     made.__init__ = __init__
     return made  # type: ignore[no-any-return]
+
+
+def _describe(group: Any) -> None:
+    """Give each field of a group its description in one line, from its class or the one below it that states it."""
+    for name, field in fields_of(group).items():
+        stated = (getattr(kind, "__pydantic_fields__", {}).get(name) for kind in group.__mro__)
+        described_by = next((one for one in stated if one is not None and one.description), field)
+        field.description = " ".join((described_by.description or "").split())
 
 
 def _accepts_tables(_: type, source: Any, handler: Callable[[Any], Any]) -> Any:
