@@ -289,10 +289,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         """The vibration of every image of the last call, in image axes: the ground truth for training.
 
         Clips whose frames share one draw have one vibration each, as a stack in ``restore``. Images that were not
-        augmented (``p`` below 1) have amplitude and image motion 0.
-
-        Args:
-            params: Parameters of another call (``augmentation._params`` after that call).
+        augmented (``p`` below 1) have amplitude and image motion 0. ``params`` are those of another call.
         """
         params = self._params if params is None else params
         if "amplitude" not in params:

@@ -214,15 +214,9 @@ def calibrate_row_time_by_exposure(
 
     A row is lit if its exposure overlaps the pulse: the height of a bright band is the sum of pulse and exposure, and a
     longer exposure increases it by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
-    the brightness of the rows of all frames, with pulse, period and row time in common.
-
-    Args:
-        frames: (T, H, W) or (T, C, H, W), T >= 2, or files.
-        exposure_times: Exposure of each frame in seconds, not all the same.
-        scan_axis: As in ``calibrate_row_time``.
-        gamma: As in ``calibrate_row_time``; it matters here.
-        full_scale: Count that means 1.0, for integers other than 8 bit.
-        channels: As in ``detect_vibration``.
+    the brightness of the rows of all frames, with pulse, period and row time in common. ``exposure_times`` are those of
+    the frames in seconds, not all the same; the other arguments are as in ``calibrate_row_time``, and ``gamma`` matters
+    here.
 
     Returns:
         Row time with its standard deviation, and the frequency of the strobe.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,21 +10,13 @@ import rsvib_torch
 from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
 from rsvib_torch.commands.flat_command import argument, option
-from rsvib_torch.commands.shared_options import check_new
+from rsvib_torch.commands.shared_options import check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, working
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.validation import options, read_json
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
 
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) from ``HEIGHTxWIDTH``."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower())
-    if match is None:
-        raise ValueError(f"--size must be HEIGHTxWIDTH in px such as 1080x1920, got {text!r}")
-    return int(match[1]), int(match[2])
 
 
 @options
@@ -117,7 +108,8 @@ def export(given: ExportOptions) -> Answer:
 
 def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
     """Size and number of the frames, from the stack or the options."""
-    size, count = None if given.size is None else _size(given.size), given.num_frames
+    size = None if given.size is None else size_of(given.size, "HEIGHTxWIDTH in px such as 1080x1920")
+    count = given.num_frames
     if given.frames is not None:
         shape = io.read_stack_info(given.frames).shape
         size, count = size or (shape[-2], shape[-1]), shape[0] if count is None else count

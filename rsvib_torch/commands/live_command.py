@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 import threading
 import time
@@ -18,7 +17,7 @@ from pydantic import Field
 from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new
+from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.text import number_of
@@ -82,6 +81,12 @@ class LiveOptions(CameraOptions, RangeOptions):
         if not io.stack_files(self.source)[0].exists():
             raise FileNotFoundError(f"{self.source}: no such file; a camera is a number or a URL")
         return self.part_of(Path(self.source))
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """(height, width) of the frames on standard input."""
+        width, height = size_of(self.size or "", "WIDTHxHEIGHT in px such as 1024x768")
+        return height, width
 
     @property
     def is_camera(self) -> bool:
@@ -163,7 +168,7 @@ def _source(given: LiveOptions, settings: Config) -> live.FrameSource:
     if given.file is None:
         # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
         stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-        return live.PipeSource(stream, _size(given.size or ""), given.pixel_format, settings.timing)
+        return live.PipeSource(stream, given.frame_size, given.pixel_format, settings.timing)
     scale = given.full_scale if given.full_scale is not None else settings.full_scale
     return live.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
 
@@ -174,8 +179,6 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
     if given.source != "-" and given.size is not None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
-    if given.size is not None:
-        _size(given.size)
     if given.realtime and given.file is None:
         raise ValueError(f"--realtime goes with a file, not with {given.source}: a camera has its own rate")
     if given.border == "crop" or (given.steady > 0 and given.file is not None and not given.realtime):
@@ -198,14 +201,6 @@ def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> l
         outputs.append(served)
         error_line(f"the page is {served.url}", "note")
     return outputs
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) from ``WIDTHxHEIGHT``."""
-    match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text.strip().lower())
-    if match is None:
-        raise ValueError(f"--size must be WIDTHxHEIGHT in px such as 1024x768, got {text!r}")
-    return int(match[2]), int(match[1])
 
 
 @contextmanager

@@ -77,6 +77,14 @@ def _axes(text: str) -> str:
     return text
 
 
+def size_of(text: str, expected: str) -> tuple[int, int]:
+    """Two numbers of px with an x between them, from ``--size``."""
+    match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text.strip().lower())
+    if match is None:
+        raise ValueError(f"--size must be {expected}, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
 TIME: dict[str, Any] = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
 SENSOR_FORMS: dict[str, dict[str, Any]] = {
@@ -275,11 +283,7 @@ def check_new(
 ) -> None:
     """Raise an error if results would replace an input, or exist and must not be replaced.
 
-    Args:
-        paths: Files to write, and folders that are written as a whole. An empty folder may exist.
-        overwrite: Whether existing results are replaced.
-        inputs: Files and folders that are read; None for those that were not given.
-        folder: Folder of the results, as in ``check_outputs``.
+    Of folders, which are written as a whole, an empty one may exist. ``folder`` is as in ``check_outputs``.
     """
     paths = list(paths)
     check_outputs(paths, [path for path in inputs if path is not None], folder=folder)

@@ -136,10 +136,7 @@ def check_not_special(path: str | os.PathLike[str]) -> None:
 def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True) -> None:
     """Raise an ``OSError`` with the reason if ``path`` must not be replaced by a file, or written into as a folder.
 
-    Args:
-        path: The file or folder to write.
-        kind: As in ``StackFormat``.
-        parent_exists: Whether the folder of a file must exist.
+    ``kind`` is as in ``StackFormat``; ``parent_exists`` states whether the folder of a file must exist.
     """
     size = len(os.fsencode(path.name))
     if size > _LONGEST_NAME:

@@ -94,16 +94,7 @@ def check_whole_number(name: str, value: object, *, at_least: int, at_most: int 
 
 
 def needed_package(name: str, purpose: str, extra: str) -> Any:
-    """Import an optional package.
-
-    Args:
-        name: Module to import.
-        purpose: What needs it, for the message.
-        extra: Extra of this package that installs it.
-
-    Raises:
-        ModuleNotFoundError: If it is missing, naming the extra to install.
-    """
+    """Import an optional package that ``purpose`` needs; an error names the extra of this package that installs it."""
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

@@ -262,20 +262,12 @@ class Result(Summarised):
         return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result as JSON, which ``load`` reads; an existing file is replaced.
-
-        Args:
-            path: The file to write; its folder must exist.
-        """
+        """Write the result as JSON, which ``load`` reads; an existing file is replaced."""
         save_result(self, Path(path))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that ``save`` wrote.
-
-        Args:
-            path: The file.
-        """
+        """Read a file that ``save`` wrote."""
         result: Self = result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
         return result
 
@@ -294,11 +286,7 @@ class Result(Summarised):
         raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
 
     def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
-        """``table`` as a ``pandas.DataFrame``; missing values are NaN.
-
-        Args:
-            pixel_size: As in ``table``.
-        """
+        """``table`` as a ``pandas.DataFrame``; missing values are NaN."""
         frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
             self.table(pixel_size=pixel_size)
         )

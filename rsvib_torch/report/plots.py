@@ -219,9 +219,6 @@ def offset_figure(result: DetectionResult) -> Figure:
     the lower edge are rows that were not measured; the line is the offset curve of the detected vibration. Of more than
     13 frames, the upper panels have the 9 neighbouring frames with the largest residual, and the lower ones all.
 
-    Args:
-        result: A detection (not a batch).
-
     Example:
         >>> from rsvib_torch.evaluation import example_frames
         >>> from rsvib_torch.detection import detect_vibration
@@ -396,10 +393,6 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     The offset gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu
     et al. 2023). Blind frequencies are dashed lines.
 
-    Args:
-        result: A detection (not a batch).
-        timing: The sensor.
-
     Example:
         >>> from rsvib_torch.evaluation import example_frames
         >>> from rsvib_torch.detection import detect_vibration
@@ -449,11 +442,6 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
 def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw mean displacement and motion blur of every row of frame 0.
 
-    Args:
-        vibration: The motion (not a batch).
-        timing: The sensor.
-        num_rows: Rows of a frame.
-
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
         >>> figure = rows_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=512)
@@ -478,11 +466,6 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
     """Draw point spread functions of 24 rows of frame 0 with the path of the image during their exposure.
 
     Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
-
-    Args:
-        vibration: The motion (not a batch).
-        timing: The sensor.
-        num_rows: Rows of a frame.
 
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)

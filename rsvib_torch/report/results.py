@@ -106,10 +106,6 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     between the frames by ``offset``; the vibration predicts ``fitted``; ``residual = offset - fitted`` remains after
     correction. All are the displacement in the later frame minus that in the earlier one, in px along x and y, in rad
     for roll. ``std`` is the standard deviation of the offset and of the residual, if it is known.
-
-    Args:
-        path: The file to write; an existing file is replaced.
-        result: A detection (not a batch).
     """
     check_single("result", result)
     curve = result.offsets

@@ -94,14 +94,7 @@ class MtfCurve(
 
     @checks_arguments
     def at(self, frequency: float | Tensor) -> Tensor:
-        """MTF at frequencies of any shape, cycles/px, computed from the line spread function.
-
-        Args:
-            frequency: 0 ... 1 cycles/px.
-
-        Returns:
-            float64 tensor in the shape of ``frequency``.
-        """
+        """MTF at frequencies of any shape, cycles/px, computed from the line spread function."""
         if not isinstance(frequency, Tensor):
             check_number("frequency", frequency, at_least=0.0, at_most=1.0)
         wanted = torch.as_tensor(frequency, dtype=torch.float64, device=self.lsf.device)

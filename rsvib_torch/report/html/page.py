@@ -240,15 +240,9 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
-    """Write ``report.html`` and its figures as PNG files into a folder.
+    """Write ``report.html`` and its figures as PNG files into an existing folder; returns the names of the files.
 
-    Args:
-        folder: An existing folder.
-        report: The content.
-        edges: Positions of slanted edges in the frame on the page; None searches for them.
-
-    Returns:
-        Names of the files.
+    ``edges`` are positions of slanted edges in the frame on the page; None searches for them.
     """
     result, timing = report.detection, report.timing
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
