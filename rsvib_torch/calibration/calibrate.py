@@ -59,14 +59,6 @@ class RowTimeCalibration(
         light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
             flickering light.
         fitted_light: (T, H) the bands that were fitted to it.
-
-    Example:
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> light = 0.4 + 0.2 * torch.cos(2 * torch.pi * torch.arange(512) / 64)  # 1000 Hz, 64 rows per period
-        >>> found = rsv.calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0)
-        >>> f"{1e6 * found.row_time:.3f} us per row"
-        '15.625 us per row'
     """
 
     row_time: float | None

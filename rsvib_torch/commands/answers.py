@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsvib_torch import detection, stacks
 from rsvib_torch import report as reports
-from rsvib_torch.commands.terminal import Answer, error_line
+from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.core.text import number_of, printable, wrapped
 
 if TYPE_CHECKING:
@@ -76,10 +76,10 @@ def warn_of_restoration(result: stacks.RestoredFrames, output: str = "frames") -
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     forced = "writes" if output == "frames" else "shows"
     if not result.moves:
-        error_line(f"no vibration was found that can be removed: {kept}", "warning")
+        warn(f"no vibration was found that can be removed: {kept}")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
-        error_line(result.verdict.sentence + unchanged, "warning")
+        warn(result.verdict.sentence + unchanged)
 
 
 def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:

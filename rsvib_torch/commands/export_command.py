@@ -11,7 +11,7 @@ from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
 from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new, size_of
-from rsvib_torch.commands.terminal import Answer, error_line, working
+from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.validation import options, read_json
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
@@ -133,7 +133,7 @@ def _trusted(
                 f"nothing to export: {'; '.join(notes) or 'no vibration'}; --force exports it nevertheless"
             )
         for note in notes:
-            error_line(note, "warning")
+            warn(note)
     if given.focal_length is None:
         return motion
     if motion.camera is not None:

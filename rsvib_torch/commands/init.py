@@ -14,7 +14,7 @@ from rsvib_torch import io
 from rsvib_torch.commands.answers import next_step
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_rate
-from rsvib_torch.commands.terminal import Answer, error_line, note, working
+from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
@@ -156,7 +156,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         values["frame_rate"] = stated
         note(f"frame rate {stated:.6g} per second, from the times in the file")
     elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
-        error_line(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}", "warning")
+        warn(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}")
     source, likely, proposal = None, {}, ""
     if camera is not None:
         values["row_time"], source = _row_time_of(camera, info, values)
@@ -247,15 +247,12 @@ def _check_timing(timing: SensorTiming, rows: int) -> None:
     readout, period = 1e3 * rows * timing.row_time, 1e3 * timing.frame_period
     note(f"readout of {rows} rows takes {readout:.4g} ms of the frame period of {period:.4g} ms")
     if used > 0.995:  # of the frame period; sensors have at least some blanking rows, data sheets three digits
-        error_line(
+        warn(
             "the row time equals 1 / (frame rate x rows), which is rarely true, because sensors have blanking rows: "
-            "take it from the data sheet, or measure it with rsvib calibrate",
-            "warning",
+            "take it from the data sheet, or measure it with rsvib calibrate"
         )
     elif used < 0.01:  # of the frame period: rarer than a value in a wrong unit
-        error_line(
-            f"the readout takes only {100 * used:.2g} % of the frame period: check the unit of the row time", "warning"
-        )
+        warn(f"the readout takes only {100 * used:.2g} % of the frame period: check the unit of the row time")
 
 
 def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:

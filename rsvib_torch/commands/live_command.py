@@ -18,7 +18,7 @@ from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
-from rsvib_torch.commands.terminal import Answer, error_line
+from rsvib_torch.commands.terminal import Answer, error_line, warn
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import Count, NotNegative, options
@@ -157,7 +157,7 @@ def live_session(given: LiveOptions) -> Answer:
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
     if report.dropped or report.lost:
-        error_line(_missing(report), "warning")
+        warn(_missing(report))
     return _answer(given.source, report, [*files, *saved], drops=drops)
 
 

@@ -15,7 +15,7 @@ from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import Stack, load, restore_and_save
-from rsvib_torch.commands.terminal import Answer, error_line, note, working
+from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import options
@@ -214,7 +214,7 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
     if reasons and not given.force:
         raise ValueError(f"{given.motion}: {'; '.join(reasons)}; --force restores with it nevertheless")
     for reason in reasons:
-        error_line(reason, "warning")
+        warn(reason)
 
 
 def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMotion) -> detection.MotionCheck | None:
@@ -223,7 +223,7 @@ def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMot
     If the clock is stated, an error of the comparison is a warning.
     """
     if len(stack.frames) < 2:
-        error_line("cannot determine whether the motion fits: the comparison needs two frames", "warning")
+        warn("cannot determine whether the motion fits: the comparison needs two frames")
         return None
     try:
         with working("comparing the motion"):
@@ -231,11 +231,11 @@ def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMot
     except ValueError as error:
         if given.offset is None:
             raise
-        error_line(f"cannot determine whether the motion fits: {error}", "warning")
+        warn(f"cannot determine whether the motion fits: {error}")
         return None
     if check.helps:
         for reason in check.reasons:
-            error_line(reason, "warning")
+            warn(reason)
     else:
         _refuse(given, check.reasons)
     return check

@@ -12,7 +12,7 @@ from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
-from rsvib_torch.commands.terminal import Answer, error_line, working
+from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import options
@@ -158,7 +158,7 @@ def _answer_of_windows(
     """What a run on a stack of ``count`` frames found and did, with its warnings."""
     frames, out = given.stack, given.out
     if result.bad_frames:
-        error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
+        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
     written.note_lost(restored, result.not_kept)
     if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
         assert first.restoration is not None
@@ -242,13 +242,13 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
         names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, manifest, given.pixel_size)]
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
-        error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
+        warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
     if not result.restored:
-        error_line("no vibration was found that can be removed: the frames are written unchanged", "warning")
+        warn("no vibration was found that can be removed: the frames are written unchanged")
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
-        error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
+        warn(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}")
     answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
         if stored.shaking is not None:

@@ -136,6 +136,11 @@ def error_line(message: str, kind: str = "error") -> None:
         console.print(line, soft_wrap=not console.is_terminal)
 
 
+def warn(message: str) -> None:
+    """Print a warning to standard error."""
+    error_line(message, "warning")
+
+
 @contextmanager
 def warnings_in_one_line() -> Iterator[None]:
     """Show Python's warnings without file name and source line, each once."""
@@ -145,7 +150,7 @@ def warnings_in_one_line() -> Iterator[None]:
         line = " ".join(str(message).split())
         if line not in shown:
             shown.add(line)
-            error_line(line, "warning")
+            warn(line)
 
     with warnings.catch_warnings():
         warnings.showwarning = show

@@ -10,7 +10,7 @@ import rsvib_torch
 from rsvib_torch import io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
-from rsvib_torch.commands.terminal import error_line, note, working
+from rsvib_torch.commands.terminal import note, warn, working
 from rsvib_torch.core.atomic import check_writable, write_json
 from rsvib_torch.core.text import number_of
 
@@ -42,7 +42,7 @@ def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
     try:
         reports.save_figure(draw(), path)
     except Exception as error:
-        error_line(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}", "warning")
+        warn(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}")
         return []
     return [path.name]
 
@@ -85,4 +85,4 @@ def warn_of_failures(manifest: stacks.StackManifest) -> None:
     """Print a warning if detection or restoration failed in windows."""
     failed = sum(record.error is not None for record in manifest.windows)
     if failed:
-        error_line(f"detection failed in {number_of(failed, 'window')}: see manifest.json", "warning")
+        warn(f"detection failed in {number_of(failed, 'window')}: see manifest.json")

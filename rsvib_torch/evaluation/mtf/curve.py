@@ -53,14 +53,6 @@ class MtfCurve(
         far: () amplitude of the tail in ``esf`` and ``lsf``.
         levels: (2,) values of the dark and the bright side at the middle of the edge.
         noise: () standard deviation of the noise of a pixel, root mean square over the ROI.
-
-    Example:
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> y, x = torch.meshgrid(torch.arange(60.0) - 30, torch.arange(40.0) - 20, indexing="ij")
-        >>> sharp, blurred = (rsv.slanted_edge_mtf(torch.special.ndtr((x + 0.1 * y) / s)) for s in (0.5, 1.0))
-        >>> bool(sharp.mtf50 > blurred.mtf50)  # cycles per pixel
-        True
     """
 
     frequency: Tensor
