@@ -5,11 +5,12 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rsvib_torch import detection, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, warn
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import number_of, printable, wrapped
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def _shell_word(text: str) -> str:
     return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
 
 
-def detection_data(result: detection.DetectionResult) -> dict[str, Any]:
+def detection_data(result: detection.DetectionResult) -> Table:
     """A detection without its offset curve."""
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
 

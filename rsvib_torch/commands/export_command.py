@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import rsvib_torch
 from rsvib_torch import io, restoration
@@ -13,6 +12,7 @@ from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new, size_of
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import check_writable
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.validation import options, read_json
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
 
@@ -78,7 +78,7 @@ def export(given: ExportOptions) -> Answer:
     timing = detected.timing
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
-    data: dict[str, Any] = {"format": chosen}
+    data: Table = {"format": chosen}
     if chosen == "isd":
         if given.camera_isd is None:
             raise ValueError(

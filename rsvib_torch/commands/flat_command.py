@@ -11,6 +11,7 @@ import typer
 from pydantic import Field
 
 from rsvib_torch.commands.terminal import Answer, error_line, output_of, show_answer
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.validation import fields_of, members_of, options
 from rsvib_torch.options import COMMAND_LINE
 
@@ -127,8 +128,8 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
         with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
             run(given)
 
-    def run(given: dict[str, Any]) -> None:
-        values: dict[str, Any] = {}
+    def run(given: Table) -> None:
+        values: Table = {}
         for place, parameter in fields:
             value = given[parameter.name]
             if place == parameter.name:

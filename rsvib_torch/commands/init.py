@@ -18,6 +18,7 @@ from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import measured_text, printable, text_table
 from rsvib_torch.core.validation import MistakesError, fields_of, options
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
@@ -39,7 +40,7 @@ class InitOptions:
     out: Path = Path("camera.toml")
     """Configuration file to write."""
     sensor: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             SensorSection,
             forms={
@@ -196,7 +197,7 @@ def _likely_full_scale(pixels: Any) -> float:
     return float(((1 << max(int(pixels.max()) // step, 255).bit_length()) - 1) * step)
 
 
-def _complete(values: dict[str, Any], rows: int, likely: Mapping[str, float], proposal: str) -> None:
+def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
     """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
     questions: dict[str, tuple[str, Callable[[str], float]]] = {
         "frame_rate": ("--frame-rate", rate),

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 
 from pydantic import Field
 
@@ -20,6 +20,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
 from rsvib_torch.core.atomic import check_writable
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import Count, NotNegative, options
 from rsvib_torch.options import BorderName, TrackerOptions, method_options
@@ -54,7 +55,7 @@ class LiveOptions(CameraOptions, RangeOptions):
     realtime: bool = False
     """Read a file at its own rate, and drop frames like a camera."""
     tracker: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             TrackerOptions,
             ("window", "columns"),

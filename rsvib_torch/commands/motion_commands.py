@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
@@ -17,6 +17,7 @@ from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import Stack, load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.core.atomic import check_writable, whole_file
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import options
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
@@ -34,7 +35,7 @@ class MotionOptions(shared.StackCommand, shared.VerdictOptions):
     model: Literal["free", "swept"] = "free"
     """free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose
     frequency changes linearly."""
-    detection: Annotated[dict[str, Any], Given(FreeMotionOptions, ("knot_rows", "search"))]
+    detection: Annotated[Table, Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
 def motion(given: MotionOptions) -> Answer:
@@ -81,7 +82,7 @@ def motion(given: MotionOptions) -> Answer:
     )
 
 
-def _without_curve(result: Result) -> dict[str, Any]:
+def _without_curve(result: Result) -> Table:
     """The values of a result without its curves, which have a value for every row or knot."""
     curve = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light"}
     curve |= {"measured", "predicted"}
@@ -139,7 +140,7 @@ def known(given: KnownOptions) -> Answer:
     shape = shared.restored_shape(info, options)
     io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     results: dict[str, list[str]] = {}
-    data: dict[str, Any] = {"alignment": None, "check": None}
+    data: Table = {"alignment": None, "check": None}
     stack = load(given, options)
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
         with working("aligning the recording"):

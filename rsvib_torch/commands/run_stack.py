@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from rsvib_torch import detection, io, stacks, tracking
 from rsvib_torch import report as reports
@@ -14,6 +14,7 @@ from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCom
 from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import whole_folder
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import options
 from rsvib_torch.options import ProcessStackOptions, ProcessVideoOptions, WindowOptions
@@ -41,7 +42,7 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
     Videos are followed frame by frame instead of in windows."""
     moved: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             ProcessVideoOptions,
             context="With --video, ",
@@ -67,8 +68,8 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
             },
         ),
     ]
-    windows: Annotated[dict[str, Any], Given(WindowOptions, default="from the configuration")]
-    processing: Annotated[dict[str, Any], Given(ProcessStackOptions, _PROCESSING)]
+    windows: Annotated[Table, Given(WindowOptions, default="from the configuration")]
+    processing: Annotated[Table, Given(ProcessStackOptions, _PROCESSING)]
 
 
 def run(given: RunOptions) -> Answer:
@@ -109,9 +110,7 @@ def run(given: RunOptions) -> Answer:
     return answer
 
 
-def _run_windows(
-    given: RunOptions, restored: Path, info: io.StackInfo, common: dict[str, Any], chosen: WindowOptions
-) -> Answer:
+def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions) -> Answer:
     """Process a stack in windows."""
     settings, frames, out = given.settings, given.stack, given.out
     common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
@@ -176,7 +175,7 @@ def _answer_of_windows(
     return answer
 
 
-def _comparison(given: RunOptions, common: dict[str, Any], first: stacks.WindowResult) -> Figure:
+def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) -> Figure:
     """Draw the first restored frame of a stack beside the frame of the input."""
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
     from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
@@ -202,7 +201,7 @@ def _frame(path: Path, index: int, full_scale: float | None) -> Tensor:
     return frame
 
 
-def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> Answer:
+def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
     only_windows = {

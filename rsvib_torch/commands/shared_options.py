@@ -18,6 +18,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.validation import options
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
@@ -85,9 +86,9 @@ def size_of(text: str, expected: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-TIME: dict[str, Any] = {"parser": seconds, "metavar": "TIME"}  # form of an option
+TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
-SENSOR_FORMS: dict[str, dict[str, Any]] = {
+SENSOR_FORMS: dict[str, Table] = {
     "row_time": {"text": "Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.", **TIME},
     "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
     "frame_rate": {
@@ -138,7 +139,7 @@ class CameraOptions:
 
     config: Path | None = None
     """TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate."""
-    sensor: Annotated[dict[str, Any], Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
+    sensor: Annotated[Table, Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
     readout_time: float | None = option(None, **TIME)
     """Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time."""
     full_scale: float | None = option(None, show_default="from the file, or the configuration")
@@ -206,9 +207,7 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         """Files that are read."""
         return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
 
-    def planned_restoration(
-        self, given: Mapping[str, Any] | None = None
-    ) -> "tuple[StackInfo, float | None, dict[str, Any]]":
+    def planned_restoration(self, given: Mapping[str, Any] | None = None) -> "tuple[StackInfo, float | None, Table]":
         """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
         info = io.read_stack_info(self.stack)
         scale = full_scale_of(self.stack, info, self.settings, self.full_scale)
@@ -220,7 +219,7 @@ class RestorationCommand(StackCommand):
     """A command that restores the frames with options of ``restore``."""
 
     restoration: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             RestorationOptions,
             default="from the configuration",
@@ -312,7 +311,7 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
 
 def _restoration_options(
     info: "StackInfo", full_scale: float | None, options: Mapping[str, Any], given: Mapping[str, Any]
-) -> dict[str, Any]:
+) -> Table:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
     options, given = dict(options), dict(given)
     method = given.get("method", options.get("method", "exact"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
@@ -17,7 +17,7 @@ from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, note, running_command, working
 from rsvib_torch.core.atomic import check_writable, whole_folder
-from rsvib_torch.core.reading import check_regular
+from rsvib_torch.core.reading import Table, check_regular
 from rsvib_torch.core.text import printable
 from rsvib_torch.core.validation import options
 from rsvib_torch.options import DetectStackOptions
@@ -43,7 +43,7 @@ class Stack:
     timing: rsvib_torch.SensorTiming  # the sensor, with the frame times of the file
 
 
-def load(given: shared.StackCommand, restoration: dict[str, Any] | None = None) -> Stack:
+def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows."""
     from rsvib_torch.stacks.memory import check_stack_fits  # noqa: PLC0415
 
@@ -73,7 +73,7 @@ def _detect(stack: Stack, config: Config) -> detection.DetectionResult:
 
 
 def _restore(
-    stack: Stack, motion: Motion | DetectedVibration, options: dict[str, Any], force: bool, output: str = "frames"
+    stack: Stack, motion: Motion | DetectedVibration, options: Table, force: bool, output: str = "frames"
 ) -> stacks.RestoredFrames:
     """Restore frames, and judge the result on eight pairs of frames; ``output`` names what will be written."""
     with working("restoring and judging"):
@@ -86,7 +86,7 @@ def restore_and_save(
     path: Path,
     stack: Stack,
     motion: Motion | DetectedVibration,
-    options: dict[str, Any],
+    options: Table,
     force: bool,
     report: Path | None = None,
 ) -> stacks.RestoredFrames:
@@ -169,7 +169,7 @@ class DetectOptions(shared.StackCommand, shared.PixelSizeOptions, shared.Verdict
     out: Path = option(...)
     """Folder for vibration.json, tables (tones, offsets, spectrum) and figures."""
     windows: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             DetectStackOptions,
             ("memory", "workers", "follow"),

@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.text import Text
 
 from rsvib_torch.core.progress import listening
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import json_text, printable, shortened, wrapped
 
 
@@ -27,7 +28,7 @@ class Answer:
     """What a command found and did: the last thing that it prints."""
 
     results: dict[str, list[str]]  # titles of the results, and their lines
-    data: dict[str, Any]  # the same for ``--json``, values that JSON can store
+    data: Table  # the same for ``--json``, values that JSON can store
     files: list[Path] = field(default_factory=list)  # files that were written, the one to open first in front
     next_steps: list[str] = field(default_factory=list)  # what to do next: sentences and commands
     reliable: dict[str, bool] = field(default_factory=dict)  # verdict on each axis, in all windows

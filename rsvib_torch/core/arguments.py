@@ -146,7 +146,7 @@ def check_pixels(name: str, pixels: Tensor) -> None:
         )
 
 
-def check_broadcast(**tensors: Any) -> None:
+def check_broadcast(**tensors: object) -> None:
     """Raise a ``ValueError`` unless tensors broadcast; other values are omitted."""
     given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
     if len(given) < 2:
@@ -234,7 +234,7 @@ def hints_of(owner: Any) -> dict[str, Any]:
     return get_type_hints(types.SimpleNamespace(__annotations__=given), names, known, include_extras=True)
 
 
-def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
+def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> Any:
     """The value, or a tuple in place of a list or array, if it is of a kind."""
     adapter, members = _adapter(kind, finite)
     if torch.device in members and value is not None:
@@ -249,7 +249,7 @@ def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
 
 
 @cache
-def _adapter(kind: Any, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
+def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
     """The check of an annotation, None where the function converts the value itself; and the members of a union."""
     members = members_of(kind)
     made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1

@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rsvib_torch.core.text import json_text
 
@@ -214,7 +214,7 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield part
 
 
-def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+def write_json(path: str | os.PathLike[str], content: Mapping[str, object]) -> None:
     """Write a table as JSON with one key per line, atomically."""
     with whole_file(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")

@@ -21,7 +21,7 @@ def flat_options(
     names = {parameter.name for parameter in direct}
 
     @wraps(function)
-    def flat(*args: Any, **given: Any) -> Any:
+    def flat(*args: object, **given: object) -> object:
         own = {name: given.pop(name) for name in names & given.keys()}
         return function(*args, **own, options=(build or group)(**given))
 
@@ -45,7 +45,7 @@ def _without_bounds(annotation: Any) -> Any:
     return annotation
 
 
-def _with_options(text: str, group: Any) -> str:
+def _with_options(text: str, group: type) -> str:
     """A docstring in which the line ``options:`` is replaced by the options of a group; without text, only these."""
     lines = (text or "Args:\n    options: Options.").splitlines()
     place = next((number for number, line in enumerate(lines) if line.startswith("    options:")), len(lines))

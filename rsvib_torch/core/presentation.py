@@ -22,6 +22,7 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_fields, check_shapes, checked_methods
 from rsvib_torch.core.checks import check_number, described, needed_package
 from rsvib_torch.core.figures import FIGURES, figure_of
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import texts
 from rsvib_torch.core.result_files import figure_png, result_of, save_result, write_figure
 from rsvib_torch.core.text import data_uri, text_table, wrapped
@@ -51,7 +52,11 @@ def axis_head(batch_shape: Sequence[int]) -> list[str]:
 
 
 def verdict_table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], batch_shape: Sequence[int], reliable: Any, reasons: Any
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    batch_shape: Sequence[int],
+    reliable: Tensor,
+    reasons: tuple[Any, ...],
 ) -> list[str]:
     """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
@@ -76,7 +81,7 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
 # Dictionaries
 
 
-def plain_values(value: Any) -> Any:
+def plain_values(value: object) -> Any:
     """A value as JSON can store it: tensors as nested lists, None for numbers that are not finite, results as tables.
 
     Example:
@@ -99,7 +104,7 @@ def plain_values(value: Any) -> Any:
 # Tables
 
 
-def joined_columns(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+def joined_columns(lines: Sequence[Mapping[str, object]]) -> dict[str, list[object]]:
     """Columns of a table from its lines; a cell that a line does not have is None."""
     names = dict.fromkeys(name for line in lines for name in line)
     return {name: [line.get(name) for line in lines] for name in names}
@@ -218,7 +223,7 @@ class Result(Summarised):
                 return value.shape[: value.ndim + 1 - len(stated.split())]
         return ()
 
-    def _fields_of_batch(self) -> dict[str, Any]:
+    def _fields_of_batch(self) -> Table:
         """Fields that have one entry for each result of a batch, by the leading dimensions that their shapes state."""
         return {
             name: value
@@ -257,7 +262,7 @@ class Result(Summarised):
             object.__setattr__(result, name, joined)
         return result
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Table:
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
         return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 

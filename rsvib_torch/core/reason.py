@@ -95,7 +95,7 @@ class Reason:
         """The text after the name of the axis."""
         return str(self) if self.axis is None else f"{self.axis}: {self}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The reason as JSON can store it, with its text; None for numbers that are not finite."""
         numbers = {"value": self.value, "limit": self.limit, **self.details}
         for name, number in numbers.items():

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.core.arguments import check_fields, hints_of
 from rsvib_torch.core.atomic import whole_file, write_json
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import read_findings
 from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import members_of
@@ -26,7 +27,7 @@ def save_result(result: Any, path: Path) -> None:
     write_json(path, {"format": result.file_format, "version": 1, **result.to_dict(), "units": dict(result.units)})
 
 
-def result_of(kind: type[Any], data: dict[str, Any], path: Path) -> Any:
+def result_of(kind: type[Any], data: Table, path: Path) -> Any:
     """A result of a class from the content of a file that ``save_result`` wrote, see ``Result.load``."""
     if data.get("format") != kind.file_format or data.get("version") != 1:
         raise ValueError(
@@ -39,7 +40,7 @@ def result_of(kind: type[Any], data: dict[str, Any], path: Path) -> Any:
         raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
 
 
-def decode(kind: Any, value: Any, path: str, missing: float = math.nan) -> Any:
+def decode(kind: object, value: object, path: str, missing: float = math.nan) -> Any:
     """A value of an annotated type from what ``plain_values`` made of it; ``check_fields`` checks the other types.
 
     ``path`` is its place in the file, for messages; ``missing`` is what None stands for in a tensor.
@@ -61,7 +62,7 @@ def _dataclass(kind: Any, value: object, path: str) -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{path}: expected a table, got {quoted(value)}")
     hints, start, missing = hints_of(kind), f"{path}." if path else "", getattr(kind, "_MISSING", math.nan)
-    values: dict[str, Any] = {}
+    values: Table = {}
     for field in fields(kind):
         if field.name in value:
             stated, hint = value[field.name], hints[field.name]
@@ -95,7 +96,7 @@ def _tensor(value: object, path: str, missing: float) -> Tensor:
     return tensor
 
 
-def _tuples(value: Any) -> Any:
+def _tuples(value: object) -> object:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 

@@ -15,17 +15,17 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-from pydantic_core import PydanticCustomError, core_schema
+from pydantic_core import ErrorDetails, PydanticCustomError, core_schema
 
 from rsvib_torch.core.checks import MAX_NUMBER, Error, described, named
-from rsvib_torch.core.reading import read_text
+from rsvib_torch.core.reading import Table, read_text
 from rsvib_torch.core.text import one_line, quoted
 
 _Group = TypeVar("_Group")
 _Result = TypeVar("_Result")
 _MAX_LINES = 20  # of an error message
 _MAX_JSON_BYTES = 10**9  # a manifest has about 2 KB per window
-_TYPE_NAMES: dict[Any, str] = {
+_TYPE_NAMES: dict[object, str] = {
     float: "a number",
     int: "a whole number",
     str: "text",
@@ -36,7 +36,7 @@ _TYPE_NAMES: dict[Any, str] = {
     os.PathLike: "a path",
 }
 _CLASS_NAMES = {"Tensor": "a tensor", "ndarray": "a NumPy array"}
-_LIST_NAMES: dict[Any, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
+_LIST_NAMES: dict[object, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
 _BOUNDS = {
     "greater_than": "larger than {gt:g}",
     "greater_than_equal": "at least {ge:g}",
@@ -83,7 +83,7 @@ class Extensible:
     """
 
     @staticmethod
-    def __get_pydantic_core_schema__(source: Any, handler: Callable[[Any], Any]) -> Any:
+    def __get_pydantic_core_schema__(source: object, handler: object) -> core_schema.CoreSchema:
         """Schema of any text outside of files."""
         names = get_args(source)
 
@@ -125,7 +125,7 @@ def options(group: type[_Group]) -> type[_Group]:
     return made  # type: ignore[no-any-return]
 
 
-def _describe(group: Any) -> None:
+def _describe(group: type) -> None:
     """Give each field of a group its description in one line, from its class or the one below it that states it."""
     for name, field in fields_of(group).items():
         stated = (getattr(kind, "__pydantic_fields__", {}).get(name) for kind in group.__mro__)
@@ -133,7 +133,7 @@ def _describe(group: Any) -> None:
         field.description = " ".join((described_by.description or "").split())
 
 
-def _accepts_tables(_: type, source: Any, handler: Callable[[Any], Any]) -> Any:
+def _accepts_tables(_: type, source: object, handler: Callable[[object], Table]) -> Table:
     """Schema of a group that can be a table; its values are not converted nevertheless."""
     schema = handler(source)
     return schema | {"strict": False} if schema["type"] == "dataclass" else schema
@@ -146,9 +146,9 @@ def _plain(value: Any) -> Any:
     return value.tolist() if value.ndim < 2 and value.size < 10 else value
 
 
-def fields_of(group: Any) -> dict[str, Any]:
+def fields_of(group: type) -> Table:
     """Fields of a group of options or of a section, by name: annotation, default and description."""
-    return dict(group.model_fields if issubclass(group, BaseModel) else group.__pydantic_fields__)
+    return dict(vars(group)["__pydantic_fields__"])
 
 
 def not_an_option(name: str, message: str) -> PydanticCustomError:
@@ -156,7 +156,7 @@ def not_an_option(name: str, message: str) -> PydanticCustomError:
     return PydanticCustomError(_NOT_AN_OPTION, "{message}", {"name": name, "message": message})
 
 
-def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result:
+def checked(build: Callable[..., _Result], *args: object, **kwargs: object) -> _Result:
     """Call ``build`` in a validator: pydantic reports ``ValueError`` only, so a ``TypeError`` becomes one."""
     try:
         return build(*args, **kwargs)
@@ -166,7 +166,7 @@ def checked(build: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result
         raise changed from error
 
 
-def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Result:
+def validate(model: type[_Result], data: Mapping[str, object], source: str) -> _Result:
     """Parsed TOML or JSON as a ``Section`` or group of options; an error has a line for each mistake in ``source``."""
     try:
         return TypeAdapter(model).validate_python(data, context={"file": source})
@@ -177,7 +177,7 @@ def validate(model: type[_Result], data: Mapping[str, Any], source: str) -> _Res
         raise mistakes[0].named(MistakesError([*lines[:_MAX_LINES], *more])) from error
 
 
-def validated(name: str, value: Any, adapter: TypeAdapter[Any], kind: Any) -> Any:
+def validated(name: str, value: object, adapter: TypeAdapter[Any], kind: object) -> Any:
     """Return the value of an argument if it is of a kind, as ``adapter`` converts it."""
     try:
         return adapter.validate_python(_plain(value))
@@ -192,11 +192,11 @@ class _Mistake:
     """A mistake at one key."""
 
     path: str  # the key, with the tables around it
-    value: Any = None  # the value
+    value: object = None  # the value
     expected: str = ""  # what was expected instead
     text: str = ""  # a sentence that replaces the others
     known: tuple[str, ...] = ()  # the keys that exist, for one that does not
-    choices: tuple[Any, ...] = ()  # the choices, if there is nothing else
+    choices: tuple[object, ...] = ()  # the choices, if there is nothing else
     accepts_none: bool = False  # whether None is possible in Python
     kind: type[Exception] = ValueError  # the exception in Python
     is_bound: bool = False  # whether the value has the right type and is out of bounds
@@ -231,7 +231,7 @@ class _Mistake:
         return f"{place}: {self.text or f'expected {self.expected}, got {quoted(self.value)}'}"
 
 
-def _mistakes(model: Any, data: Any, error: ValidationError) -> list[_Mistake]:
+def _mistakes(model: object, data: object, error: ValidationError) -> list[_Mistake]:
     """The mistakes that pydantic found, one for each key: of the members of a union, that of the fitting type."""
     found: dict[str, _Mistake] = {}
     for entry in error.errors(include_url=False):
@@ -241,11 +241,10 @@ def _mistakes(model: Any, data: Any, error: ValidationError) -> list[_Mistake]:
     return list(found.values())
 
 
-def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
+def _mistake(model: object, data: object, entry: ErrorDetails) -> _Mistake:
     """What an entry of pydantic means: the key at its location, and what is wrong."""
     path = ""
-    value: Any = data
-    expected: Any = model
+    value, expected = data, model
     kind, context = entry["type"], entry.get("ctx", {})
     for step in entry["loc"]:
         tables = [member for member in members_of(expected) if get_origin(member) in (Mapping, dict)]
@@ -279,7 +278,7 @@ def _mistake(model: Any, data: Any, entry: Any) -> _Mistake:
     return _Mistake(path, value, expected_text(expected), kind=error, choices=only, accepts_none=accepts_none)
 
 
-def members_of(annotation: Any) -> tuple[Any, ...]:
+def members_of(annotation: object) -> tuple[Any, ...]:
     """Members of a union without their bounds, and without None."""
     annotation = without_alias(annotation)
     if get_origin(annotation) is Annotated:
@@ -298,7 +297,7 @@ def without_alias(annotation: Any) -> Any:
     return alias.__value__[arguments] if arguments else alias.__value__
 
 
-def _items(annotation: Any, index: int) -> Iterator[Any]:
+def _items(annotation: object, index: int) -> Iterator[object]:
     """Types that an entry of a list or tuple may have."""
     for member in members_of(annotation):
         if get_origin(member) in (list, tuple, Sequence):
@@ -306,7 +305,7 @@ def _items(annotation: Any, index: int) -> Iterator[Any]:
             yield get_args(member)[index if several else 0]
 
 
-def _keys(annotation: Any) -> dict[str, Any]:
+def _keys(annotation: object) -> dict[str, object]:
     """Keys of a table with their types; empty for a table with arbitrary keys."""
     for member in members_of(annotation):
         if isinstance(member, type) and hasattr(member, "__pydantic_fields__"):
@@ -314,7 +313,7 @@ def _keys(annotation: Any) -> dict[str, Any]:
     return {}
 
 
-def expected_text(annotation: Any) -> str:
+def expected_text(annotation: object) -> str:
     """Description of a type in a message."""
     words: list[str] = []
     for member in members_of(annotation):
@@ -338,7 +337,7 @@ def expected_text(annotation: Any) -> str:
     return " or ".join(dict.fromkeys(words))
 
 
-def read_json(path: Path, what: str) -> dict[str, Any]:
+def read_json(path: Path, what: str) -> Table:
     """Read a table from a JSON file of a kind, at most 1 GB."""
     try:
         text = read_text(path, at_most=_MAX_JSON_BYTES)

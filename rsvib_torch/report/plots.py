@@ -24,6 +24,7 @@ from rsvib_torch.core.arguments import check_shapes, checks_arguments
 from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.figures import FIGURES
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.result_files import figure_png, write_figure
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import Count
@@ -44,10 +45,10 @@ _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
 _X_COLOUR, _Y_COLOUR = "#14487a", "#c8102e"
 _AXIS_COLOURS = {"x": _X_COLOUR, "y": _Y_COLOUR}
 _FIT_COLOUR = _Y_COLOUR
-_LEGEND: dict[str, Any] = {"fontsize": 9, "frameon": False}
-_LEGEND_ABOVE: dict[str, Any] = {**_LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-_TITLE: dict[str, Any] = {"loc": "left", "fontsize": 9.5, "color": _INK}
-_HEADING: dict[str, Any] = {"loc": "left", "fontsize": 12, "fontweight": "bold", "color": _INK}
+_LEGEND: Table = {"fontsize": 9, "frameon": False}
+_LEGEND_ABOVE: Table = {**_LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+_TITLE: Table = {"loc": "left", "fontsize": 9.5, "color": _INK}
+_HEADING: Table = {"loc": "left", "fontsize": 12, "fontweight": "bold", "color": _INK}
 _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", _X_COLOUR])  # poor ... good
 
@@ -124,7 +125,7 @@ def _plot_axes(
         panel.legend(**_LEGEND, ncols=2)
 
 
-def _marker(colour: str, reliable: bool) -> dict[str, Any]:
+def _marker(colour: str, reliable: bool) -> Table:
     """Style of points: hollow if they are not reliable."""
     return {"color": colour, "marker": "o", "linestyle": "none", "markerfacecolor": colour if reliable else "white"}
 
@@ -410,7 +411,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     for panel in (upper, lower):
         for blind in blind_frequencies(timing, highest).tolist():
             panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    labels: dict[str, Any] = {}
+    labels: Table = {}
     for axis, name in enumerate("xy"):
         reliable = bool(result.reliable[axis])
         style = _marker(_AXIS_COLOURS[name], reliable) | {"markersize": 6}

@@ -5,15 +5,16 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.presentation import Result, plain_values
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.result_files import result_of
 from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import read_json
@@ -84,7 +85,7 @@ def load_detection(path: Path) -> DetectionResult:
 def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -> None:
     """Raise an error if a detection was stored with another timing than that of the frames to be restored."""
 
-    def equal(first: Any, second: Any) -> bool:
+    def equal(first: ArrayLike, second: ArrayLike) -> bool:
         if np.shape(first) != np.shape(second) or {str, type(None)} & {type(first), type(second)}:
             return bool(first == second)
         return np.allclose(first, second, rtol=1e-9, atol=0.0)  # up to rounding
@@ -157,7 +158,7 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
     write_columns(path, result.table(pixel_size=pixel_size))
 
 
-def restoration_data(result: RestoredFrames) -> dict[str, Any]:
+def restoration_data(result: RestoredFrames) -> Table:
     """What was restored, and whether that helped, as values that JSON can store."""
     verdict = result.verdict
     return {
@@ -171,14 +172,14 @@ def restoration_data(result: RestoredFrames) -> dict[str, Any]:
 
 
 def write_restoration(
-    path: str | os.PathLike[str], result: RestoredFrames, options: dict[str, Any], not_kept: Sequence[str] = ()
+    path: str | os.PathLike[str], result: RestoredFrames, options: Table, not_kept: Sequence[str] = ()
 ) -> None:
     """Write whether frames were restored, with which options of ``restore``, and whether that helped, as JSON.
 
     ``not_kept`` names metadata of the input that the output does not contain.
     """
     verdict = result.verdict
-    content: dict[str, Any] = {"format": "rsvib restoration", "version": 1, "options": options}
+    content: Table = {"format": "rsvib restoration", "version": 1, "options": options}
     content |= {**restoration_data(result), "not_kept": list(not_kept)}
     if verdict is not None:
         pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}

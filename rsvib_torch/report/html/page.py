@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
@@ -66,7 +66,7 @@ class Report:
     detection: DetectionResult
     verdict: RestorationVerdict | None
     left_alone: tuple[Reason, ...]
-    options: dict[str, Any]
+    options: Table
     version: str
     next_steps: tuple[tuple[str, str], ...] = ()
     command: str | None = None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.result_files import figure_png
 from rsvib_torch.core.text import data_uri
 from rsvib_torch.report.plots import picture
@@ -161,7 +162,7 @@ def _explained(text: str, terms: Mapping[str, str]) -> Markup:
     )
 
 
-def write_page(path: str | os.PathLike[str], template: str, content: dict[str, Any]) -> None:
+def write_page(path: str | os.PathLike[str], template: str, content: Table) -> None:
     """Write a page from a template of the package; text is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rsvib_torch.report.html"),

@@ -3,9 +3,10 @@
 import math
 from collections.abc import Sequence
 from datetime import datetime
-from typing import Any, Literal
+from typing import Literal
 
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
@@ -144,7 +145,7 @@ def verdict_sentences(
 
 
 def tried_sentences(
-    result: DetectionResult, options: dict[str, Any], verdict: RestorationVerdict | None, found: Sequence[str]
+    result: DetectionResult, options: Table, verdict: RestorationVerdict | None, found: Sequence[str]
 ) -> list[str]:
     """What was tried where no frame was restored: the detection, its findings ``found``, and the restoration."""
     curve = result.offsets
@@ -161,7 +162,7 @@ def tried_sentences(
     return [*sentences, f"Frames were restored{f' with {chosen}' * bool(chosen)} and judged; they are not written."]
 
 
-def about_rows(created: datetime, version: str, command: str | None, options: dict[str, Any]) -> list[list[str]]:
+def about_rows(created: datetime, version: str, command: str | None, options: Table) -> list[list[str]]:
     """Lines of the table of the report itself: when and how it was made."""
     rows = [["created", created.isoformat(" ", "seconds")], ["program", f"rsvib_torch {version}"]]
     if command is not None:
