@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import typer
 from pydantic import Field
 
-from rsvib_torch.commands.terminal import Answer, error_line, output_of, show_answer
+from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
 from rsvib_torch.core.reading import Table
 from rsvib_torch.core.validation import fields_of, members_of, options
 from rsvib_torch.options import COMMAND_LINE
@@ -125,10 +125,6 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
     fields = list(_parameters(group))
 
     def flat(**given: Any) -> None:
-        with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
-            run(given)
-
-    def run(given: Table) -> None:
         values: Table = {}
         for place, parameter in fields:
             value = given[parameter.name]
@@ -137,14 +133,16 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
             else:
                 is_given = value is not None and value is not False
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
-        with output_of(as_json=given["as_json"], quiet=given["quiet"]):
+        output = current_output()
+        output.as_json, output.quiet = given["as_json"], given["quiet"]
+        with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
             answer = command(group(**values))
-            show_answer(name, answer)
-            required = values.get("require_reliable") or ""
-            missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]
-            if missed:
-                error_line(f"--require-reliable: {' and '.join(missed)} not reliable; the files are complete")
-                raise typer.Exit(_NOT_RELIABLE)
+        show_answer(name, answer)
+        required = values.get("require_reliable") or ""
+        missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]
+        if missed:
+            error_line(f"--require-reliable: {' and '.join(missed)} not reliable; the files are complete")
+            raise typer.Exit(_NOT_RELIABLE)
 
     parameters = [parameter for _, parameter in (*fields, *_parameters(_OutputOptions))]
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -157,8 +157,13 @@ def live_session(given: LiveOptions) -> Answer:
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
-    if report.dropped or report.lost:
-        warn(_missing(report))
+    missing = {
+        "dropped, because processing was too slow (fewer --columns)": report.dropped,
+        "not delivered by the source": report.lost,
+    }
+    parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
+    if parts:
+        warn("; ".join(parts))
     return _answer(given.source, report, [*files, *saved], drops=drops)
 
 
@@ -231,15 +236,6 @@ class _StateText:
         found = tracked.detection
         lines = [f"time {tracked.time:.2f} s, {tracked.state}, {report.frames} frames written"]
         self._page.show_state("\n".join([*lines, *([] if found is None else [found.summary()])]))
-
-
-def _missing(report: live.LiveReport) -> str:
-    parts = []
-    if report.dropped:
-        parts.append(f"{number_of(report.dropped, 'frame')} dropped, because processing was too slow (fewer --columns)")
-    if report.lost:
-        parts.append(f"{number_of(report.lost, 'frame')} not delivered by the source")
-    return "; ".join(parts)
 
 
 def _answer(source: str, report: live.LiveReport, files: list[Path], *, drops: bool) -> Answer:

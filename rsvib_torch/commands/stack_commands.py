@@ -15,7 +15,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.terminal import Answer, note, running_command, working
+from rsvib_torch.commands.terminal import Answer, current_output, note, working
 from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.reading import Table, check_regular
 from rsvib_torch.core.text import printable
@@ -370,7 +370,7 @@ def report(given: ReportOptions) -> Answer:
         options=options,
         version=rsvib_torch.__version__,
         next_steps=tuple(answers.step_parts(step) for step in steps),
-        command=running_command(),
+        command=current_output().command,
         windows=windows,
     )
     with whole_folder(out) as folder, working("writing the page"):

@@ -35,11 +35,12 @@ class Answer:
 
 
 @dataclass
-class _Output:
+class Output:
     """Form of the output of a command, and its notes and warnings so far."""
 
-    as_json: bool = False
-    quiet: bool = False
+    command: str | None = None  # the command line, as it can be copied into a shell; None outside of the program
+    as_json: bool = False  # print nothing but the answer, as JSON
+    quiet: bool = False  # print no answer and no progress
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -47,33 +48,22 @@ class _Output:
 LOG_AFTER = 20.0  # s; commands that take less write no progress to files
 _SHOWN_AFTER = 2.0  # s, from which the elapsed time is shown beside that of a loop, which may be one of several
 
-_outputs: list[_Output] = [_Output()]  # of the running command, last
-_command_lines: list[str] = []  # the running one is the last
+_outputs: list[Output] = [Output()]  # that of the running command is the last
 
 
 @contextmanager
 def running(arguments: Sequence[str]) -> Iterator[None]:
-    """Remember the command line while it runs."""
-    _command_lines.append(printable(shlex.join(["rsvib", *arguments])))
-    try:
-        yield
-    finally:
-        _command_lines.pop()
-
-
-def running_command() -> str | None:
-    """The running command line, as it can be copied into a shell; None outside of the program."""
-    return _command_lines[-1] if _command_lines else None
-
-
-@contextmanager
-def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
-    """Form of the output of a command: its answer as JSON, or neither text nor progress."""
-    _outputs.append(_Output(as_json, quiet))
+    """Collect the output of a command line while it runs."""
+    _outputs.append(Output(printable(shlex.join(["rsvib", *arguments]))))
     try:
         yield
     finally:
         _outputs.pop()
+
+
+def current_output() -> Output:
+    """The output of the running command."""
+    return _outputs[-1]
 
 
 def print_line(message: str) -> None:

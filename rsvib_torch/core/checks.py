@@ -52,12 +52,7 @@ def check_single(name: str, value: Any) -> None:
 
 
 def check_number(
-    name: str,
-    value: object,
-    *,
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
+    name: str, value: object, *, above: float = -math.inf, at_least: float = -math.inf, at_most: float = math.inf
 ) -> float:
     """Return ``value`` as a finite float within its bounds; booleans are refused."""
     if isinstance(value, bool) or not isinstance(value, Real):

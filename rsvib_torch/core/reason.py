@@ -97,19 +97,12 @@ class Reason:
 
     def to_dict(self) -> dict[str, object]:
         """The reason as JSON can store it, with its text; None for numbers that are not finite."""
-        numbers = {"value": self.value, "limit": self.limit, **self.details}
-        for name, number in numbers.items():
-            if isinstance(number, float) and not math.isfinite(number):
-                numbers[name] = None
-        value, limit = numbers.pop("value"), numbers.pop("limit")
-        return {
-            "code": self.code,
-            "axis": self.axis,
-            "value": value,
-            "limit": limit,
-            "details": numbers,
-            "text": str(self),
+        numbers = {
+            name: None if isinstance(number, float) and not math.isfinite(number) else number
+            for name, number in {"value": self.value, "limit": self.limit, **self.details}.items()
         }
+        compared = {name: numbers.pop(name) for name in _COMPARED}
+        return {"code": self.code, "axis": self.axis, **compared, "details": numbers, "text": str(self)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Reason":
@@ -347,7 +340,7 @@ _RECORDED = {
     ),
     "axes_mirrored": _of_result(
         "the mirrored axes {axes} fit better than every rotation: the frames are mirrored, or the recording has "
-        "left-handed axes",
+        "left-handed axes"
     ),
     "axes_ambiguous": _of_result("the axes {axes} explain the frames as well", "rotate the camera about all axes"),
     "focal_length_uncertain": _of_result(
