@@ -30,20 +30,13 @@ def option(default: Any, *names: str, **form: Any) -> Any:
 
 @dataclass(frozen=True)
 class Given:
-    """Mark of a field of a command: a dictionary of those options of another group that are given.
+    """Mark of a field of a command: a dictionary of those options of another group that are given."""
 
-    Attributes:
-        group: The group.
-        names: Its options; by default those whose fields are marked by ``COMMAND_LINE``.
-        default: Where the default comes from, before that of the group.
-        context: What comes before the description of each.
-        forms: For options that are stated in another form than the field: arguments of ``option``.
-    """
-
-    group: Any
-    names: tuple[str, ...] = ()
-    default: str = ""
-    context: str = ""
+    group: Any  # the group
+    names: tuple[str, ...] = ()  # its options; by default those whose fields are marked by ``COMMAND_LINE``
+    default: str = ""  # where the default comes from, before that of the group
+    context: str = ""  # what comes before the description of each
+    # for options that are stated in another form than the field: arguments of ``option``
     forms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def parameters(self) -> Iterator[inspect.Parameter]:

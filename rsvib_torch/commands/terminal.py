@@ -184,14 +184,8 @@ def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int
     """Show the elapsed time, and progress, rate and remaining time of a loop.
 
     In a log, which is not a terminal, they are lines: the first one after ``LOG_AFTER`` seconds, each of the others
-    after twice the time.
-
-    Args:
-        description: What is done.
-        counts: Whether the block reports its frames itself; otherwise, the loops in it report their steps.
-
-    Yields:
-        A function to call with the number of processed frames and the number of all frames.
+    after twice the time. With ``counts``, the block calls the function that it gets with the number of processed frames
+    and of all frames; otherwise, the loops in it report their steps.
     """
     begun = time.monotonic()
     with _progress() as progress:

@@ -164,15 +164,8 @@ def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[s
     """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
 
     It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
-    keeps its other files.
-
-    Args:
-        path: The file or folder.
-        kind: As in ``StackFormat``.
-        companions: Endings of files beside it, as in ``StackFormat``.
-
-    Yields:
-        The temporary name, which the block creates.
+    keeps its other files. The block creates what has the temporary name. ``kind``, and ``companions``, the endings of
+    files beside it, are as in ``StackFormat``.
     """
     target = Path(path)
     endings = (*companions, "")  # what describes a file is there before it

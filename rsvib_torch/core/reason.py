@@ -21,22 +21,14 @@ class ReasonKind:
 
     Sentence and remedy are templates with the fields ``value``, ``limit``, ``axis``, ``other`` (the axis across it) and
     the names of the details. A part in square brackets is omitted if one of its details is not given.
-
-    Attributes:
-        sentence: Template of the sentence.
-        remedy: Template of what the user can do; empty if nothing is known.
-        compares: The quantity, and from which limit on it is a reason; empty if there is no limit.
-        unit: Unit of value and limit; empty for a ratio, a count, or nothing.
-        refuses: What is refused.
-        free_model: Whether ``detect_motion`` may explain the frames.
     """
 
-    sentence: str
-    remedy: str = ""
-    compares: str = ""
-    unit: str = ""
-    refuses: str = "the axis"
-    free_model: bool = False
+    sentence: str  # template of the sentence
+    remedy: str = ""  # template of what the user can do; empty if nothing is known
+    compares: str = ""  # the quantity, and from which limit on it is a reason; empty if there is no limit
+    unit: str = ""  # unit of value and limit; empty for a ratio, a count, or nothing
+    refuses: str = "the axis"  # what is refused
+    free_model: bool = False  # whether ``detect_motion`` may explain the frames
 
 
 @dataclass(frozen=True)

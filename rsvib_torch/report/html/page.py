@@ -36,42 +36,25 @@ Box = tuple[int, int, int, int]  # top, left, height, width in px
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Content of a report page.
+    """Content of a report page."""
 
-    Attributes:
-        title: Heading.
-        subtitle: Line below.
-        frames: (T, H, W) or (T, C, H, W) input frames, full scale 1.
-        restored: Frames after restoration, or one frame restored jointly from all; on a finer grid with as many times
-            the rows and columns.
-        was_restored: Whether ``restored`` is restored, or the unchanged input.
-        timing: The sensor.
-        detection: The detection (not a batch).
-        verdict: Comparison of pairs of frames; None if they could not be compared.
-        left_alone: A reason for each axis that was not restored.
-        options: Options of ``restore``.
-        version: Version of the package.
-        next_steps: What to do next, and the command that does it, or an empty text.
-        command: The command line that wrote the page; None for a page written from Python.
-        windows: Windows of the stack that were processed separately; None if there are none.
-        created: Time at which the page was made.
-    """
-
-    title: str
-    subtitle: str
-    frames: Tensor
+    title: str  # heading
+    subtitle: str  # line below
+    frames: Tensor  # (T, H, W) or (T, C, H, W) input frames, full scale 1
+    # frames after restoration, or one frame restored jointly from all; on a finer grid with as many times the rows and
+    # columns
     restored: Tensor
-    was_restored: bool
-    timing: SensorTiming
-    detection: DetectionResult
-    verdict: RestorationVerdict | None
-    left_alone: tuple[Reason, ...]
-    options: Table
-    version: str
-    next_steps: tuple[tuple[str, str], ...] = ()
-    command: str | None = None
-    windows: StackManifest | None = None
-    created: datetime = field(default_factory=lambda: datetime.now().astimezone())
+    was_restored: bool  # whether ``restored`` is restored, or the unchanged input
+    timing: SensorTiming  # the sensor
+    detection: DetectionResult  # the detection (not a batch)
+    verdict: RestorationVerdict | None  # comparison of pairs of frames; None if they could not be compared
+    left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
+    options: Table  # options of ``restore``
+    version: str  # version of the package
+    next_steps: tuple[tuple[str, str], ...] = ()  # what to do next, and the command that does it, or an empty text
+    command: str | None = None  # the command line that wrote the page; None for a page written from Python
+    windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
+    created: datetime = field(default_factory=lambda: datetime.now().astimezone())  # time at which the page was made
 
 
 @dataclass(frozen=True)
