@@ -1,16 +1,19 @@
 """Groups of options and tables from files: their checks, and one line for each mistake.
 
-The class of a group is the only place that states an option: its type, bounds, default and description. ``options``
-makes a class such a group. Python arguments, keys of TOML files and options of the command line are checked by it, and
+The class of a group is the only place that states an option: its type, bounds and default, and its description in the
+text below the field. ``options`` makes a class such a group. Python arguments, keys of TOML files and options of the command line are checked by it, and
 ``_mistakes`` translates what pydantic reports for all of them.
 """
 
+import inspect
 import json
 import os
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin
 
 import pydantic
@@ -149,6 +152,51 @@ def _plain(value: Any) -> Any:
 def fields_of(group: type) -> Table:
     """Fields of a group of options or of a section, by name: annotation, default and description."""
     return dict(vars(group)["__pydantic_fields__"])
+
+
+def flat_options(
+    group: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
+
+    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced. ``build`` makes the
+    options of the arguments, if it is not the group.
+    """
+    direct = [one for name, one in inspect.signature(function).parameters.items() if name != "options"]
+    names = {parameter.name for parameter in direct}
+
+    @wraps(function)
+    def flat(*args: object, **given: object) -> object:
+        own = {name: given.pop(name) for name in names & given.keys()}
+        return function(*args, **own, options=(build or group)(**given))
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    of_group = [
+        inspect.Parameter(name, kind, default=field.get_default(), annotation=_without_bounds(field.annotation))
+        for name, field in fields_of(group).items()
+    ]
+    flat.__signature__ = inspect.Signature([*direct, *of_group])  # type: ignore[attr-defined]
+    flat.__doc__ = _with_options(inspect.getdoc(function) or "", group)
+    return flat
+
+
+def _without_bounds(annotation: Any) -> Any:
+    """The annotation of an option as users read it."""
+    if get_origin(annotation) is Annotated:
+        return _without_bounds(get_args(annotation)[0])
+    if arguments := get_args(annotation):
+        plain = tuple(map(_without_bounds, arguments))
+        return annotation.copy_with(plain) if hasattr(annotation, "copy_with") else annotation
+    return annotation
+
+
+def _with_options(text: str, group: type) -> str:
+    """A docstring in which the line ``options:`` is replaced by the options of a group; without text, only these."""
+    lines = (text or "Args:\n    options: Options.").splitlines()
+    place = next((number for number, line in enumerate(lines) if line.startswith("    options:")), len(lines))
+    entries = (f"{name}: {field.description}" for name, field in fields_of(group).items())
+    listed = [fill(entry, 116, initial_indent=" " * 4, subsequent_indent=" " * 8) for entry in entries]
+    return "\n".join([*lines[:place], *listed, *lines[place + 1 :]])
 
 
 def not_an_option(name: str, message: str) -> PydanticCustomError:
