@@ -1,8 +1,8 @@
 """Groups of options and tables from files: their checks, and one line for each mistake.
 
 The class of a group is the only place that states an option: its type, bounds and default, and its description in the
-text below the field. ``options`` makes a class such a group. Python arguments, keys of TOML files and options of the command line are checked by it, and
-``_mistakes`` translates what pydantic reports for all of them.
+text below the field. ``options`` makes a class such a group. Python arguments, keys of TOML files and options of the
+command line are checked by it, and ``_mistakes`` translates what pydantic reports for all of them.
 """
 
 import inspect

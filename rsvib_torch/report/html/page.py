@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
 
 from torch import Tensor
@@ -87,8 +88,8 @@ def _find_edges(image: Tensor) -> list[Box]:
     searched = 2048  # px
     top, left = (max(0, (size - searched) // 2) for size in image.shape)
     edges = find_slanted_edges(image[top : top + searched, left : left + searched])
-    chosen = [edge for vertical in (True, False) for edge in [e for e in edges if e.near_vertical is vertical][:3]]
-    return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in chosen]
+    chosen = [[edge for edge in edges if edge.near_vertical == vertical][:3] for vertical in (True, False)]
+    return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in chain(*chosen)]
 
 
 def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = None) -> tuple[list[Edge], list[str]]:
@@ -119,7 +120,7 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
         restored = measured(after, box, points, "")
         if restored is not None:
             edges.append(Edge(box, measured(before, box, 1, " in the input"), restored, points))
-        elif boxes is None:  # an edge that was found by a search
+        elif boxes is None:  # nobody asked for this edge
             notes.pop()
     return edges, notes
 
