@@ -1,7 +1,7 @@
 from .export.angular_rates import write_gcsv
 from .export.community_sensor_model import camera_isd, write_isd
 from .export.pixel_map import sampling_map, write_stmap
-from .html import Box, Report, write_report_page
+from .html.page import Box, Report, write_report_page
 from .plots import (
     comparison_figure,
     gain_figure,
