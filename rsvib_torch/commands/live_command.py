@@ -172,9 +172,10 @@ def _source(given: LiveOptions, settings: Config) -> live.FrameSource:
     if given.is_camera:
         return live.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
     if given.file is None:
+        size = given.frame_size
         # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
         stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-        return live.PipeSource(stream, given.frame_size, given.pixel_format, settings.timing)
+        return live.PipeSource(stream, size, given.pixel_format, settings.timing)
     scale = given.full_scale if given.full_scale is not None else settings.full_scale
     return live.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
 
