@@ -11,7 +11,7 @@ from rsvib_torch import detection, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import number_of, printable, wrapped
+from rsvib_torch.core.text import AXES, number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
@@ -34,10 +34,8 @@ def verdicts(
     found: Sequence[DetectedVibration | detection.MotionDetection | detection.SweptTone | None],
 ) -> dict[str, bool]:
     """Whether each axis is reliable in all detections; None is one that failed."""
-    from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415 - loads PyTorch
-
     flags = [[] if one is None else one.reliable.tolist() for one in found]
-    return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXIS_NAMES)}
+    return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXES)}
 
 
 def stack_answer(

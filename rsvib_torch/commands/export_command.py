@@ -13,6 +13,7 @@ from rsvib_torch.commands.shared_options import check_new, size_of
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import check_writable
 from rsvib_torch.core.reading import Table
+from rsvib_torch.core.text import AXES
 from rsvib_torch.core.validation import options, read_json
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
 
@@ -145,11 +146,9 @@ def _trusted(
 
 def _residuals(detected: rsvib_torch.DetectionResult) -> list[str]:
     """A line for each axis: root mean square of the offsets and of the residuals."""
-    from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415
-
     curve = detected.offsets
     lines = []
-    for axis, name in enumerate(AXIS_NAMES[: detected.vibration.num_axes]):
+    for axis, name in enumerate(AXES[: detected.vibration.num_axes]):
         before = curve.offsets[..., axis][curve.good]
         after = before - detected.fitted[..., axis][curve.good]
         unit = ("px", "px", "rad", "")[axis]

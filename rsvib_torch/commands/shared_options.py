@@ -19,6 +19,7 @@ from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.reading import Table
+from rsvib_torch.core.text import AXES
 from rsvib_torch.core.validation import options
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
@@ -73,7 +74,7 @@ def _range_of_frames(text: str) -> str:
 
 def _axes(text: str) -> str:
     """Names of axes with commas between them, as they were given."""
-    if not set(text.split(",")) <= {"x", "y", "roll", "zoom"}:
+    if not set(text.split(",")) <= {*AXES}:
         raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
     return text
 

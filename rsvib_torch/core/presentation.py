@@ -25,7 +25,7 @@ from rsvib_torch.core.figures import FIGURES, figure_of
 from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import texts
 from rsvib_torch.core.result_files import figure_png, result_of, save_result, write_figure
-from rsvib_torch.core.text import data_uri, text_table, wrapped
+from rsvib_torch.core.text import AXES, data_uri, text_table, wrapped
 from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 # Text
 
 
-AXIS_NAMES = ("x", "y", "roll", "zoom")
+AXIS_NAMES = AXES
 AXIS_UNITS = ("px", "px", "rad", "of the scale")
 
 

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+AXES = ("x", "y", "roll", "zoom")  # components of a motion
+
 # Marks that change the direction of the text after them, and separators of lines.
 _INVISIBLE = frozenset("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
