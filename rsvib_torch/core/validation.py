@@ -167,8 +167,8 @@ def flat_options(
 
     @wraps(function)
     def flat(*args: object, **given: object) -> object:
-        own = {name: given.pop(name) for name in names & given.keys()}
-        return function(*args, **own, options=(build or group)(**given))
+        stated = {name: given.pop(name) for name in names & given.keys()}
+        return function(*args, **stated, options=(build or group)(**given))
 
     kind = inspect.Parameter.KEYWORD_ONLY
     of_group = [
