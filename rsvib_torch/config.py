@@ -21,29 +21,18 @@ from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 
 @dataclass(frozen=True)
 class Config:
-    """Content of a configuration file.
+    """Content of a configuration file."""
 
-    Attributes:
-        source: Name of the file, for messages.
-        timing: The sensor.
-        full_scale: Count that corresponds to 1.0 in integer frames; None if it is not in the file.
-        detection: Options of ``detect_vibration`` that are in the file.
-        restoration: Options of ``restore`` that are in the file.
-        simulation: ``[simulation]``, of the class ``simulation_section``; None if it is not in the file.
-        stack: Options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file.
-        arguments: Options of the program that describe the camera, for the commands that it suggests.
-        path: The file; None if the camera is described by options only.
-    """
-
-    source: str
-    timing: SensorTiming
-    full_scale: float | None
-    detection: dict[str, Any]
-    restoration: dict[str, Any]
-    simulation: Any
-    stack: dict[str, Any]
+    source: str  # name of the file, for messages
+    timing: SensorTiming  # the sensor
+    full_scale: float | None  # count that corresponds to 1.0 in integer frames; None if it is not in the file
+    detection: dict[str, Any]  # options of ``detect_vibration`` that are in the file
+    restoration: dict[str, Any]  # options of ``restore`` that are in the file
+    simulation: Any  # ``[simulation]``, of the class ``simulation_section``; None if it is not in the file
+    stack: dict[str, Any]  # options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file
+    # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
-    path: Path | None = None
+    path: Path | None = None  # the file; None if the camera is described by options only
 
 
 @functools.cache
@@ -83,14 +72,13 @@ def simulation_section() -> Any:
 
     class SimulationSection(Section):
         vibration: VibrationSection
-        num_frames: Count = Field(default=2, description="Number of frames.")
-        frame_size: tuple[Count, Count] | None = Field(
-            default=None,
-            strict=False,
-            description="(height, width) of the frames in px; None for the largest size that the scene allows.",
-        )
+        num_frames: Count = 2
+        """Number of frames."""
+        frame_size: tuple[Count, Count] | None = Field(default=None, strict=False)
+        """(height, width) of the frames in px; None for the largest size that the scene allows."""
         noise: SensorNoise | None = None
-        seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Seed of the noise.")
+        seed: int = Field(default=0, ge=0, le=2**63 - 1)
+        """Seed of the noise."""
 
     return SimulationSection
 
@@ -133,9 +121,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
             ``frame_rate`` also ``frame_rows``, and vice versa.
 
     Raises:
-        OSError: If the file cannot be opened.
-        ValueError: If it is not TOML, or a key is missing, unknown or has a wrong type or value: one line per key,
-            with its path, its value and what was expected.
+        ValueError: If it is not TOML, or keys are missing, unknown or have a wrong type or value: one line for each.
 
     Example:
         >>> camera = {"row_time": 20e-6, "exposure_time": 1e-3, "frame_rate": 25}

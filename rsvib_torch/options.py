@@ -1,8 +1,8 @@
 """All options of detection, restoration and stacks, in groups.
 
-A field of a group is the only statement of an option: arguments of public functions, keys of configuration files,
-options of the commands, their checks, help texts and reference pages follow from it. To add an option, add a field, and
-use it where the group is used.
+A field of a group, with the text below it, is the only statement of an option: arguments of public functions, keys of
+configuration files, options of the commands, their checks, help texts and reference pages follow from it. To add an
+option, add a field, and use it where the group is used.
 
 Configuration files and command lines are checked before torch is imported, which takes seconds. This module therefore
 imports no other part of the package. The tables of the packages hold the functions that belong to the names.
@@ -65,159 +65,118 @@ MAX_HARMONICS = 50  # the sensors of the paper sample a tone of 100 Hz up to its
 class InputOptions:
     """How frames are given."""
 
-    full_scale: Positive | None = Field(
-        default=None,
-        description="Count that means 1.0, for integer frames; by default that of the file, 255 for uint8.",
-    )
-    channels: Channels = Field(
-        default=None,
-        description='``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image '
-        'axes, and frames that appear to have them last are refused; ``"first"`` omits this check.',
-    )
+    full_scale: Positive | None = None
+    """Count that means 1.0, for integer frames; by default that of the file, 255 for uint8."""
+    channels: Channels = None
+    """``"last"`` for frames (T, H, W, C) or (B, T, H, W, C). By default channels come before the image axes, and frames
+    that appear to have them last are refused; ``"first"`` omits this check."""
 
 
 @options
 class MaskedInputOptions(InputOptions):
     """How frames are given, with missing pixels."""
 
-    ignore: Annotated[Mask, SkipValidation] = Field(
-        default=None,
-        description="Boolean mask of pixels that do not count (dead, saturated, a dark rim), broadcastable to "
-        "(..., H, W) of the frames; they may hold any value. NaN marks missing pixels as well.",
-    )
+    ignore: Annotated[Mask, SkipValidation] = None
+    """Boolean mask of pixels that do not count (dead, saturated, a dark rim), broadcastable to (..., H, W) of the
+    frames; they may hold any value. NaN marks missing pixels as well."""
 
 
 @options
 class BandOptions:
     """Row bands whose offsets between frames are measured."""
 
-    band_rows: int = Field(default=32, ge=4, le=2**31, description="Rows of a band.")
-    band_step: Count = Field(default=16, description="Rows from one band to the next.")
-    search: int = Field(
-        default=16,
-        ge=2,
-        le=2**31,
-        description="Search range in px around the whole-frame offset; a peak at its edge fails.",
-    )
+    band_rows: int = Field(default=32, ge=4, le=2**31)
+    """Rows of a band."""
+    band_step: Count = 16
+    """Rows from one band to the next."""
+    search: int = Field(default=16, ge=2, le=2**31)
+    """Search range in px around the whole-frame offset; a peak at its edge fails."""
 
 
 @options
 class RegistrationOptions(BandOptions):
     """Row bands, and how their offsets are measured."""
 
-    registration: Annotated[Registration, Extensible] = Field(
-        default="ncc",
-        description='Method of the band registration: ``"projection"`` (gray projection, the paper), ``"ncc"`` or '
-        '``"phase"``, as in ``register_bands``.',
-    )
+    registration: Annotated[Registration, Extensible] = "ncc"
+    """Method of the band registration: ``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``, as in
+    ``register_bands``."""
 
 
 @options
 class ProjectionOptions:
     """The camera, for a motion that is a rotation."""
 
-    focal_length: Positive | None = Field(
-        default=None,
-        description="Focal length in px, for a motion that is a rotation of the camera: displacements then follow from "
-        "the projection (see ``Camera``), which matters for fields of view above about 20 degrees, and the result has "
-        "an ``attitude``. None: the displacement by translation is the same in the whole frame.",
-    )
-    principal_point: tuple[Number, Number] | None = Field(
-        default=None,
-        strict=False,
-        description="px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the "
-        "frame.",
-    )
-    distortion: tuple[Number, Number, Number, Number, Number] | None = Field(
-        default=None,
-        strict=False,
-        description="Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none.",
-    )
+    focal_length: Positive | None = None
+    """Focal length in px, for a motion that is a rotation of the camera: displacements then follow from the projection
+    (see ``Camera``), which matters for fields of view above about 20 degrees, and the result has an ``attitude``. None:
+    the displacement by translation is the same in the whole frame."""
+    principal_point: tuple[Number, Number] | None = Field(default=None, strict=False)
+    """px along x and y from the centre of the first pixel, as in OpenCV; by default the centre of the frame."""
+    distortion: tuple[Number, Number, Number, Number, Number] | None = Field(default=None, strict=False)
+    """Lens distortion (k1, k2, p1, p2, k3) as in OpenCV; by default none."""
 
 
 @options
 class ToneOptions(ProjectionOptions, RegistrationOptions):
     """Detection of tones."""
 
-    method: Annotated[DetectionMethod, Extensible] = Field(
-        default="direct",
-        description='``"direct"``, or ``"bands"`` (of the paper), in half the time with ten times larger errors.',
-    )
-    tones: Annotated[int, Field(ge=1, le=MAX_TONES)] | Literal["auto"] = Field(
-        default="auto",
-        description='Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard '
-        "deviations then allow for a further tone.",
-    )
-    harmonics: int = Field(
-        default=1,
-        ge=1,
-        le=MAX_HARMONICS,
-        description="Number of multiples of every tone, with one common base frequency; 1 for independent tones.",
-    )
-    image_acceleration: bool = Field(default=False, description="Whether the image motion has a constant acceleration.")
-    columns: Columns | None = Field(
-        default=None,
-        description="Use only this number of neighbouring columns, those with the most detail: all columns contain the "
-        "same vibration, and a quarter of them takes two thirds of the time for half the accuracy. None for all.",
-    )
-    roll: bool | Literal["auto"] = Field(
-        default="auto",
-        description="Measure the rotation about the optical axis as a third component of the motion, in rad: True, "
-        'False, or ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three '
-        "axes instead of two, see ``Vibration``.",
-    )
-    zoom: bool | Literal["auto"] = Field(
-        default="auto", description="The same for the change of scale, as a fourth component; includes roll."
-    )
+    method: Annotated[DetectionMethod, Extensible] = "direct"
+    """``"direct"``, or ``"bands"`` (of the paper), in half the time with ten times larger errors."""
+    tones: Annotated[int, Field(ge=1, le=MAX_TONES)] | Literal["auto"] = "auto"
+    """Number of tones of each axis, 1 to 4, or ``"auto"`` to select it by significance; the standard deviations then
+    allow for a further tone."""
+    harmonics: int = Field(default=1, ge=1, le=MAX_HARMONICS)
+    """Number of multiples of every tone, with one common base frequency; 1 for independent tones."""
+    image_acceleration: bool = False
+    """Whether the image motion has a constant acceleration."""
+    columns: Columns | None = None
+    """Use only this number of neighbouring columns, those with the most detail: all columns contain the same vibration,
+    and a quarter of them takes two thirds of the time for half the accuracy. None for all."""
+    roll: bool | Literal["auto"] = "auto"
+    """Measure the rotation about the optical axis as a third component of the motion, in rad: True, False, or
+    ``"auto"``: if the halves of the rows move apart, and not with ``columns``. Results then have three axes instead of
+    two, see ``Vibration``."""
+    zoom: bool | Literal["auto"] = "auto"
+    """The same for the change of scale, as a fourth component; includes roll."""
 
 
 @options
 class VibrationOptions(ToneOptions, MaskedInputOptions):
     """Options of ``detect_vibration`` for tones."""
 
-    model: Literal["tones"] = Field(
-        default="tones",
-        description='``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape, with the options '
-        'of ``detect_motion``; ``"swept"``: one tone per axis whose amplitude decays or grows and whose frequency '
-        "sweeps, with the options of ``detect_swept_tone``.",
-    )
-    window: int | None = Field(
-        default=None,
-        description="Number of frames of one result: the vibration is followed through the stack, and the result is a "
-        "batch with one entry per window (a leading dimension behind B). None for one result from all frames.",
-    )
-    window_step: int | None = Field(
-        default=None, description="Frames from one window to the next; half a window by default."
-    )
+    model: Literal["tones"] = "tones"
+    """``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape, with the options of
+    ``detect_motion``; ``"swept"``: one tone per axis whose amplitude decays or grows and whose frequency sweeps, with
+    the options of ``detect_swept_tone``."""
+    window: int | None = None
+    """Number of frames of one result: the vibration is followed through the stack, and the result is a batch with one
+    entry per window (a leading dimension behind B). None for one result from all frames."""
+    window_step: int | None = None
+    """Frames from one window to the next; half a window by default."""
 
 
 @options
 class FreeMotionOptions(ProjectionOptions, RegistrationOptions, MaskedInputOptions):
     """Options of ``detect_motion``; bands are those of the start."""
 
-    knot_rows: int = Field(
-        default=24,
-        ge=4,
-        le=2**31,
-        description="Row times from one knot of the spline to the next, which then resolves frequencies up to "
-        "``1 / (2 knot_rows T_row)``. In long stacks the spacing is larger, for 3000 knots at most.",
-    )
-    iterations: int = Field(default=4, ge=1, le=100, description="Rounds of measuring and fitting.")
-    roll: bool = Field(
-        default=False,
-        description="Measure the rotation about the optical axis as a third component of the motion, in rad, from "
-        "strips of columns.",
-    )
-    zoom: bool = Field(
-        default=False, description="The same for the change of scale, as a fourth component; includes roll."
-    )
+    knot_rows: int = Field(default=24, ge=4, le=2**31)
+    """Row times from one knot of the spline to the next, which then resolves frequencies up to ``1 / (2 knot_rows
+    T_row)``. In long stacks the spacing is larger, for 3000 knots at most."""
+    iterations: int = Field(default=4, ge=1, le=100)
+    """Rounds of measuring and fitting."""
+    roll: bool = False
+    """Measure the rotation about the optical axis as a third component of the motion, in rad, from strips of
+    columns."""
+    zoom: bool = False
+    """The same for the change of scale, as a fourth component; includes roll."""
 
 
 @options
 class SweptToneOptions(RegistrationOptions, MaskedInputOptions):
     """Options of ``detect_swept_tone``; bands are those of the start."""
 
-    iterations: int = Field(default=3, ge=1, le=100, description="Rounds of measuring and fitting.")
+    iterations: int = Field(default=3, ge=1, le=100)
+    """Rounds of measuring and fitting."""
 
 
 @options
@@ -229,136 +188,94 @@ class OffsetOptions(RegistrationOptions, MaskedInputOptions):
 class BandRegistrationOptions(BandOptions, InputOptions):
     """Options of ``register_bands``."""
 
-    method: Annotated[Registration, Extensible] = Field(
-        default="ncc", description='``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``.'
-    )
+    method: Annotated[Registration, Extensible] = "ncc"
+    """``"projection"`` (gray projection, the paper), ``"ncc"`` or ``"phase"``."""
 
 
 @options
 class JointOptions:
     """Frames that are restored together."""
 
-    joint: bool | Count = Field(
-        default=False,
-        json_schema_extra=COMMAND_LINE,
-        description="``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps "
-        "length 1); a number K: every frame from K neighbouring ones; ``False``: every frame from itself. With image "
-        "motion, only what a frame has in common with the restored one is used.",
-    )
+    joint: bool | Count = Field(default=False, json_schema_extra=COMMAND_LINE)
+    """``True``: one image from all frames, in the coordinates of the middle one (the time axis keeps length 1); a
+    number K: every frame from K neighbouring ones; ``False``: every frame from itself. With image motion, only what a
+    frame has in common with the restored one is used."""
 
 
 @options
 class ChunkOptions:
     """Memory of the methods that restore rows one after the other."""
 
-    chunk_rows: Count | None = Field(
-        default=None,
-        description="Rows (``banded``: slabs) restored at a time; bounds the memory, does not change the result. None: "
-        "a suitable number.",
-    )
+    chunk_rows: Count | None = None
+    """Rows (``banded``: slabs) restored at a time; bounds the memory, does not change the result. None: a suitable
+    number."""
 
 
 @options
 class OpticsOptions:
     """Transfer function of a lens and of square pixels, see ``Optics``."""
 
-    sigma: NotNegative = Field(default=0.0, description="Standard deviation of the Gaussian blur of aberrations in px.")
-    cutoff: Positive | None = Field(
-        default=None,
-        description="Diffraction cutoff frequency in cycles/px (pixel pitch over wavelength and f-number); None for no "
-        "diffraction.",
-    )
-    pixel: NotNegative = Field(
-        default=0.0,
-        description="Width of the light-sensitive square in px; 0 for none, for a scene that was recorded by pixels "
-        "before.",
-    )
-    mtf: Annotated[Curve, SkipValidation] | None = Field(
-        default=None,
-        description="Measured MTF: frequencies in cycles/px, increasing from above 0 or from 0 with an MTF of 1, and "
-        "values; 0 beyond the last one. The curve of ``slanted_edge_mtf`` contains the pixel: "
-        "``Optics(mtf=(curve.frequency, curve.mtf))``.",
-    )
+    sigma: NotNegative = 0.0
+    """Standard deviation of the Gaussian blur of aberrations in px."""
+    cutoff: Positive | None = None
+    """Diffraction cutoff frequency in cycles/px (pixel pitch over wavelength and f-number); None for no diffraction."""
+    pixel: NotNegative = 0.0
+    """Width of the light-sensitive square in px; 0 for none, for a scene that was recorded by pixels before."""
+    mtf: Annotated[Curve, SkipValidation] | None = None
+    """Measured MTF: frequencies in cycles/px, increasing from above 0 or from 0 with an MTF of 1, and values; 0 beyond
+    the last one. The curve of ``slanted_edge_mtf`` contains the pixel: ``Optics(mtf=(curve.frequency, curve.mtf))``."""
 
 
 @options
 class ExactOptions(JointOptions):
     """Options of method ``"exact"``."""
 
-    prior: Annotated[PriorName, Extensible] = Field(
-        default="gaussian",
-        json_schema_extra=COMMAND_LINE,
-        description='``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``: moreover, every '
-        "patch of 8 x 8 px is a sum of few cosines, which separates edges and flat areas from noise; several times "
-        "slower.",
-    )
-    noise: NotNegative | Literal["auto"] = Field(
-        default="auto",
-        description='Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame. Noise '
-        "and texture are distinguished with two frames or with blur, and only within bounds with one sharp frame, see "
-        "``noise_levels``.",
-    )
-    regularisation: Positive = Field(
-        default=1.0, description="Factor on the prior; 1 is the strength estimated from the frames."
-    )
-    chunk_frequencies: Count | None = Field(
-        default=None,
-        description="Frequencies solved at a time; fewer need less memory and do not change the result. None: as many "
-        "as take 8 times the memory of the spectrum of the scene, or 16 times where the displacement changes by more "
-        "than a pixel during an exposure. While missing values or the boundary extension are filled, the factors of "
-        "all frequencies stay in memory, and this option does not bound it.",
-    )
-    segments: Count | None = Field(
-        default=None,
-        description="Overlapping segments of rows that are solved side by side, which changes the result by about "
-        "1e-5; None: segments of at least 512 rows on a CPU, 256 on a GPU. Always one where the displacement changes "
-        "by more than a pixel during an exposure: rows then depend on distant rows.",
-    )
-    scale: Literal[1, 2] = Field(
-        default=1,
-        json_schema_extra=COMMAND_LINE,
-        description="Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene "
-        "after optics and pixel on a grid of half pixels, and aliasing is part of the model: several frames that "
-        "sample between each other's pixels contain detail beyond half a cycle per px, one frame does not. The prior "
-        "is then a polynomial in the Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which "
-        "detail the restored frames contain.",
-    )
-    mosaic: Mosaic | None = Field(
-        default=None,
-        json_schema_extra=COMMAND_LINE,
-        description="Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) "
-        'behind colour filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three '
-        "channels R, G, B, see ``restore_mosaic``.",
-    )
-    optics: OpticsOptions | None = Field(
-        default=None,
-        json_schema_extra=COMMAND_LINE,
-        description="Optics of the camera, pixel included: the restored frames are as sharp as from a camera with "
-        "pixels of the restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / "
-        "scale)``, where noise allows it, see ``sharpened``. None: the restored frames have the sharpness of the "
-        "camera at rest.",
-    )
+    prior: Annotated[PriorName, Extensible] = Field(default="gaussian", json_schema_extra=COMMAND_LINE)
+    """``"gaussian"``: rows predict their neighbours, one fast solution; ``"edges"``: moreover, every patch of 8 x 8 px
+    is a sum of few cosines, which separates edges and flat areas from noise; several times slower."""
+    noise: NotNegative | Literal["auto"] = "auto"
+    """Standard deviation of the noise (full scale 1); ``"auto"`` estimates it for every frame. Noise and texture are
+    distinguished with two frames or with blur, and only within bounds with one sharp frame, see ``noise_levels``."""
+    regularisation: Positive = 1.0
+    """Factor on the prior; 1 is the strength estimated from the frames."""
+    chunk_frequencies: Count | None = None
+    """Frequencies solved at a time; fewer need less memory and do not change the result. None: as many as take 8 times
+    the memory of the spectrum of the scene, or 16 times where the displacement changes by more than a pixel during an
+    exposure. While missing values or the boundary extension are filled, the factors of all frequencies stay in memory,
+    and this option does not bound it."""
+    segments: Count | None = None
+    """Overlapping segments of rows that are solved side by side, which changes the result by about 1e-5; None: segments
+    of at least 512 rows on a CPU, 256 on a GPU. Always one where the displacement changes by more than a pixel during
+    an exposure: rows then depend on distant rows."""
+    scale: Literal[1, 2] = Field(default=1, json_schema_extra=COMMAND_LINE)
+    """Points of the restored frames per pixel along both axes, 1 or 2. With 2, the unknown is the scene after optics
+    and pixel on a grid of half pixels, and aliasing is part of the model: several frames that sample between each
+    other's pixels contain detail beyond half a cycle per px, one frame does not. The prior is then a polynomial in the
+    Laplacians of both axes (``PolynomialPrior``). ``restoration_mtf`` measures which detail the restored frames
+    contain."""
+    mosaic: Mosaic | None = Field(default=None, json_schema_extra=COMMAND_LINE)
+    """Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames (T, H, W) or (T, 1, H, W) behind colour
+    filters: ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``. The restored frames have three channels R, G, B, see
+    ``restore_mosaic``."""
+    optics: OpticsOptions | None = Field(default=None, json_schema_extra=COMMAND_LINE)
+    """Optics of the camera, pixel included: the restored frames are as sharp as from a camera with pixels of the
+    restored grid behind a Gaussian of half a pixel, ``Optics(sigma=0.5 / scale, pixel=1 / scale)``, where noise allows
+    it, see ``sharpened``. None: the restored frames have the sharpness of the camera at rest."""
 
 
 @options
 class BandedOptions(ChunkOptions):
     """Options of method ``"banded"``."""
 
-    half_rows: Count = Field(default=16, description="Half height of a slab, in rows.")
-    stride: Count = Field(
-        default=2,
-        description="Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise "
-        "0.003).",
-    )
-    interpolation: Literal["linear", "cubic"] = Field(
-        default="cubic",
-        description='Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own '
-        'blur is deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them.',
-    )
-    noise_to_signal: NotNegative | Literal["auto"] = Field(
-        default="auto",
-        description='Variance of the noise over that of the scene gradients; ``"auto"`` estimates it.',
-    )
+    half_rows: Count = 16
+    """Half height of a slab, in rows."""
+    stride: Count = 2
+    """Central rows kept per slab: 2 takes half the time of 1 and costs 0.02 dB (paper camera, noise 0.003)."""
+    interpolation: Literal["linear", "cubic"] = "cubic"
+    """Interpolation in the PSF: ``"linear"`` is that of the paper (Eqs. 26-39, N_e samples), whose own blur is
+    deconvolved as well; ``"cubic"`` is a cubic B-spline across rows, exact along them."""
+    noise_to_signal: NotNegative | Literal["auto"] = "auto"
+    """Variance of the noise over that of the scene gradients; ``"auto"`` estimates it."""
 
 
 @options
@@ -370,12 +287,9 @@ class DewarpOptions(ChunkOptions):
 class RichardsonLucyOptions(JointOptions):
     """Options of method ``"richardson-lucy"``."""
 
-    iterations: int = Field(
-        default=20,
-        ge=1,
-        le=1000,  # each takes the time of four blurs; noise is amplified long before (docs/method.md)
-        description="Number of iterations, at most 1000.",
-    )
+    # each takes the time of four blurs; noise is amplified long before 1000 (docs/method.md)
+    iterations: int = Field(default=20, ge=1, le=1000)
+    """Number of iterations, at most 1000."""
 
 
 METHOD_OPTIONS: dict[str, type] = {
@@ -387,12 +301,7 @@ METHOD_OPTIONS: dict[str, type] = {
 
 
 def method_options(method: str) -> tuple[str, ...]:
-    """Names of the options of a restoration method.
-
-    Example:
-        >>> method_options("dewarp")
-        ('chunk_rows',)
-    """
+    """Names of the options of a restoration method."""
     return tuple(fields_of(METHOD_OPTIONS[method]))
 
 
@@ -400,19 +309,13 @@ def method_options(method: str) -> tuple[str, ...]:
 class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonLucyOptions):
     """A restoration method and its options; those of other methods must have their default values."""
 
-    method: RestorationName = Field(
-        default="exact",
-        json_schema_extra=COMMAND_LINE,
-        description='``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row '
-        'within slabs (Sec. 3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: '
-        "iterative, non-negative, several frames jointly if requested.",
-    )
-    saturation: Positive | Literal["auto"] | None = Field(
-        default="auto",
-        json_schema_extra=COMMAND_LINE,
-        description='Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for '
-        "integer frames, none for floating-point frames, whose level is unknown; None for none.",
-    )
+    method: RestorationName = Field(default="exact", json_schema_extra=COMMAND_LINE)
+    """``"exact"``: all rows coupled, several frames jointly if requested; ``"banded"``: row by row within slabs (Sec.
+    3.2 of Liu et al. 2023); ``"dewarp"``: geometry only, fastest; ``"richardson-lucy"``: iterative, non-negative,
+    several frames jointly if requested."""
+    saturation: Positive | Literal["auto"] | None = Field(default="auto", json_schema_extra=COMMAND_LINE)
+    """Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for integer frames, none
+    for floating-point frames, whose level is unknown; None for none."""
 
     def __post_init__(self) -> None:
         names = method_options(self.method)
@@ -427,11 +330,9 @@ class RestorationOptions(ExactOptions, BandedOptions, DewarpOptions, RichardsonL
 class RestorerOptions(RestorationOptions, InputOptions):
     """Options of ``VibrationRestorer``."""
 
-    check: bool = Field(
-        default=True,
-        description="Judge the result on a part of the frames, and warn if it is no better than the raw frames; needs "
-        "two frames. ``judge_restoration`` judges all of them.",
-    )
+    check: bool = True
+    """Judge the result on a part of the frames, and warn if it is no better than the raw frames; needs two frames.
+    ``judge_restoration`` judges all of them."""
 
 
 @options
@@ -448,110 +349,89 @@ class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
 class NoiseGainOptions(RestorationOptions, InputOptions):
     """Options of ``predict_noise_gain``."""
 
-    columns: Columns = Field(
-        default=256, description="Width of the strip across the scan, from the middle of the frames."
-    )
+    columns: Columns = 256
+    """Width of the strip across the scan, from the middle of the frames."""
 
 
 @options
 class TrackerOptions(RestorationOptions, InputOptions):
     """Options of ``VibrationTracker``."""
 
-    window: Frames = Field(
-        default=8,
-        description="Number of frames from which the vibration is detected at the start, and again if tracking fails.",
-    )
-    columns: Columns | None = Field(
-        default=384, description="Columns that are measured, those with the most detail; None for all."
-    )
-    method: RestorationName = Field(default="dewarp", description='Method of ``restore``; ``"dewarp"`` is the fastest.')
-    steady: NotNegative = Field(
-        default=0.0,
-        description="s; the image is moved to the straight line that fits its path during this time, so that slow "
-        "shaking is removed as well. 0: frames stay where they are.",
-    )
-    wobble: bool = Field(
-        default=False,
-        description="Whether skew and wobble by slow motion are removed along axes without a reliable vibration as "
-        "well, as with ``steady``. Frames that move as a whole (stabilised in the camera) would be skewed by it.",
-    )
+    window: Frames = 8
+    """Number of frames from which the vibration is detected at the start, and again if tracking fails."""
+    columns: Columns | None = 384
+    """Columns that are measured, those with the most detail; None for all."""
+    method: RestorationName = "dewarp"
+    """Method of ``restore``; ``"dewarp"`` is the fastest."""
+    steady: NotNegative = 0.0
+    """s; the image is moved to the straight line that fits its path during this time, so that slow shaking is removed
+    as well. 0: frames stay where they are."""
+    wobble: bool = False
+    """Whether skew and wobble by slow motion are removed along axes without a reliable vibration as well, as with
+    ``steady``. Frames that move as a whole (stabilised in the camera) would be skewed by it."""
 
 
 @options
 class WindowSize:
     """The windows that a stack is cut into."""
 
-    window: Frames = Field(
-        default=8,
-        json_schema_extra=COMMAND_LINE,
-        description="Largest number of frames in which one vibration is detected.",
-    )
-    follow: bool = Field(
-        default=False,
-        json_schema_extra=COMMAND_LINE,
-        description="Follow a vibration that changes, e.g. decays, from frame to frame, instead of detecting a steady "
-        "one in each window. The result of a window is the vibration at its middle frame.",
-    )
+    window: Frames = Field(default=8, json_schema_extra=COMMAND_LINE)
+    """Largest number of frames in which one vibration is detected."""
+    follow: bool = Field(default=False, json_schema_extra=COMMAND_LINE)
+    """Follow a vibration that changes, e.g. decays, from frame to frame, instead of detecting a steady one in each
+    window. The result of a window is the vibration at its middle frame."""
 
 
 @options
 class WindowOptions(WindowSize):
     """Processing of stacks in windows."""
 
-    bad_frames: BadFrames = Field(
-        default="pass",
-        json_schema_extra=COMMAND_LINE,
-        description='Frames that cannot be read or used: ``"pass"`` writes them unchanged (a frame that cannot be read '
-        'as NaN, or 0 for integers), ``"skip"`` leaves them out.',
-    )
+    bad_frames: BadFrames = Field(default="pass", json_schema_extra=COMMAND_LINE)
+    """Frames that cannot be read or used: ``"pass"`` writes them unchanged (a frame that cannot be read as NaN, or 0
+    for integers), ``"skip"`` leaves them out."""
 
 
 @options
 class ResourceOptions:
     """Memory, threads and device of a run, and the full scale of its stack."""
 
-    full_scale: Positive | None = Field(default=None, description="As in ``read_stack``.")
-    memory: str | float | None = Field(
-        default=None,
-        description='Limit for the memory of the process, in bytes or like ``"2GB"``; by default three quarters of the '
-        "memory that is free or used by the process. It does not limit Dask workers.",
-    )
-    workers: Annotated[int, Field(ge=1)] | None = Field(
-        default=None,
-        description="Largest number of windows, or of frames of a video, to compute at once; by default the number of "
-        "processors. Of local Dask workers, the number of processes.",
-    )
-    device: str = Field(default="auto", description='``"auto"``, ``"cpu"`` or ``"cuda"``.')
+    full_scale: Positive | None = None
+    """As in ``read_stack``."""
+    memory: str | float | None = None
+    """Limit for the memory of the process, in bytes or like ``"2GB"``; by default three quarters of the memory that is
+    free or used by the process. It does not limit Dask workers."""
+    workers: Annotated[int, Field(ge=1)] | None = None
+    """Largest number of windows, or of frames of a video, to compute at once; by default the number of processors. Of
+    local Dask workers, the number of processes."""
+    device: str = "auto"
+    """``"auto"``, ``"cpu"`` or ``"cuda"``."""
 
 
 @options
 class StackDetectionOptions(WindowSize, ResourceOptions):
     """Detection in windows."""
 
-    detection: OptionTable = Field(
-        default=None, description="Options of ``detect_vibration``; none with ``follow=True``."
-    )
+    detection: OptionTable = None
+    """Options of ``detect_vibration``; none with ``follow=True``."""
 
 
 @options
 class StackOptions(StackDetectionOptions):
     """Options of ``iterate_stack``."""
 
-    restoration: OptionTable = Field(
-        default=None,
-        description="Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window "
-        "becomes one image. With ``follow=True`` not ``joint``, ``scale``, ``mosaic`` or ``optics``.",
-    )
-    force: bool = Field(
-        default=False, description="Whether to keep restored frames even if they are judged worse than the raw ones."
-    )
+    restoration: OptionTable = None
+    """Options of ``restore``, for frames whose full scale is 1. With ``joint=True``, every window becomes one image.
+    With ``follow=True`` not ``joint``, ``scale``, ``mosaic`` or ``optics``."""
+    force: bool = False
+    """Whether to keep restored frames even if they are judged worse than the raw ones."""
 
 
 @options
 class ProgressOptions:
     """What is called while a stack is processed."""
 
-    progress: Progress = Field(default=None, description="Called with the number of complete frames and of all frames.")
+    progress: Progress = None
+    """Called with the number of complete frames and of all frames."""
 
 
 @options
@@ -563,61 +443,42 @@ class DetectStackOptions(StackDetectionOptions, ProgressOptions):
 class RunOptions(ProgressOptions):
     """A run from file to file."""
 
-    resume: bool = Field(
-        default=False, description="Whether to continue an interrupted run; a complete output is not changed."
-    )
-    manifest: FilePath = Field(
-        default=None, description="Path of the manifest; by default ``sink`` with ``.manifest.json`` appended."
-    )
+    resume: bool = False
+    """Whether to continue an interrupted run; a complete output is not changed."""
+    manifest: FilePath = None
+    """Path of the manifest; by default ``sink`` with ``.manifest.json`` appended."""
 
 
 @options
 class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
     """Options of ``process_stack``."""
 
-    given: Detections = Field(
-        default=None, description="Detections to use instead, one for each window (see ``read_manifest``)."
-    )
-    scheduler: str | None = Field(
-        default=None,
-        description='Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` '
-        "starts workers on this machine; None computes in this process.",
-    )
-    compression: str | None = Field(
-        default=None, description="Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."
-    )
+    given: Detections = None
+    """Detections to use instead, one for each window (see ``read_manifest``)."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` starts workers on
+    this machine; None computes in this process."""
+    compression: str | None = None
+    """Compression of a TIFF stack, zlib or lzma, as in ``write_stack``."""
 
 
 @options
 class ProcessVideoOptions(RunOptions, ResourceOptions):
     """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
-    border: BorderName = Field(
-        default="mirror",
-        description='Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself; '
-        '``"hold"``: as in the frame before; ``"crop"``: cut off by constant margins.',
-    )
-    steady: NotNegative = Field(
-        default=0.0,
-        description="s; every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose "
-        "period is this time or shorter is removed, slower motion is kept. 0: frames stay where they are, and only "
-        "vibration is removed.",
-    )
-    crop_limit: Side = Field(
-        default=0.1,
-        description="Largest displacement of a corner of a frame by ``steady``, in parts of the width or height; where "
-        "the path would need more, it is smoothed less.",
-    )
-    gyroscope: FilePath = Field(
-        default=None,
-        description='File with the rates of a gyroscope, as in ``read_gyroscope``, or ``"auto"``: the track of the '
-        "video itself. The path of the camera is its rotation by the gyroscope, instead of the path and the tones by "
-        "corners.",
-    )
-    restoration: OptionTable = Field(
-        default=None,
-        description='``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames '
-        "whose full scale is 1. Without ``saturation``, saturated pixels count as measured: their values are restored "
-        "0.2 dB worse if 1 % of the pixels are saturated, in a quarter of the time. Not ``joint``, ``scale``, "
-        "``mosaic`` or ``optics``.",
-    )
+    border: BorderName = "mirror"
+    """Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself; ``"hold"``: as in
+    the frame before; ``"crop"``: cut off by constant margins."""
+    steady: NotNegative = 0.0
+    """s; every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose period is this time
+    or shorter is removed, slower motion is kept. 0: frames stay where they are, and only vibration is removed."""
+    crop_limit: Side = 0.1
+    """Largest displacement of a corner of a frame by ``steady``, in parts of the width or height; where the path would
+    need more, it is smoothed less."""
+    gyroscope: FilePath = None
+    """File with the rates of a gyroscope, as in ``read_gyroscope``, or ``"auto"``: the track of the video itself. The
+    path of the camera is its rotation by the gyroscope, instead of the path and the tones by corners."""
+    restoration: OptionTable = None
+    """``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames whose full scale
+    is 1. Without ``saturation``, saturated pixels count as measured: their values are restored 0.2 dB worse if 1 % of
+    the pixels are saturated, in a quarter of the time. Not ``joint``, ``scale``, ``mosaic`` or ``optics``."""

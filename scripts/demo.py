@@ -27,7 +27,7 @@ from rsvib_torch.commands.terminal import warnings_in_one_line, working
 from rsvib_torch.core.atomic import whole_folder
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.options import DetectionMethod
-from rsvib_torch.report.html import Report, write_report_page
+from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import write_offsets, write_vibration
 from rsvib_torch.restoration.restore import METHODS

@@ -150,9 +150,8 @@ class ImageMotion:
         upright box around it. Boxes that are not upright are moved corner by corner.
         """
         low, high = boxes.amin(-2), boxes.amax(-2)
-        steps = torch.linspace(
-            0.0, 1.0, int((high - low)[..., 1].amax().ceil()) + 2, dtype=boxes.dtype, device=boxes.device
-        )
+        count = int((high - low)[..., 1].amax().ceil()) + 2
+        steps = torch.linspace(0.0, 1.0, count, dtype=boxes.dtype, device=boxes.device)
         side_rows = low[..., 1, None] + (high - low)[..., 1, None] * steps  # (B, N, S), at most one row apart
         sides = torch.stack(
             [torch.stack([x[..., None].expand_as(side_rows), side_rows], -1) for x in (low[..., 0], high[..., 0])], -3
@@ -166,36 +165,22 @@ class ImageMotion:
         return torch.where(upright[..., None, None], around, corners)
 
 
-def _axis_ranges(
-    name: str, value: Range, *, at_least: float = -math.inf
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Lowest and highest value of the axes x and y, from a number or a range for both or for each.
-
-    Example:
-        >>> _axis_ranges("amplitude", (1.0, 2.0))
-        ((1.0, 2.0), (1.0, 2.0))
-    """
+def _axis_ranges(name: str, value: Range, *, at_least: float = -math.inf) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest value of the axes x and y, from a number or a range for both or for each."""
     if not isinstance(value, Sequence):
-        number = check_number(name, value, at_least=at_least)
-        return (number, number), (number, number)
+        return ((check_number(name, value, at_least=at_least),) * 2,) * 2
     pairs = value if any(isinstance(part, Sequence) for part in value) else (value, value)
-    if len(pairs) != 2 or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs):
-        raise TypeError(
-            f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {quoted(value)}"
-        )
-    x, y = (tuple(check_number(name, number, at_least=at_least) for number in pair) for pair in pairs)  # type: ignore[union-attr]
-    for low, high in (x, y):
+    ranges = []
+    for pair in pairs:
+        if len(pairs) != 2 or not isinstance(pair, Sequence) or len(pair) != 2:
+            raise TypeError(
+                f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {quoted(value)}"
+            )
+        low, high = (check_number(name, number, at_least=at_least) for number in pair)
         if low > high:
             raise ValueError(f"{name} must not have low above high, got ({low:g}, {high:g})")
-    return (x[0], x[1]), (y[0], y[1])
-
-
-def _draw(
-    ranges: tuple[tuple[float, float], ...], shape: Sequence[int], device: torch.device, dtype: torch.dtype
-) -> Tensor:
-    """Uniformly distributed values between low and high, (*shape, number of ranges)."""
-    low, high = torch.tensor(ranges, device=device, dtype=dtype).unbind(-1)
-    return low + (high - low) * torch.rand(*shape, len(ranges), device=device, dtype=dtype)
+        ranges.append((low, high))
+    return tuple(ranges)
 
 
 class RollingShutterVibration(GeometricAugmentationBase2D):
@@ -227,10 +212,6 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         p: Probability that an image is augmented.
         same_on_batch: Whether all images share one draw.
         keepdim: Whether the output keeps the rank of the input.
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a range is out of bounds.
 
     Example:
         >>> timing = SensorTiming(row_time=20e-6, exposure_rows=20, frame_rows=1080)
@@ -267,17 +248,16 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         exposures = _axis_ranges("exposure_rows", timing.exposure_rows if exposure_rows is None else exposure_rows)[0]
         for value in exposures:
             check_number("exposure_rows", value, above=0.0, at_most=timing.frame_rows)
-        turns = []
-        for name, of_turn in (("roll", roll), ("zoom", zoom)):
+        turns: tuple[tuple[float, float], ...] = ()
+        for name, of_turn in (("roll", roll), ("zoom", zoom))[: 2 if zoom is not None else int(roll is not None)]:
             if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
                 raise TypeError(f"{name} must be a number or (low, high), got {quoted(of_turn)}")
-            turns.append((0.0, 0.0) if of_turn is None else _axis_ranges(name, of_turn, at_least=0.0)[0])
-        turns = turns if zoom is not None else turns[:1] if roll is not None else []
+            turns += _axis_ranges(name, of_turn or 0.0, at_least=0.0)[:1]
         frequencies, phases = _axis_ranges("frequency", frequency, at_least=0.0), _axis_ranges("phase", phase)
         self.flags = {
-            "amplitude": (*_axis_ranges("amplitude", amplitude, at_least=0.0), *turns),
-            "frequency": (*frequencies, *frequencies[:1] * len(turns)),
-            "phase": (*phases, *phases[:1] * len(turns)),
+            "amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns,
+            "frequency": frequencies + frequencies[:1] * len(turns),
+            "phase": phases + phases[:1] * len(turns),
             "image_motion": _axis_ranges("image_motion", image_motion),
             "exposure_rows": exposures,
             "interpolation": interpolation,
@@ -294,43 +274,32 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> Parameters:
         """Draw one motion per image: amplitude, frequency, phase (B, A, K), image_motion (B, 2), exposure_rows (B,)."""
         draws = 1 if self.same_on_batch else batch_shape[0]
-        drawn = {
-            name: _draw(self.flags[name], (draws, self.tones), self.device, self.dtype).mT
-            for name in ("amplitude", "frequency", "phase")
-        }
-        drawn["image_motion"] = _draw(self.flags["image_motion"], (draws,), self.device, self.dtype)
-        drawn["exposure_rows"] = _draw((self.flags["exposure_rows"],), (draws,), self.device, self.dtype)[:, 0]
-        return {
-            name: value.repeat(batch_shape[0] // max(draws, 1), *[1] * (value.ndim - 1))
-            for name, value in drawn.items()
-        }
+
+        def uniform(name: str, *shape: int) -> Tensor:
+            low, high = torch.tensor(self.flags[name], device=self.device, dtype=self.dtype).unbind(-1)
+            return low + (high - low) * torch.rand(draws, *shape, *low.shape, device=self.device, dtype=self.dtype)
+
+        drawn = {name: uniform(name, self.tones).mT for name in ("amplitude", "frequency", "phase")}
+        drawn |= {name: uniform(name) for name in ("image_motion", "exposure_rows")}
+        copies = batch_shape[0] // max(draws, 1)
+        return {name: value.repeat(copies, *[1] * (value.ndim - 1)) for name, value in drawn.items()}
 
     @checks_arguments
     def drawn_vibration(self, params: Parameters | None = None) -> Vibration:
         """The vibration of every image of the last call, in image axes: the ground truth for training.
 
         Clips whose frames share one draw have one vibration each, as a stack in ``restore``. Images that were not
-        augmented (``p`` below 1) have amplitude and image motion 0.
-
-        Args:
-            params: Parameters of another call (``augmentation._params`` after that call).
-
-        Raises:
-            ValueError: If nothing was drawn yet.
+        augmented (``p`` below 1) have amplitude and image motion 0. ``params`` are those of another call.
         """
         params = self._params if params is None else params
         if "amplitude" not in params:
             raise ValueError("no vibration has been drawn yet: call the augmentation first")
         taken = self._gate(params).to(torch.float64)
-        drawn = (
-            params["amplitude"] * taken[:, None, None],
-            params["frequency"],
-            params["phase"],
-            params["image_motion"] * taken[:, None],
-        )
+        drawn = {name: params[name] for name in ("amplitude", "frequency", "phase", "image_motion")}
+        drawn |= {"amplitude": drawn["amplitude"] * taken[:, None, None]}
+        drawn |= {"image_motion": drawn["image_motion"] * taken[:, None]}
         step = self._recording_length(params)
-        amplitude, frequency, phase, image_motion = (value[::step] for value in drawn)
-        return Vibration(amplitude, frequency, phase, image_motion)
+        return Vibration(**{name: value[::step] for name, value in drawn.items()}, camera=None)
 
     def compute_transformation(self, input: Tensor, params: Parameters, flags: dict[str, Any]) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
@@ -339,11 +308,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Distort and blur images (B, C, H, W).
-
-        Raises:
-            ValueError: If the images appear to have their channels last.
-        """
+        """Distort and blur images (B, C, H, W)."""
         if channels_appear_last(input.shape):
             raise ValueError(
                 f"images of shape {tuple(input.shape)} appear to have their channels last: pass images.movedim(-1, -3)"
@@ -380,11 +345,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         return output
 
     def _moved(
-        self,
-        points: Tensor,
-        params: Parameters,
-        shape: tuple[int, ...],
-        move: Callable[[ImageMotion, Tensor], Tensor],
+        self, points: Tensor, params: Parameters, shape: tuple[int, ...], move: Callable[[ImageMotion, Tensor], Tensor]
     ) -> Tensor:
         """Points (..., x and y), moved by ``move`` as (B, N, *shape) in row order."""
         if points.numel() == 0:

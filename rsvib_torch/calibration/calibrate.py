@@ -59,14 +59,6 @@ class RowTimeCalibration(
         light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
             flickering light.
         fitted_light: (T, H) the bands that were fitted to it.
-
-    Example:
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> light = 0.4 + 0.2 * torch.cos(2 * torch.pi * torch.arange(512) / 64)  # 1000 Hz, 64 rows per period
-        >>> found = rsv.calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0)
-        >>> f"{1e6 * found.row_time:.3f} us per row"
-        '15.625 us per row'
     """
 
     row_time: float | None
@@ -153,7 +145,6 @@ def calibrate_row_time(
         Row time with its standard deviation, and the other values that the arguments determine.
 
     Raises:
-        TypeError: If an argument is not a number.
         ValueError: If there is no flicker in the frames, it is too fast or too slow for the camera, or the frames are
             black or saturated.
 
@@ -215,22 +206,12 @@ def calibrate_row_time_by_exposure(
 
     A row is lit if its exposure overlaps the pulse: the height of a bright band is the sum of pulse and exposure, and a
     longer exposure increases it by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
-    the brightness of the rows of all frames, with pulse, period and row time in common.
-
-    Args:
-        frames: (T, H, W) or (T, C, H, W), T >= 2, or files.
-        exposure_times: Exposure of each frame in seconds, not all the same.
-        scan_axis: As in ``calibrate_row_time``.
-        gamma: As in ``calibrate_row_time``; it matters here.
-        full_scale: Count that means 1.0, for integers other than 8 bit.
-        channels: As in ``detect_vibration``.
+    the brightness of the rows of all frames, with pulse, period and row time in common. ``exposure_times`` are those of
+    the frames in seconds, not all the same; the other arguments are as in ``calibrate_row_time``, and ``gamma`` matters
+    here.
 
     Returns:
         Row time with its standard deviation, and the frequency of the strobe.
-
-    Raises:
-        TypeError: If an argument is not a number.
-        ValueError: If there are no bands, exposures do not fit the frames or are all the same.
     """
     exposures = [float(exposure) for exposure in exposure_times]
     profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)

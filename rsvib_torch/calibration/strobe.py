@@ -12,12 +12,7 @@ _MAX_MISFIT = 0.3  # largest root mean square of the residuals over the brightne
 
 
 def lit_fraction(begin: Array, exposure: Array | float, on_time: float, period: float) -> Array:
-    """Fraction of exposures from ``begin`` on in which a light is on that goes on at 0, P, 2 P ... for ``on_time``.
-
-    Example:
-        >>> lit_fraction(np.array([-1.0, 0.0, 1.5, 2.0]), 1.0, 2.0, 10.0).tolist()
-        [0.0, 1.0, 0.5, 0.0]
-    """
+    """Fraction of exposures from ``begin`` on in which a light is on that goes on at 0, P, 2 P ... for ``on_time``."""
 
     def lit_until(time: Array) -> Array:
         whole = np.floor(time / period)
@@ -83,10 +78,6 @@ def exposure_from_contrast(contrast: float, light_contrast: float, period: float
     """Exposure that attenuates a sine of known contrast to the contrast of the bands: ``sinc(f T_e)``, first lobe.
 
     The result has the unit of the period 1/f; the contrast is the amplitude of the fundamental over the mean.
-
-    Example:
-        >>> round(exposure_from_contrast(0.5 * 2 / math.pi, 0.5, 10.0), 6)
-        5.0
     """
     ratio = contrast / light_contrast
     if ratio > 1.0:

@@ -5,54 +5,44 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from rsvib_torch import detection, stacks
 from rsvib_torch import report as reports
-from rsvib_torch.commands.terminal import Answer, error_line
-from rsvib_torch.core.text import number_of, printable, wrapped
+from rsvib_torch.commands.terminal import Answer, warn
+from rsvib_torch.core.reading import Table
+from rsvib_torch.core.text import AXES, number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
-    from rsvib_torch.detection import DetectionResult, MotionDetection, SweptTone
     from rsvib_torch.motion.detected_vibration import DetectedVibration
-    from rsvib_torch.stacks import RestoredFrames, StackManifest, StackReport
-
-
-def command_text(*parts: str | Path) -> str:
-    """A command line of the program that can be copied into a shell."""
-    return " ".join(["rsvib", *map(_shell_word, map(str, parts))])
 
 
 def _shell_word(text: str) -> str:
-    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are.
-
-    Example:
-        >>> _shell_word("a b"), _shell_word("a\nb")
-        ("'a b'", "$'a\\nb'")
-    """
+    r"""A word of a command line; ``$'...'`` where it contains characters that are not printed as they are."""
     if printable(text) == text:
         return shlex.quote(text)
     return "$'" + printable(text.replace("\\", "\\\\").replace("'", "\\'")) + "'"
 
 
-def detection_data(result: DetectionResult) -> dict[str, Any]:
+def detection_data(result: detection.DetectionResult) -> Table:
     """A detection without its offset curve."""
     return {name: value for name, value in result.to_dict().items() if name not in ("offsets", "fitted")}
 
 
-def verdicts(found: Sequence[DetectedVibration | MotionDetection | SweptTone | None]) -> dict[str, bool]:
+def verdicts(
+    found: Sequence[DetectedVibration | detection.MotionDetection | detection.SweptTone | None],
+) -> dict[str, bool]:
     """Whether each axis is reliable in all detections; None is one that failed."""
-    from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415 - loads PyTorch
-
     flags = [[] if one is None else one.reliable.tolist() for one in found]
-    return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXIS_NAMES)}
+    return {name: all(of_one[axis : axis + 1] == [True] for of_one in flags) for axis, name in enumerate(AXES)}
 
 
 def stack_answer(
     frames: Path,
-    found: DetectionResult,
+    found: detection.DetectionResult,
     pixel_size: float | None = None,
-    restored: RestoredFrames | None = None,
+    restored: stacks.RestoredFrames | None = None,
     count: int = 0,
 ) -> Answer:
     """The vibration in a stack, also in units of length if the size of a pixel in m is given, and its restoration."""
@@ -67,7 +57,10 @@ def stack_answer(
 
 
 def windows_answer(
-    title: str, manifest: StackManifest, report: StackReport | None = None, pixel_size: float | None = None
+    title: str,
+    manifest: stacks.StackManifest,
+    report: stacks.StackReport | None = None,
+    pixel_size: float | None = None,
 ) -> Answer:
     """The vibration in the windows of a stack, and what was restored."""
     vibration, restoration = manifest.lines(pixel_size)
@@ -77,18 +70,18 @@ def windows_answer(
     return answer
 
 
-def warn_of_restoration(result: RestoredFrames, output: str = "frames") -> None:
+def warn_of_restoration(result: stacks.RestoredFrames, output: str = "frames") -> None:
     """Print a warning if there is nothing to restore, or if restoration does not help or helps in part only."""
     kept = "the frames are written unchanged" if output == "frames" else "the page has the input frames only"
     forced = "writes" if output == "frames" else "shows"
     if not result.moves:
-        error_line(f"no vibration was found that can be removed: {kept}", "warning")
+        warn(f"no vibration was found that can be removed: {kept}")
     elif result.verdict is not None and result.verdict.overall in ("partly", "worse"):
         unchanged = "" if result.restored else f"; {kept}, --force {forced} the restored ones"
-        error_line(result.verdict.sentence + unchanged, "warning")
+        warn(result.verdict.sentence + unchanged)
 
 
-def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
+def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
     """What was restored of ``count`` frames and its gain, and which axes were left unchanged and why."""
     frames = number_of(count, "frame") if len(result.frames) == count else f"1 image of {number_of(count, 'frame')}"
     if not result.restored:
@@ -111,24 +104,24 @@ def restoration_lines(result: RestoredFrames, count: int) -> list[str]:
     return [wrapped(line) for line in lines]
 
 
-def next_step(sentence: str, command: str) -> str:
-    """A step: a sentence, and the command that does it."""
-    return f"{sentence}:\n  {command}"
+def next_step(sentence: str, *command: object) -> str:
+    """A step: a sentence, and the command that does it, which can be copied into a shell."""
+    return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
 
 
 def steps_after_detection(
-    result: DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
+    result: detection.DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
     """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
     steps = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
         target = frames.with_name("restored.tif")
-        restore = command_text("restore", frames, target, *settings.arguments, "--vibration", vibration)
-        steps.append(next_step("restore the frames", restore))
+        restore = ("restore", frames, target, *settings.arguments, "--vibration", vibration)
+        steps.append(next_step("restore the frames", *restore))
     reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
-        motion = command_text("motion", frames, *settings.arguments, "--out", "motion.csv")
-        steps.append(next_step("detect a motion that is not a steady vibration (model='free')", motion))
+        motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
+        steps.append(next_step("detect a motion that is not a steady vibration (model='free')", *motion))
     if reasons:
         steps.append("follow the remedies that the reasons above name")
     return steps
@@ -136,16 +129,11 @@ def steps_after_detection(
 
 def page_step(frames: Path, out: Path, settings: Config, *more: str | Path) -> str:
     """The step to write a page about a restored stack."""
-    page = command_text("report", frames, out, *settings.arguments, *more)
-    return next_step("write a page with all figures and the sharpness before and after", page)
+    sentence = "write a page with all figures and the sharpness before and after"
+    return next_step(sentence, "report", frames, out, *settings.arguments, *more)
 
 
 def step_parts(step: str) -> tuple[str, str]:
-    r"""Sentence and command of a step; the command is empty if there is none.
-
-    Example:
-        >>> step_parts("restore the frames:\n  rsvib restore")
-        ('Restore the frames:', 'rsvib restore')
-    """
+    r"""Sentence and command of a step; the command is empty if there is none."""
     sentence, _, command = step.partition("\n")
     return f"{sentence[0].upper()}{sentence[1:]}{'' if command else '.'}", command.strip()

@@ -2,72 +2,62 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from rsvib_torch import detection, io, restoration
+import rsvib_torch
+from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
 from rsvib_torch.commands.flat_command import argument, option
-from rsvib_torch.commands.shared_options import check_new
-from rsvib_torch.commands.terminal import Answer, error_line, working
+from rsvib_torch.commands.shared_options import check_new, size_of
+from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import check_writable
+from rsvib_torch.core.reading import Table
+from rsvib_torch.core.text import AXES
 from rsvib_torch.core.validation import options, read_json
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
 
-if TYPE_CHECKING:
-    from rsvib_torch.detection import DetectionResult
-    from rsvib_torch.motion.timing import SensorTiming
-    from rsvib_torch.motion.vibration import Vibration
-
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) from ``HEIGHTxWIDTH``."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower())
-    if match is None:
-        raise ValueError(f"--size must be HEIGHTxWIDTH in px such as 1080x1920, got {text!r}")
-    return int(match[1]), int(match[2])
 
 
 @options
 class ExportOptions:
     """Options of ``export``."""
 
-    vibration: Path = argument("The vibration.json written by detect or run.")
-    out: Path = argument("File to write; for stmap a folder.")
+    vibration: Path = argument()
+    """The vibration.json written by detect or run."""
+    out: Path = argument()
+    """File to write; for stmap a folder."""
     file_format: ExportFormat | None = option(
-        None,
-        "gcsv: angular rates, for Gyroflow; stmap: a position per pixel and frame, for compositing programs and "
-        "OpenCV; isd: image support data, for the Community Sensor Model; csv: offsets of the rows before and after "
-        "correction.",
-        "--format",
-        show_default="from the extension: .gcsv, .csv, .json for isd",
+        None, "--format", show_default="from the extension: .gcsv, .csv, .json for isd"
     )
-    frames: Path | None = option(None, "The stack of frames, for their size and number (gcsv, stmap).")
-    size: str | None = option(None, "Size of the frames in px, in place of --frames.", metavar="HEIGHTxWIDTH")
-    num_frames: int | None = option(None, "Number of frames, in place of --frames.")
-    focal_length: float | None = option(
-        None, "Focal length in px, for a vibration that was detected without one; required for gcsv."
-    )
-    camera_isd: Path | None = option(None, "ISD of the camera at rest (JSON), which isd requires.", "--isd")
-    frame: int = option(0, "Number of the frame that isd describes, from 0.")
-    model: IsdModel = option(
-        "auto",
-        "Sensor model of isd: frame, a frame camera with jitter polynomials; line-scan, one quaternion per row; auto, "
-        "the first of them that is accurate enough.",
-    )
-    tolerance: float = option(0.005, "Largest error of a position by isd, in px.")
-    convention: StmapConvention = option(
-        "nuke", "Positions of stmap: nuke, 0 to 1 from the bottom left corner; opencv, px from the first pixel."
-    )
-    sample_rate: float | None = option(
-        None, "Samples per second of gcsv.", show_default="chosen for an attitude within 2e-7 rad"
-    )
-    force: bool = option(False, "Export axes as well that are not reliable or not accurate.")
-    overwrite: bool = option(False, "Replace results that exist already.")
+    """gcsv: angular rates, for Gyroflow; stmap: a position per pixel and frame, for compositing programs and OpenCV;
+    isd: image support data, for the Community Sensor Model; csv: offsets of the rows before and after correction."""
+    frames: Path | None = None
+    """The stack of frames, for their size and number (gcsv, stmap)."""
+    size: str | None = option(None, metavar="HEIGHTxWIDTH")
+    """Size of the frames in px, in place of --frames."""
+    num_frames: int | None = None
+    """Number of frames, in place of --frames."""
+    focal_length: float | None = None
+    """Focal length in px, for a vibration that was detected without one; required for gcsv."""
+    camera_isd: Path | None = option(None, "--isd")
+    """ISD of the camera at rest (JSON), which isd requires."""
+    frame: int = 0
+    """Number of the frame that isd describes, from 0."""
+    model: IsdModel = "auto"
+    """Sensor model of isd: frame, a frame camera with jitter polynomials; line-scan, one quaternion per row; auto, the
+    first of them that is accurate enough."""
+    tolerance: float = 0.005
+    """Largest error of a position by isd, in px."""
+    convention: StmapConvention = "nuke"
+    """Positions of stmap: nuke, 0 to 1 from the bottom left corner; opencv, px from the first pixel."""
+    sample_rate: float | None = option(None, show_default="chosen for an attitude within 2e-7 rad")
+    """Samples per second of gcsv."""
+    force: bool = False
+    """Export axes as well that are not reliable or not accurate."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
 
 def export(given: ExportOptions) -> Answer:
@@ -82,15 +72,14 @@ def export(given: ExportOptions) -> Answer:
     frames = [] if given.frames is None else io.stack_files(given.frames)
     check_new([out], given.overwrite, [given.vibration, *frames, given.camera_isd])
     check_writable(out, folder=chosen == "stmap")
-    reports.read_vibration(given.vibration)  # its errors name what to give instead
-    detected = detection.DetectionResult.load(given.vibration)
+    detected = reports.load_detection(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)
         return Answer({"Offsets before and after correction": _residuals(detected)}, {"format": chosen}, [out])
     timing = detected.timing
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
-    data: dict[str, Any] = {"format": chosen}
+    data: Table = {"format": chosen}
     if chosen == "isd":
         if given.camera_isd is None:
             raise ValueError(
@@ -102,9 +91,8 @@ def export(given: ExportOptions) -> Answer:
         written = reports.write_isd(
             out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
         )
-        form = (
-            "frame camera with jitter polynomials" if written == "frame" else "line scanner with one quaternion per row"
-        )
+        form = "frame camera with jitter polynomials"
+        form = form if written == "frame" else "line scanner with one quaternion per row"
         data |= {"model": written, "frame": given.frame}
         return Answer({"Sensor model": [f"frame {given.frame} as a {form}"]}, data, [out])
     shape, count = _extent(given)
@@ -121,7 +109,8 @@ def export(given: ExportOptions) -> Answer:
 
 def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
     """Size and number of the frames, from the stack or the options."""
-    size, count = None if given.size is None else _size(given.size), given.num_frames
+    size = None if given.size is None else size_of(given.size, "HEIGHTxWIDTH in px such as 1080x1920")
+    count = given.num_frames
     if given.frames is not None:
         shape = io.read_stack_info(given.frames).shape
         size, count = size or (shape[-2], shape[-1]), shape[0] if count is None else count
@@ -132,14 +121,10 @@ def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
     return size, count
 
 
-def _trusted(given: ExportOptions, detected: DetectionResult, timing: SensorTiming, count: int, rows: int) -> Vibration:
-    """The accurate part of a detected vibration, or all of it with ``force``, with a camera if a focal length is given.
-
-    Raises:
-        ValueError: If nothing of it is accurate enough, or there are two focal lengths.
-    """
-    from rsvib_torch.motion.camera import Camera  # noqa: PLC0415
-
+def _trusted(
+    given: ExportOptions, detected: rsvib_torch.DetectionResult, timing: rsvib_torch.SensorTiming, count: int, rows: int
+) -> rsvib_torch.Vibration:
+    """The accurate part of a detected vibration, or all of it with ``force``; with a camera if its lens is given."""
     motion = detected.vibration
     if not given.force:
         motion, reasons = restoration.trusted_vibration(detected, timing, count, rows)
@@ -149,23 +134,21 @@ def _trusted(given: ExportOptions, detected: DetectionResult, timing: SensorTimi
                 f"nothing to export: {'; '.join(notes) or 'no vibration'}; --force exports it nevertheless"
             )
         for note in notes:
-            error_line(note, "warning")
+            warn(note)
     if given.focal_length is None:
         return motion
     if motion.camera is not None:
         raise ValueError(
             f"the vibration was detected with focal_length={motion.camera.focal_length:g} px; omit --focal-length"
         )
-    return motion.with_camera(Camera(given.focal_length))
+    return motion.with_camera(rsvib_torch.Camera(given.focal_length))
 
 
-def _residuals(detected: DetectionResult) -> list[str]:
+def _residuals(detected: rsvib_torch.DetectionResult) -> list[str]:
     """A line for each axis: root mean square of the offsets and of the residuals."""
-    from rsvib_torch.core.presentation import AXIS_NAMES  # noqa: PLC0415
-
     curve = detected.offsets
     lines = []
-    for axis, name in enumerate(AXIS_NAMES[: detected.vibration.num_axes]):
+    for axis, name in enumerate(AXES[: detected.vibration.num_axes]):
         before = curve.offsets[..., axis][curve.good]
         after = before - detected.fitted[..., axis][curve.good]
         unit = ("px", "px", "rad", "")[axis]

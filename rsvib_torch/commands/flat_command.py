@@ -10,39 +10,33 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import typer
 from pydantic import Field
 
-from rsvib_torch.commands.terminal import Answer, error_line, output_of, show_answer
+from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.validation import fields_of, members_of, options
 from rsvib_torch.options import COMMAND_LINE
 
 _NOT_RELIABLE = 3  # exit code
 
 
-def argument(text: str, **form: Any) -> Any:
-    """An argument of a command; ``form`` has ``default`` and arguments of ``typer.Argument``."""
-    return Field(form.pop("default", ...), description=text, json_schema_extra={"positional": True, **form})
+def argument(default: Any = ..., **form: Any) -> Any:
+    """An argument of a command; ``form`` has arguments of ``typer.Argument``."""
+    return Field(default, json_schema_extra={"positional": True, **form})
 
 
-def option(default: Any, text: str, *names: str, **form: Any) -> Any:
-    """An option of a command, by default of the name of its field; ``form`` has arguments of ``typer.Option``."""
-    return Field(default, description=text, json_schema_extra={"names": list(names), **form})
+def option(default: Any, *names: str, **form: Any) -> Any:
+    """An option of a command that is not named as its field, or has arguments ``form`` of ``typer.Option``."""
+    return Field(default, json_schema_extra={"names": list(names), **form})
 
 
 @dataclass(frozen=True)
 class Given:
-    """Mark of a field of a command: a dictionary of those options of another group that are given.
+    """Mark of a field of a command: a dictionary of those options of another group that are given."""
 
-    Attributes:
-        group: The group.
-        names: Its options; by default those whose fields are marked by ``COMMAND_LINE``.
-        default: Where the default comes from, before that of the group.
-        context: What comes before the description of each.
-        forms: For options that are stated in another form than the field: arguments of ``option``.
-    """
-
-    group: Any
-    names: tuple[str, ...] = ()
-    default: str = ""
-    context: str = ""
+    group: Any  # the group
+    names: tuple[str, ...] = ()  # its options; by default those whose fields are marked by ``COMMAND_LINE``
+    default: str = ""  # where the default comes from, before that of the group
+    context: str = ""  # what comes before the description of each
+    # for options that are stated in another form than the field: arguments of ``option``
     forms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def parameters(self) -> Iterator[inspect.Parameter]:
@@ -63,9 +57,12 @@ class Given:
 class _OutputOptions:
     """Options of all commands; ``--debug`` is read where errors are printed."""
 
-    as_json: bool = option(False, "Print the answer as JSON on standard output, and nothing else there.", "--json")
-    quiet: bool = option(False, "Print nothing but warnings and errors, and no progress.", "--quiet", "-q")
-    debug: bool = option(False, "Print the traceback of an error.")
+    as_json: bool = option(False, "--json")
+    """Print the answer as JSON on standard output, and nothing else there."""
+    quiet: bool = option(False, "--quiet", "-q")
+    """Print nothing but warnings and errors, and no progress."""
+    debug: bool = False
+    """Print the traceback of an error."""
 
 
 def _parameter(name: str, annotation: Any, default: Any, form: Mapping[str, Any]) -> inspect.Parameter:
@@ -88,36 +85,30 @@ def _parameters(group: type) -> Iterator[tuple[str, inspect.Parameter]]:
     """Name of each field of a command with its parameters: arguments, own options, then those that commands share."""
     depth = {name: place for place, kind in enumerate(group.__mro__) for name in inspect.get_annotations(kind)}
     fields = fields_of(group)
-    for name in sorted(fields, key=lambda name: -1 if _is_argument(fields[name]) else depth[name]):
-        mark = next((mark for mark in fields[name].metadata if isinstance(mark, Given)), None)
+    forms = {name: {"text": stated.description, **(stated.json_schema_extra or {})} for name, stated in fields.items()}
+    for name in sorted(fields, key=lambda name: -1 if forms[name].get("positional") else depth[name]):
+        stated = fields[name]
+        mark = next((mark for mark in stated.metadata if isinstance(mark, Given)), None)
         if mark is not None:
             yield from ((name, parameter) for parameter in mark.parameters())
         else:
-            stated = fields[name]
             default = inspect.Parameter.empty if stated.is_required() else stated.default
-            yield name, _parameter(name, stated.annotation, default, {"text": stated.description, **_form(stated)})
-
-
-def _form(stated: Any) -> dict[str, Any]:
-    return stated.json_schema_extra or {}
-
-
-def _is_argument(stated: Any) -> bool:
-    return bool(_form(stated).get("positional"))
+            yield name, _parameter(name, stated.annotation, default, forms[name])
 
 
 @contextmanager
 def _naming_options(parameters: Sequence[inspect.Parameter]) -> Iterator[None]:
-    """Errors name the arguments of Python functions: name the options that were given instead."""
+    """Errors name the arguments of Python functions and the keys of files: name the option that was given instead."""
     try:
         yield
     except (TypeError, ValueError) as error:
-        found = re.match(r"(?:the command line: sensor: )?(\w+)[.\w]*( must .*?)(?: \((?:int|float)\))?$", str(error))
+        # options replace the keys of [sensor], in a file as well
+        name = re.split(r"[.[]", getattr(error, "argument", "").removeprefix("sensor."))[0]
         for parameter in parameters:
             info = get_args(parameter.annotation)[1]
-            if found is not None and parameter.name == found[1] and isinstance(info, typer.models.OptionInfo):
-                option = info.default if isinstance(info.default, str) else f"--{parameter.name.replace('_', '-')}"
-                raise ValueError(f"{option}{found[2]}") from error
+            if parameter.name == name and isinstance(info, typer.models.OptionInfo):
+                option = info.default if isinstance(info.default, str) else f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} {vars(error)['problem']}") from error
         raise
 
 
@@ -127,11 +118,7 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
     fields = list(_parameters(group))
 
     def flat(**given: Any) -> None:
-        with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
-            run(given)
-
-    def run(given: dict[str, Any]) -> None:
-        values: dict[str, Any] = {}
+        values: Table = {}
         for place, parameter in fields:
             value = given[parameter.name]
             if place == parameter.name:
@@ -139,14 +126,16 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
             else:
                 is_given = value is not None and value is not False
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
-        with output_of(as_json=given["as_json"], quiet=given["quiet"]):
+        output = current_output()
+        output.as_json, output.quiet = given["as_json"], given["quiet"]
+        with _naming_options([parameter for _, parameter in fields if given[parameter.name] is not None]):
             answer = command(group(**values))
-            show_answer(name, answer)
-            required = values.get("require_reliable") or ""
-            missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]
-            if missed:
-                error_line(f"--require-reliable: {' and '.join(missed)} not reliable; the files are complete")
-                raise typer.Exit(_NOT_RELIABLE)
+        show_answer(name, answer)
+        required = values.get("require_reliable") or ""
+        missed = [axis for axis in required.split(",") if required and not answer.reliable.get(axis)]
+        if missed:
+            error_line(f"--require-reliable: {' and '.join(missed)} not reliable; the files are complete")
+            raise typer.Exit(_NOT_RELIABLE)
 
     parameters = [parameter for _, parameter in (*fields, *_parameters(_OutputOptions))]
     flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsvib_torch import io
-from rsvib_torch.commands.answers import command_text, next_step
+from rsvib_torch.commands.answers import next_step
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_rate
-from rsvib_torch.commands.terminal import Answer, error_line, note, working
+from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.core.atomic import check_writable, whole_file
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import measured_text, printable, text_table
 from rsvib_torch.core.validation import MistakesError, fields_of, options
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
@@ -34,12 +35,12 @@ _HINTS: dict[str, str] = {name: field.description for name, field in fields_of(S
 class InitOptions:
     """Options of ``init``."""
 
-    frames: Path | None = argument(
-        "Stack of frames of the camera; its size, frame rate and times are read.", default=None
-    )
-    out: Path = option(Path("camera.toml"), "Configuration file to write.")
+    frames: Path | None = argument(default=None)
+    """Stack of frames of the camera; its size, frame rate and times are read."""
+    out: Path = Path("camera.toml")
+    """Configuration file to write."""
     sensor: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             SensorSection,
             forms={
@@ -51,10 +52,13 @@ class InitOptions:
             },
         ),
     ]
-    camera: str | None = option(None, "Model of the camera, for its measured row time (rsvib cameras lists them).")
-    preset: str | None = option(None, f"Copy a preset instead: {', '.join(presets())}.")
-    list_presets: bool = option(False, "List the presets and exit.")
-    overwrite: bool = option(False, "Replace an existing configuration file.")
+    camera: str | None = None
+    """Model of the camera, for its measured row time (rsvib cameras lists them)."""
+    preset: str | None = option(None, text=f"Copy a preset instead: {', '.join(presets())}.")
+    list_presets: bool = False
+    """List the presets and exit."""
+    overwrite: bool = False
+    """Replace an existing configuration file."""
 
 
 def init(given: InitOptions) -> Answer:
@@ -85,8 +89,8 @@ def init(given: InitOptions) -> Answer:
         text = _describe_camera(frames, sensor, camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
-    step = command_text("run", frames or "FRAMES", "results", "--config", out)
-    return Answer({}, {}, [out], [next_step("detect the vibration and restore the frames", step)])
+    run = ("run", frames or "FRAMES", "results", "--config", out)
+    return Answer({}, {}, [out], [next_step("detect the vibration and restore the frames", *run)])
 
 
 def _first_comment(text: str) -> str:
@@ -100,7 +104,8 @@ def _first_comment(text: str) -> str:
 class CamerasOptions:
     """Options of ``cameras``."""
 
-    search: list[str] | None = argument("Words of its name, e.g. iphone 12.", default=None)
+    search: list[str] | None = argument(default=None)
+    """Words of its name, e.g. iphone 12."""
 
 
 def cameras(given: CamerasOptions) -> Answer:
@@ -152,7 +157,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         values["frame_rate"] = stated
         note(f"frame rate {stated:.6g} per second, from the times in the file")
     elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
-        error_line(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}", "warning")
+        warn(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}")
     source, likely, proposal = None, {}, ""
     if camera is not None:
         values["row_time"], source = _row_time_of(camera, info, values)
@@ -192,7 +197,7 @@ def _likely_full_scale(pixels: Any) -> float:
     return float(((1 << max(int(pixels.max()) // step, 255).bit_length()) - 1) * step)
 
 
-def _complete(values: dict[str, Any], rows: int, likely: Mapping[str, float], proposal: str) -> None:
+def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
     """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
     questions: dict[str, tuple[str, Callable[[str], float]]] = {
         "frame_rate": ("--frame-rate", rate),
@@ -243,15 +248,12 @@ def _check_timing(timing: SensorTiming, rows: int) -> None:
     readout, period = 1e3 * rows * timing.row_time, 1e3 * timing.frame_period
     note(f"readout of {rows} rows takes {readout:.4g} ms of the frame period of {period:.4g} ms")
     if used > 0.995:  # of the frame period; sensors have at least some blanking rows, data sheets three digits
-        error_line(
+        warn(
             "the row time equals 1 / (frame rate x rows), which is rarely true, because sensors have blanking rows: "
-            "take it from the data sheet, or measure it with rsvib calibrate",
-            "warning",
+            "take it from the data sheet, or measure it with rsvib calibrate"
         )
     elif used < 0.01:  # of the frame period: rarer than a value in a wrong unit
-        error_line(
-            f"the readout takes only {100 * used:.2g} % of the frame period: check the unit of the row time", "warning"
-        )
+        warn(f"the readout takes only {100 * used:.2g} % of the frame period: check the unit of the row time")
 
 
 def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:

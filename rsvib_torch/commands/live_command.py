@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 import threading
 import time
@@ -11,24 +10,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 
 from pydantic import Field
 
 from rsvib_torch import io, live, tracking
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new
-from rsvib_torch.commands.terminal import Answer, error_line
+from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
+from rsvib_torch.commands.terminal import Answer, error_line, warn
 from rsvib_torch.core.atomic import check_writable
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import Count, NotNegative, options
 from rsvib_torch.options import BorderName, TrackerOptions, method_options
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
-    from rsvib_torch.live import FrameOutput, FrameSource, LiveReport
-    from rsvib_torch.tracking import TrackedFrame
 
 PixelFormatName = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 _AT_LEAST_2 = Annotated[int, Field(ge=2)]
@@ -38,39 +36,41 @@ _AT_LEAST_2 = Annotated[int, Field(ge=2)]
 class LiveOptions(CameraOptions, RangeOptions):
     """Options of ``live``."""
 
-    source: str = argument("Number or URL of a camera, - for raw frames on standard input, or a file with frames.")
-    out: Path | None = option(None, "Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout.")
-    page: Annotated[int, Field(ge=0, le=65535)] | None = option(
-        None, "Show the restored frames at http://127.0.0.1:PORT.", metavar="PORT"
-    )
-    preview: bool = option(False, "Show the restored frames in a window.")
-    spectrogram: Path | None = option(
-        None, "Write the spectrogram of both axes: NAME.png and NAME.zarr.", metavar="NAME"
-    )
-    max_frequency: float = option(250.0, "Highest frequency of the spectrogram.", metavar="HZ")
-    size: str | None = option(None, "Size of the frames on standard input, e.g. 1024x768.", metavar="WIDTHxHEIGHT")
-    pixel_format: PixelFormatName = option("gray8", "Pixels of the frames on standard input.")
-    realtime: bool = option(False, "Read a file at its own rate, and drop frames like a camera.")
+    source: str = argument()
+    """Number or URL of a camera, - for raw frames on standard input, or a file with frames."""
+    out: Path | None = None
+    """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
+    page: Annotated[int, Field(ge=0, le=65535)] | None = option(None, metavar="PORT")
+    """Show the restored frames at http://127.0.0.1:PORT."""
+    preview: bool = False
+    """Show the restored frames in a window."""
+    spectrogram: Path | None = option(None, metavar="NAME")
+    """Write the spectrogram of both axes: NAME.png and NAME.zarr."""
+    max_frequency: float = option(250.0, metavar="HZ")
+    """Highest frequency of the spectrogram."""
+    size: str | None = option(None, metavar="WIDTHxHEIGHT")
+    """Size of the frames on standard input, e.g. 1024x768."""
+    pixel_format: PixelFormatName = "gray8"
+    """Pixels of the frames on standard input."""
+    realtime: bool = False
+    """Read a file at its own rate, and drop frames like a camera."""
     tracker: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             TrackerOptions,
             ("window", "columns"),
             forms={"method": {"show_default": "from the configuration, or dewarp"}},
         ),
     ]
-    steady: NotNegative = option(
-        0.0,
-        "Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime).",
-        metavar="SECONDS",
-    )
-    border: BorderName = option(
-        "mirror",
-        "Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available "
-        "for videos (rsvib run --video).",
-    )
-    waiting: Count = option(64, "Frames that wait before the oldest ones are dropped.")
-    num_frames: _AT_LEAST_2 | None = option(None, "Stop after this number of frames.")
+    steady: NotNegative = option(0.0, metavar="SECONDS")
+    """Stabilise the image to a straight line through the last part of its path (a camera; a file with --realtime)."""
+    border: BorderName = "mirror"
+    """Pixels that the sensor did not record: mirror, extrapolated; hold, as in the frame before; crop is available for
+    videos (rsvib run --video)."""
+    waiting: Count = 64
+    """Frames that wait before the oldest ones are dropped."""
+    num_frames: _AT_LEAST_2 | None = None
+    """Stop after this number of frames."""
 
     @cached_property
     def file(self) -> Path | None:
@@ -82,6 +82,12 @@ class LiveOptions(CameraOptions, RangeOptions):
         if not io.stack_files(self.source)[0].exists():
             raise FileNotFoundError(f"{self.source}: no such file; a camera is a number or a URL")
         return self.part_of(Path(self.source))
+
+    @property
+    def frame_size(self) -> tuple[int, int]:
+        """(height, width) of the frames on standard input."""
+        width, height = size_of(self.size or "", "WIDTHxHEIGHT in px such as 1024x768")
+        return height, width
 
     @property
     def is_camera(self) -> bool:
@@ -151,19 +157,25 @@ def live_session(given: LiveOptions) -> Answer:
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
-    if report.dropped or report.lost:
-        error_line(_missing(report), "warning")
+    missing = {
+        "dropped, because processing was too slow (fewer --columns)": report.dropped,
+        "not delivered by the source": report.lost,
+    }
+    parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
+    if parts:
+        warn("; ".join(parts))
     return _answer(given.source, report, [*files, *saved], drops=drops)
 
 
-def _source(given: LiveOptions, settings: Config) -> FrameSource:
+def _source(given: LiveOptions, settings: Config) -> live.FrameSource:
     """The source of the frames."""
     if given.is_camera:
         return live.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
     if given.file is None:
+        size = given.frame_size
         # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
         stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-        return live.PipeSource(stream, _size(given.size or ""), given.pixel_format, settings.timing)
+        return live.PipeSource(stream, size, given.pixel_format, settings.timing)
     scale = given.full_scale if given.full_scale is not None else settings.full_scale
     return live.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
 
@@ -174,8 +186,6 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
     if given.source != "-" and given.size is not None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
-    if given.size is not None:
-        _size(given.size)
     if given.realtime and given.file is None:
         raise ValueError(f"--realtime goes with a file, not with {given.source}: a camera has its own rate")
     if given.border == "crop" or (given.steady > 0 and given.file is not None and not given.realtime):
@@ -184,9 +194,9 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
 
 
-def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[FrameOutput]:
+def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[live.FrameOutput]:
     """The outputs that the options name."""
-    outputs: list[FrameOutput] = []
+    outputs: list[live.FrameOutput] = []
     if given.written is not None:
         outputs.append(live.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
     if stream is not None:
@@ -198,14 +208,6 @@ def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> l
         outputs.append(served)
         error_line(f"the page is {served.url}", "note")
     return outputs
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) from ``WIDTHxHEIGHT``."""
-    match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text.strip().lower())
-    if match is None:
-        raise ValueError(f"--size must be WIDTHxHEIGHT in px such as 1024x768, got {text!r}")
-    return int(match[2]), int(match[1])
 
 
 @contextmanager
@@ -227,7 +229,7 @@ class _StateText:
     def __init__(self, page: live.PageOutput) -> None:
         self._page, self._next, self._lock = page, 0.0, threading.Lock()
 
-    def __call__(self, tracked: TrackedFrame, report: LiveReport) -> None:
+    def __call__(self, tracked: tracking.TrackedFrame, report: live.LiveReport) -> None:
         now = time.perf_counter()
         if now < self._next:
             return
@@ -237,16 +239,7 @@ class _StateText:
         self._page.show_state("\n".join([*lines, *([] if found is None else [found.summary()])]))
 
 
-def _missing(report: LiveReport) -> str:
-    parts = []
-    if report.dropped:
-        parts.append(f"{number_of(report.dropped, 'frame')} dropped, because processing was too slow (fewer --columns)")
-    if report.lost:
-        parts.append(f"{number_of(report.lost, 'frame')} not delivered by the source")
-    return "; ".join(parts)
-
-
-def _answer(source: str, report: LiveReport, files: list[Path], *, drops: bool) -> Answer:
+def _answer(source: str, report: live.LiveReport, files: list[Path], *, drops: bool) -> Answer:
     rate = report.frames / report.seconds
     lines = [
         f"{number_of(report.frames, 'frame')} in {report.seconds:.1f} s ({rate:.1f} per second), "

@@ -17,13 +17,7 @@ from rsvib_torch.commands.flat_command import flat_command
 from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
 from rsvib_torch.commands.run_stack import run
-from rsvib_torch.commands.terminal import (
-    Answer,
-    error_line,
-    print_line,
-    running,
-    warnings_in_one_line,
-)
+from rsvib_torch.commands.terminal import Answer, error_line, print_line, running, warnings_in_one_line
 from rsvib_torch.core.validation import MistakesError
 
 _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help

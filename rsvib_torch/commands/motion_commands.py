@@ -2,58 +2,40 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import command_text, next_step, restoration_lines, verdicts
+from rsvib_torch.commands import shared_options as shared
+from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
-from rsvib_torch.commands.shared_options import (
-    SENSOR_FORMS,
-    TIME,
-    PixelSizeOptions,
-    RangeOptions,
-    StackCommand,
-    VerdictOptions,
-    check_new,
-    restored_argument,
-    restored_shape,
-)
-from rsvib_torch.commands.stack_commands import load, restore_and_save
-from rsvib_torch.commands.terminal import Answer, error_line, note, working
+from rsvib_torch.commands.stack_commands import Stack, load, restore_and_save
+from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.core.atomic import check_writable, whole_file
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import options
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from rsvib_torch.calibration import RowTimeCalibration
     from rsvib_torch.core.presentation import Result
-    from rsvib_torch.detection import MotionCheck, MotionDetection, SweptTone
-    from rsvib_torch.motion.gyroscope_rates import AngularRates
-    from rsvib_torch.motion.spline import FreeMotion
-    from rsvib_torch.motion.timing import SensorTiming
 
 
 @options
-class MotionOptions(StackCommand, VerdictOptions):
+class MotionOptions(shared.StackCommand, shared.VerdictOptions):
     """Options of ``motion``."""
 
-    out: Path = option(..., "CSV file to write: time in s, x and y in px, and their standard deviations (model free).")
-    model: Literal["free", "swept"] = option(
-        "free",
-        "free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose "
-        "frequency changes linearly.",
-    )
-    detection: Annotated[dict[str, Any], Given(FreeMotionOptions, ("knot_rows", "search"))]
+    out: Path = option(...)
+    """CSV file to write: time in s, x and y in px, and their standard deviations (model free)."""
+    model: Literal["free", "swept"] = "free"
+    """free: a smooth curve of any shape; swept: one sinusoid per axis whose amplitude decays or grows and whose
+    frequency changes linearly."""
+    detection: Annotated[Table, Given(FreeMotionOptions, ("knot_rows", "search"))]
 
 
 def motion(given: MotionOptions) -> Answer:
@@ -65,11 +47,11 @@ def motion(given: MotionOptions) -> Answer:
     import torch  # noqa: PLC0415
 
     out, frames = given.out, given.stack
-    check_new([out], given.overwrite, given.inputs)
+    shared.check_new([out], given.overwrite, given.inputs)
     check_writable(out)
     chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
     stack = load(given)
-    result: MotionDetection | SweptTone
+    result: detection.MotionDetection | detection.SweptTone
     with working("detecting the motion"):
         if given.model == "free":
             result = detection.detect_motion(stack.frames, stack.timing, **chosen)
@@ -86,23 +68,21 @@ def motion(given: MotionOptions) -> Answer:
     if isinstance(result, detection.MotionDetection):
         rows, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
         columns |= {f"std_{name}": np.interp(times, rows, stds[:, axis]) for axis, name in enumerate("xy")}
-    with whole_file(out) as file, file.open("w", newline="", encoding="utf-8") as text:
-        writer = csv.writer(text)
-        writer.writerow(columns)
-        for time, *row in np.column_stack(list(columns.values())):
-            writer.writerow([f"{time:.9f}", *(f"{value:.5f}" for value in row)])
-    recording = ("--motion", out, "--unit", "px", "--offset", "0")
-    restore_it = command_text("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *recording)
+    digits = {"time": 9}
+    texts = {name: [f"{value:.{digits.get(name, 5)}f}" for value in values] for name, values in columns.items()}
+    reports.write_columns(out, texts)
+    known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
+    restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
     return Answer(
         {f"Motion in {frames.name}": [result.summary()]},
         {"motion": _without_curve(result), "columns": list(columns)},
         [out],
-        [next_step("restore the frames", restore_it)] * bool(result.reliable.any()),
+        [next_step("restore the frames", *restore)] * bool(result.reliable.any()),
         verdicts([result]),
     )
 
 
-def _without_curve(result: Result) -> dict[str, Any]:
+def _without_curve(result: Result) -> Table:
     """The values of a result without its curves, which have a value for every row or knot."""
     curve = {"motion", "times", "displacement", "offsets", "residual", "light", "fitted_light"}
     curve |= {"measured", "predicted"}
@@ -111,45 +91,37 @@ def _without_curve(result: Result) -> dict[str, Any]:
 
 
 @options
-class KnownOptions(StackCommand):
+class KnownOptions(shared.StackCommand):
     """Options of ``known``."""
 
-    restored: Path = restored_argument()
-    motion: Path = option(
-        ...,
-        "CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow "
-        "log (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit.",
-    )
-    unit: MotionUnit | None = option(
-        None, "Unit of x and y: px, an angle, or an angular rate.", show_default="the rates of a gyroscope"
-    )
-    focal_length: float | None = option(
-        None,
-        "Focal length in px; required for angles and angular rates.",
-        show_default="for a gyroscope, estimated from the frames",
-    )
-    time_unit: TimeUnit = option("s", "Unit of the times.")
-    flip_x: bool = option(False, "Positive x moves the image towards smaller x.")
-    flip_y: bool = option(False, "Positive y moves the image towards smaller y.")
-    offset: float | None = option(
-        None,
-        "Time of the recording, in s, at the exposure start of the first row of frame 0.",
-        show_default="estimated from the frames",
-    )
+    restored: Path = shared.restored_argument()
+    motion: Path = option(...)
+    """CSV file with the columns time, x and y; or, without --unit, the angular rates of a gyroscope: a gyroflow log
+    (.gcsv), a GoPro video (.mp4), or CSV with three rates whose names state the unit."""
+    unit: MotionUnit | None = option(None, show_default="the rates of a gyroscope")
+    """Unit of x and y: px, an angle, or an angular rate."""
+    focal_length: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
+    """Focal length in px; required for angles and angular rates."""
+    time_unit: TimeUnit = "s"
+    """Unit of the times."""
+    flip_x: bool = False
+    """Positive x moves the image towards smaller x."""
+    flip_y: bool = False
+    """Positive y moves the image towards smaller y."""
+    offset: float | None = option(None, show_default="estimated from the frames")
+    """Time of the recording, in s, at the exposure start of the first row of frame 0."""
     offsets: tuple[float, float] | None = option(
-        None,
-        "Smallest and largest time of the recording, in s, at the exposure start of the first row of frame 0, between "
-        "which it is estimated.",
-        metavar="LOW HIGH",
-        show_default="all for which the recording covers the frames",
+        None, metavar="LOW HIGH", show_default="all for which the recording covers the frames"
     )
-    fit_gain: bool = option(False, "Estimate the focal length from the frames as well.")
-    fit_row_time: bool = option(False, "With a gyroscope: estimate the row time from the frames as well.")
-    force: bool = option(
-        False,
-        "Restore even if the recording does not explain the motion of the frames, or the restored frames are judged "
-        "no better than the input.",
-    )
+    """Smallest and largest time of the recording, in s, at the exposure start of the first row of frame 0, between
+    which it is estimated."""
+    fit_gain: bool = False
+    """Estimate the focal length from the frames as well."""
+    fit_row_time: bool = False
+    """With a gyroscope: estimate the row time from the frames as well."""
+    force: bool = False
+    """Restore even if the recording does not explain the motion of the frames, or the restored frames are judged no
+    better than the input."""
 
 
 def known(given: KnownOptions) -> Answer:
@@ -159,20 +131,18 @@ def known(given: KnownOptions) -> Answer:
     frames, and refused if it does not explain them. If the restored frames are judged no better than the input, the
     input is written unchanged, unless --force is given.
     """
-    check_new(io.stack_files(given.restored), given.overwrite, [*given.inputs, given.motion])
-    from rsvib_torch.motion.spline import FreeMotion  # noqa: PLC0415
-
+    shared.check_new(io.stack_files(given.restored), given.overwrite, [*given.inputs, given.motion])
     recorded = _recorded(given)
     camera = None
     if given.unit is None and given.focal_length is not None:
         camera = rsvib_torch.Camera(given.focal_length)
     info, scale, options = given.planned_restoration()
-    shape = restored_shape(info, options)
+    shape = shared.restored_shape(info, options)
     io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     results: dict[str, list[str]] = {}
-    data: dict[str, Any] = {"alignment": None, "check": None}
+    data: Table = {"alignment": None, "check": None}
     stack = load(given, options)
-    if given.offset is None or not isinstance(recorded, FreeMotion):
+    if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
         with working("aligning the recording"):
             found = detection.align_motion(
                 stack.frames,
@@ -199,8 +169,8 @@ def known(given: KnownOptions) -> Answer:
                 f"{given.offset + first:.6g} to {given.offset + last:.6g} s"
             )
     check = None
-    if isinstance(recorded, FreeMotion):  # rates were compared by the alignment
-        check = _check_motion(given, stack.frames, stack.timing, placed)
+    if isinstance(recorded, rsvib_torch.FreeMotion):  # rates were compared by the alignment
+        check = _check_motion(given, stack, placed)
     if check is not None:
         results["Motion of the frames"] = [check.summary()]
         data["check"] = _without_curve(check)
@@ -210,7 +180,7 @@ def known(given: KnownOptions) -> Answer:
     return Answer(results, data, [given.restored])
 
 
-def _recorded(given: KnownOptions) -> FreeMotion | AngularRates:
+def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
     """The recording."""
     if given.offset is not None and given.offsets is not None:
         raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
@@ -232,7 +202,7 @@ def _recorded(given: KnownOptions) -> FreeMotion | AngularRates:
     return rsvib_torch.read_gyroscope(given.motion)
 
 
-def _with_row_time(timing: SensorTiming, row_time: float) -> SensorTiming:
+def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float) -> rsvib_torch.SensorTiming:
     """The timing with another row time, and the same exposure and frame period in seconds."""
     rows = timing.row_time / row_time
     return replace(
@@ -245,53 +215,57 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
     if reasons and not given.force:
         raise ValueError(f"{given.motion}: {'; '.join(reasons)}; --force restores with it nevertheless")
     for reason in reasons:
-        error_line(reason, "warning")
+        warn(reason)
 
 
-def _check_motion(given: KnownOptions, frames: Tensor, timing: SensorTiming, motion: FreeMotion) -> MotionCheck | None:
+def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMotion) -> detection.MotionCheck | None:
     """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
 
     If the clock is stated, an error of the comparison is a warning.
     """
-    if len(frames) < 2:
-        error_line("cannot determine whether the motion fits: the comparison needs two frames", "warning")
+    if len(stack.frames) < 2:
+        warn("cannot determine whether the motion fits: the comparison needs two frames")
         return None
     try:
         with working("comparing the motion"):
-            check = detection.check_motion(frames, timing, motion)
+            check = detection.check_motion(stack.frames, stack.timing, motion)
     except ValueError as error:
         if given.offset is None:
             raise
-        error_line(f"cannot determine whether the motion fits: {error}", "warning")
+        warn(f"cannot determine whether the motion fits: {error}")
         return None
     if check.helps:
         for reason in check.reasons:
-            error_line(reason, "warning")
+            warn(reason)
     else:
         _refuse(given, check.reasons)
     return check
 
 
 @options
-class CompareOptions(PixelSizeOptions):
+class CompareOptions(shared.PixelSizeOptions):
     """Options of ``compare``."""
 
-    vibration: Path = argument("The vibration.json written by detect or run.")
-    record: Path = argument("CSV file with the columns time, x (right) and y (down), evenly sampled.")
-    unit: AccelerationUnit = option(..., "Unit of x and y.")
-    out: Path | None = option(None, "Picture of both to write (PNG, SVG, PDF).")
-    offset: float | None = option(
-        None,
-        "Time of the accelerometer, in s, at the exposure start of the first row of frame 0.",
-        show_default="that at which both resemble each other most",
-    )
-    offsets: tuple[float, float] | None = option(
-        None, "Smallest and largest offset to try.", metavar="LOW HIGH", show_default="all that cover the frames"
-    )
-    time_unit: TimeUnit = option("s", "Unit of the times.")
-    flip_x: bool = option(False, "Positive x is to the left of the image, or the accelerometer is on the camera.")
-    flip_y: bool = option(False, "Positive y is upwards in the image, or the accelerometer is on the camera.")
-    overwrite: bool = option(False, "Replace results that exist already.")
+    vibration: Path = argument()
+    """The vibration.json written by detect or run."""
+    record: Path = argument()
+    """CSV file with the columns time, x (right) and y (down), evenly sampled."""
+    unit: AccelerationUnit = option(...)
+    """Unit of x and y."""
+    out: Path | None = None
+    """Picture of both to write (PNG, SVG, PDF)."""
+    offset: float | None = option(None, show_default="that at which both resemble each other most")
+    """Time of the accelerometer, in s, at the exposure start of the first row of frame 0."""
+    offsets: tuple[float, float] | None = option(None, metavar="LOW HIGH", show_default="all that cover the frames")
+    """Smallest and largest offset to try."""
+    time_unit: TimeUnit = "s"
+    """Unit of the times."""
+    flip_x: bool = False
+    """Positive x is to the left of the image, or the accelerometer is on the camera."""
+    flip_y: bool = False
+    """Positive y is upwards in the image, or the accelerometer is on the camera."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
 
 def compare(given: CompareOptions) -> Answer:
@@ -303,7 +277,7 @@ def compare(given: CompareOptions) -> Answer:
     from rsvib_torch.motion.recorded import read_acceleration  # noqa: PLC0415
 
     if given.out is not None:
-        check_new([given.out], given.overwrite, [given.vibration, given.record])
+        shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
     times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
@@ -324,43 +298,42 @@ def compare(given: CompareOptions) -> Answer:
 
 
 @options
-class CalibrateOptions(RangeOptions):
+class CalibrateOptions(shared.RangeOptions):
     """Options of ``calibrate``."""
 
-    frames: list[Path] = argument("One or more stacks of frames: TIFF, PNG, video ...")
-    frequency: float | None = option(
-        None, "Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."
-    )
-    exposure: list[float] | None = option(
-        None,
-        "Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, "
-        "if known.",
-        **TIME,
-    )
-    by_motion: bool = option(False, "Use the motion of the camera instead of a light; needs --frame-rate.")
+    frames: list[Path] = argument()
+    """One or more stacks of frames: TIFF, PNG, video ..."""
+    flicker_frequency: float | None = option(None, "--frequency")
+    """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
+    exposure: list[float] | None = option(None, **shared.TIME)
+    """Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, if
+    known."""
+    by_motion: bool = False
+    """Use the motion of the camera instead of a light; needs --frame-rate."""
     row_time: list[float] | None = option(
-        None,
-        "With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us.",
-        show_default="a readout within a tenth to the whole of the frame period",
-        **TIME,
+        None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
+    """With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us."""
     readout_direction: Literal["forward", "reverse"] | None = option(
         None,
-        f"With --by-motion, if known. {SENSOR_FORMS['readout_direction']['text']}",
         show_default="determined from the frames",
+        text=f"With --by-motion, if known. {shared.SENSOR_FORMS['readout_direction']['text']}",
     )
-    frame_rate: float | None = option(None, **SENSOR_FORMS["frame_rate"])
-    on_fraction: float | None = option(
-        None, "Duty cycle of a light that is switched on and off; determines the exposure time."
-    )
-    light_contrast: float | None = option(
-        None, "Amplitude over mean of a sinusoidal light; determines the exposure time."
-    )
-    scan_axis: Literal["y", "x"] = option("y", "Image axis along which the rows follow each other.")
-    gamma: float = option(1.0, "Exponent that makes pixel values proportional to light.")
-    full_scale: float | None = option(None, "Count that corresponds to full scale.")
-    out: Path | None = option(None, "Configuration file to write, with the table [sensor].")
-    overwrite: bool = option(False, "Replace results that exist already.")
+    frame_rate: float | None = option(None, **shared.SENSOR_FORMS["frame_rate"])
+    on_fraction: float | None = None
+    """Duty cycle of a light that is switched on and off; determines the exposure time."""
+    light_contrast: float | None = None
+    """Amplitude over mean of a sinusoidal light; determines the exposure time."""
+    scan_axis: Literal["y", "x"] = "y"
+    """Image axis along which the rows follow each other."""
+    gamma: float = 1.0
+    """Exponent that makes pixel values proportional to light."""
+    full_scale: float | None = None
+    """Count that corresponds to full scale."""
+    out: Path | None = None
+    """Configuration file to write, with the table [sensor]."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
 
 def calibrate(given: CalibrateOptions) -> Answer:
@@ -374,7 +347,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     _check_given(given)
     paths = [given.part_of(path) for path in given.frames]
     if given.out is not None:
-        check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
+        shared.check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
         check_writable(given.out)
     infos = [io.read_stack_info(path) for path in paths]
     for path, info in zip(paths, infos, strict=True):
@@ -397,13 +370,13 @@ def calibrate(given: CalibrateOptions) -> Answer:
                 scan_axis=axis,
                 readout_direction=given.readout_direction,
             )
-        elif given.frequency is None:
+        elif given.flicker_frequency is None:
             exposure = given.exposure or []
             result = calibration.calibrate_row_time_by_exposure(stack, exposure, scan_axis=axis, gamma=given.gamma)
         else:
             result = calibration.calibrate_row_time(
                 stack,
-                given.frequency,
+                given.flicker_frequency,
                 frame_rate=given.frame_rate,
                 on_fraction=given.on_fraction,
                 light_contrast=given.light_contrast,
@@ -421,8 +394,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     else:
         with whole_file(given.out) as file:
             file.write_text(table, encoding="utf-8")
-        detect_it = command_text("detect", "FRAMES", "--config", given.out, "--out", "FOLDER")
-        steps.append(next_step("detect a vibration", detect_it))
+        steps.append(next_step("detect a vibration", "detect", "FRAMES", "--config", given.out, "--out", "FOLDER"))
     return Answer(
         {"Camera": [result.summary(), f"{rows} rows are read in {readout} ms"], "Configuration": [table]},
         {"calibration": _without_curve(result)},
@@ -436,16 +408,20 @@ def _check_given(given: CalibrateOptions) -> None:
     if not given.by_motion:
         if given.row_time or given.readout_direction is not None:
             raise ValueError("--row-time and --readout-direction of calibrate are limits for --by-motion")
-        if (given.frequency is None) == (not given.exposure):
+        if (given.flicker_frequency is None) == (not given.exposure):
             raise ValueError(
                 "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
                 "--by-motion and --frame-rate for frames of a vibrating camera"
             )
         return
-    for name in ("frequency", "on_fraction", "light_contrast"):
-        if getattr(given, name) is not None:
-            option = name.replace("_", "-")
-            raise ValueError(f"--{option} describes a flickering light; leave it out with --by-motion")
+    light = {
+        "--frequency": given.flicker_frequency,
+        "--on-fraction": given.on_fraction,
+        "--light-contrast": given.light_contrast,
+    }
+    for name, value in light.items():
+        if value is not None:
+            raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
     if given.frame_rate is None:
         raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
     if given.exposure and len(given.exposure) > 1:
@@ -454,7 +430,7 @@ def _check_given(given: CalibrateOptions) -> None:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
 
 
-def _calibrated_toml(result: RowTimeCalibration, scan_axis: str) -> str:
+def _calibrated_toml(result: calibration.RowTimeCalibration, scan_axis: str) -> str:
     """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
     period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {

@@ -3,33 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-from rsvib_torch import detection, io, stacks
+from rsvib_torch import detection, io, stacks, tracking
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import (
-    page_step,
-    stack_answer,
-    steps_after_detection,
-    warn_of_restoration,
-    windows_answer,
-)
-from rsvib_torch.commands.flat_command import Given, argument, option
+from rsvib_torch.commands import answers
+from rsvib_torch.commands import written_results as written
+from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
-from rsvib_torch.commands.terminal import Answer, error_line, working
-from rsvib_torch.commands.written_results import (
-    OF_DETECTION,
-    OF_WINDOWS,
-    check_folder,
-    draw_safely,
-    note_lost,
-    remove_old,
-    warn_of_failures,
-    write_detection,
-    write_windows,
-)
+from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.core.atomic import whole_folder
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import options
 from rsvib_torch.options import ProcessStackOptions, ProcessVideoOptions, WindowOptions
@@ -38,9 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-    from rsvib_torch.stacks import StackReport, WindowResult
 
-_RESULTS = (*OF_DETECTION, *OF_WINDOWS, "restoration.json", "before_after.png")
+_RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
 _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
@@ -48,20 +32,17 @@ _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
     """Options of ``run``."""
 
-    out: Path = argument("Folder for the restored frames, the vibration and the figures.")
-    output: str = option(
-        "restored.tif",
-        "Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video "
-        "with the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a "
-        "folder of TIFF files, TIFF files of the same names, georeference, tiles and compression.",
-    )
-    video: bool = option(
-        False,
-        "Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without "
-        "loss). Videos are followed frame by frame instead of in windows.",
-    )
+    out: Path = argument()
+    """Folder for the restored frames, the vibration and the figures."""
+    output: str = "restored.tif"
+    """Name of the restored stack in that folder; its extension selects the format, e.g. .mp4 or .mkv for a video with
+    the time stamps and the sound of the input. restored/ is a folder with a file for each frame: from a folder of TIFF
+    files, TIFF files of the same names, georeference, tiles and compression."""
+    video: bool = False
+    """Write a video: restored.mp4 (H.264) from .mp4, restored.mov from .mov, else restored.mkv (FFV1, without loss).
+    Videos are followed frame by frame instead of in windows."""
     moved: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             ProcessVideoOptions,
             context="With --video, ",
@@ -87,8 +68,8 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
             },
         ),
     ]
-    windows: Annotated[dict[str, Any], Given(WindowOptions, default="from the configuration")]
-    processing: Annotated[dict[str, Any], Given(ProcessStackOptions, _PROCESSING)]
+    windows: Annotated[Table, Given(WindowOptions, default="from the configuration")]
+    processing: Annotated[Table, Given(ProcessStackOptions, _PROCESSING)]
 
 
 def run(given: RunOptions) -> Answer:
@@ -102,33 +83,38 @@ def run(given: RunOptions) -> Answer:
     settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
+    is_video = False
     if given.video:
-        output = _video_name(frames, output)
+        from rsvib_torch.io.stack_info import H264, VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
+
+        if output != "restored.tif":
+            raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
+        ending = split_range(frames)[0].suffix.lower()
+        is_video = ending in VIDEO
+        output = f"restored{ending if ending in H264 else '.mkv'}"
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     replaces = given.overwrite or "resume" in given.processing
-    check_folder(out, _RESULTS, replaces, given.inputs, out / output)
+    written.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
     common = {"full_scale": scale, "restoration": restoration, "device": str(given.torch_device)}
-    if given.video and _is_followed(frames, info.shape[0], chosen.window, requested=bool(given.moved)):
+    # videos of more than one window are followed from frame to frame
+    if given.moved or (is_video and info.shape[0] > chosen.window):
         answer = _run_followed(given, out / output, common)
     else:
         answer = _run_windows(given, out / output, info, common, chosen)
     if given.overwrite:
-        remove_old(out, _RESULTS, [path.name for path in answer.files])
+        written.remove_old(out, _RESULTS, [path.name for path in answer.files])
     return answer
 
 
-def _run_windows(
-    given: RunOptions, restored: Path, info: io.StackInfo, common: dict[str, Any], chosen: WindowOptions
-) -> Answer:
+def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions) -> Answer:
     """Process a stack in windows."""
     settings, frames, out = given.settings, given.stack, given.out
     common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
-    if not chosen.follow:  # a tracker has no options of detection
-        common["detection"] = settings.detection
+    common["detection"] = None if chosen.follow else settings.detection  # a tracker has none
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
     counts = info.shape[0] > chosen.window
     with working(f"restoring {frames.name}", counts=counts) as progress:
@@ -149,7 +135,7 @@ def _run_windows(
     with whole_folder(out) as folder:
         if len(first.frames):
             with working("drawing the frames"):
-                names += draw_safely(folder / "before_after.png", lambda: _comparison(given, common, first))
+                names += written.draw_safely(folder / "before_after.png", lambda: _comparison(given, common, first))
         names += [restored.name, "manifest.json"]
         if result.windows == 1 and not chosen.follow:
             assert isinstance(first.detection, detection.DetectionResult)
@@ -157,39 +143,39 @@ def _run_windows(
             restoration = common["restoration"]
             reports.write_restoration(folder / "restoration.json", first.restoration, restoration, result.not_kept)
             timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*write_detection(folder, first.detection, timing, given.pixel_size), "restoration.json"]
+            names += [*written.write_detection(folder, first.detection, timing, given.pixel_size), "restoration.json"]
         else:
-            names += write_windows(folder, out / "manifest.json", given.pixel_size)
+            names += written.write_windows(folder, out / "manifest.json", given.pixel_size)
     answer = _answer_of_windows(given, restored, result, first, info.shape[0])
     answer.files += [out / name for name in names]
     return answer
 
 
 def _answer_of_windows(
-    given: RunOptions, restored: Path, result: StackReport, first: WindowResult, count: int
+    given: RunOptions, restored: Path, result: stacks.StackReport, first: stacks.WindowResult, count: int
 ) -> Answer:
     """What a run on a stack of ``count`` frames found and did, with its warnings."""
     frames, out = given.stack, given.out
     if result.bad_frames:
-        error_line(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json", "warning")
-    note_lost(restored, result.not_kept)
+        warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
+    written.note_lost(restored, result.not_kept)
     if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
         assert first.restoration is not None
-        warn_of_restoration(first.restoration)
-        answer = stack_answer(frames, first.detection, given.pixel_size, first.restoration, count)
-        more, steps = [], steps_after_detection(first.detection, frames, given.settings)
+        answers.warn_of_restoration(first.restoration)
+        answer = answers.stack_answer(frames, first.detection, given.pixel_size, first.restoration, count)
+        more, steps = [], answers.steps_after_detection(first.detection, frames, given.settings)
     else:
         stored = stacks.read_manifest(out / "manifest.json")
-        warn_of_failures(stored)
-        answer = windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
+        written.warn_of_failures(stored)
+        answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
         more, steps = ["--manifest", str(out / "manifest.json")], []
     if result.restored:
-        steps.insert(0, page_step(frames, out / "report", given.settings, *more))
+        steps.insert(0, answers.page_step(frames, out / "report", given.settings, *more))
     answer.next_steps += steps
     return answer
 
 
-def _comparison(given: RunOptions, common: dict[str, Any], first: WindowResult) -> Figure:
+def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) -> Figure:
     """Draw the first restored frame of a stack beside the frame of the input."""
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
     from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
@@ -215,24 +201,7 @@ def _frame(path: Path, index: int, full_scale: float | None) -> Tensor:
     return frame
 
 
-def _video_name(frames: Path, output: str) -> str:
-    """Name of the restored video: H.264 for the endings that H.264 is written to, else FFV1."""
-    if output != "restored.tif":
-        raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-    from rsvib_torch.io.stack_info import H264, split_range  # noqa: PLC0415
-
-    ending = split_range(frames)[0].suffix.lower()
-    return f"restored{ending if ending in H264 else '.mkv'}"
-
-
-def _is_followed(frames: Path, count: int, window: int, *, requested: bool) -> bool:
-    """Whether ``--video`` follows a stack from frame to frame: videos of more than one window, or if requested."""
-    from rsvib_torch.io.stack_info import VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
-
-    return requested or (split_range(frames)[0].suffix.lower() in VIDEO and count > window)
-
-
-def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> Answer:
+def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
     only_windows = {
@@ -246,10 +215,10 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
         "--mosaic": restoration.get("mosaic"),
         "--optics-sigma": restoration.get("optics"),
     }
-    names = [name for name, value in only_windows.items() if value]
-    if names:
+    refused = [name for name, value in only_windows.items() if value]
+    if refused:
         raise ValueError(
-            f"{', '.join(names)} cannot be used with --video, which follows the frames one by one; give --output "
+            f"{', '.join(refused)} cannot be used with --video, which follows the frames one by one; give --output "
             "restored.mp4 instead of --video, which processes windows"
         )
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
@@ -267,35 +236,33 @@ def _run_followed(given: RunOptions, restored: Path, common: dict[str, Any]) -> 
             progress=progress,
         )
     stored = stacks.read_manifest(manifest)
-    drawn = draw_safely(out / "before_after.png", lambda: _followed_figure(frames, restored, stored))
+    drawn = written.draw_safely(out / "before_after.png", lambda: _followed_figure(frames, restored, stored))
     with whole_folder(out) as folder:
-        written = [restored.name, *drawn, "manifest.json", *write_windows(folder, manifest, given.pixel_size)]
+        names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, manifest, given.pixel_size)]
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
-        error_line(f"{bad} could not be used and repeat the frame before: see manifest.json", "warning")
+        warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
     if not result.restored:
-        error_line("no vibration was found that can be removed: the frames are written unchanged", "warning")
+        warn("no vibration was found that can be removed: the frames are written unchanged")
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"
-        error_line(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}", "warning")
-    answer = windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
+        warn(f"the restored frames are judged worse than the input in {where}: {worse[0].summary}")
+    answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     for name, where in (("frame_to_frame", "from frame to frame"), ("rows", "between the rows of a frame")):
         if stored.shaking is not None:
             before, after = stored.shaking[name]
             answer.results["Restoration"].append(f"shaking {where}: {before:.2g} px rms, {after:.2g} px afterwards")
     answer.data["shaking"] = stored.shaking
-    answer.files += [out / name for name in written]
-    answer.next_steps.append(page_step(frames, out / "report", settings, "--manifest", manifest))
+    answer.files += [out / name for name in names]
+    answer.next_steps.append(answers.page_step(frames, out / "report", settings, "--manifest", manifest))
     return answer
 
 
 def _followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
     """Draw one of the first frames of a video beside the restored one."""
-    from rsvib_torch.tracking import Margins  # noqa: PLC0415
-
     index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
     raw = _frame(frames, index, manifest.settings["full_scale"])
     if manifest.margins is not None:
-        raw = Margins(**manifest.margins).cut(raw)
+        raw = tracking.Margins(**manifest.margins).cut(raw)
     return reports.comparison_figure(raw, _frame(restored, index, None))

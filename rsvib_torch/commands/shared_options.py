@@ -18,6 +18,8 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.reading import Table
+from rsvib_torch.core.text import AXES
 from rsvib_torch.core.validation import options
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
@@ -54,22 +56,12 @@ def seconds(text: str) -> float:
 
 
 def metres(text: str) -> float:
-    """A length in metres: a number with a unit.
-
-    Example:
-        >>> metres("12.5um"), metres("0.3 mm")
-        (1.25e-05, 0.0003)
-    """
+    """A length in metres: a number with a unit."""
     return _with_unit(text.replace(" ", ""), _LENGTH_UNITS, "a length with its unit such as 12.5um or 0.3mm")
 
 
 def rate(text: str) -> float:
-    """Frames per second: a number or a fraction.
-
-    Example:
-        >>> round(rate("30000/1001"), 6)
-        29.97003
-    """
+    """Frames per second: a number or a fraction."""
     return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
@@ -82,14 +74,22 @@ def _range_of_frames(text: str) -> str:
 
 def _axes(text: str) -> str:
     """Names of axes with commas between them, as they were given."""
-    if not set(text.split(",")) <= {"x", "y", "roll", "zoom"}:
+    if not set(text.split(",")) <= {*AXES}:
         raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
     return text
 
 
-TIME: dict[str, Any] = {"parser": seconds, "metavar": "TIME"}  # form of an option
+def size_of(text: str, expected: str) -> tuple[int, int]:
+    """Two numbers of px with an x between them, from ``--size``."""
+    match = re.fullmatch(r"([1-9]\d{0,5})x([1-9]\d{0,5})", text.strip().lower())
+    if match is None:
+        raise ValueError(f"--size must be {expected}, got {text!r}")
+    return int(match[1]), int(match[2])
+
+
+TIME: Table = {"parser": seconds, "metavar": "TIME"}  # form of an option
 # Forms of the keys of [sensor] that are options.
-SENSOR_FORMS: dict[str, dict[str, Any]] = {
+SENSOR_FORMS: dict[str, Table] = {
     "row_time": {"text": "Time between the exposure starts of adjacent rows, e.g. 14.6us or 1.46e-5.", **TIME},
     "exposure_time": {"names": ["--exposure"], "text": "Exposure time, e.g. 1/500 or 2ms.", **TIME},
     "frame_rate": {
@@ -108,13 +108,9 @@ class RangeOptions:
     """A part of the frames of a stack."""
 
     frame_range: str | None = option(
-        None,
-        "Use only the frames START to END - 1, counted from 0; times count from the first of them.",
-        "--frames",
-        parser=_range_of_frames,
-        metavar="START:END",
-        show_default="all frames",
+        None, "--frames", parser=_range_of_frames, metavar="START:END", show_default="all frames"
     )
+    """Use only the frames START to END - 1, counted from 0; times count from the first of them."""
 
     def part_of(self, path: Path) -> Path:
         """The path of a stack, or of the frames that are used of it, ``NAME[START:END]``."""
@@ -125,15 +121,12 @@ class RangeOptions:
 class DeviceOptions:
     """Where it is computed."""
 
-    device: DeviceName = option("auto", "Device for the computation; auto uses a GPU if there is one.")
+    device: DeviceName = "auto"
+    """Device for the computation; auto uses a GPU if there is one."""
 
     @cached_property
     def torch_device(self) -> "torch.device":
-        """The device.
-
-        Raises:
-            ValueError: If there is no CUDA device.
-        """
+        """The device."""
         import torch  # noqa: PLC0415
 
         if self.device == "cuda" and not torch.cuda.is_available():
@@ -145,20 +138,15 @@ class DeviceOptions:
 class CameraOptions:
     """The camera, and what all commands have that use one."""
 
-    config: Path | None = option(
-        None,
-        "TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate.",
-    )
-    sensor: Annotated[dict[str, Any], Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
-    readout_time: float | None = option(
-        None, "Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time.", **TIME
-    )
-    full_scale: float | None = option(
-        None,
-        "Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits.",
-        show_default="from the file, or the configuration",
-    )
-    overwrite: bool = option(False, "Replace results that exist already.")
+    config: Path | None = None
+    """TOML file that describes the camera; rsvib init writes one. Or give --row-time, --exposure and --frame-rate."""
+    sensor: Annotated[Table, Given(SensorSection, default="from the configuration", forms=SENSOR_FORMS)]
+    readout_time: float | None = option(None, **TIME)
+    """Time in which all rows of a frame are read, e.g. 15ms, in place of --row-time."""
+    full_scale: float | None = option(None, show_default="from the file, or the configuration")
+    """Count of an integer format that corresponds to full scale, e.g. 4095 for 12 bits."""
+    overwrite: bool = False
+    """Replace results that exist already."""
 
     def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
         """Configuration file and the options that replace its keys, or the options alone.
@@ -202,9 +190,8 @@ class CameraOptions:
 class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
     """A command that reads a stack of frames."""
 
-    frames: Path = argument(
-        "Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."
-    )
+    frames: Path = argument()
+    """Stack of frames: TIFF, .npy, HDF5, Zarr, raw, video, or a folder of PNG, TIFF or JPEG files."""
 
     @cached_property
     def stack(self) -> Path:
@@ -221,17 +208,11 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         """Files that are read."""
         return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
 
-    def planned_restoration(
-        self, given: Mapping[str, Any] | None = None
-    ) -> "tuple[StackInfo, float | None, dict[str, Any]]":
-        """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``.
-
-        Raises:
-            ValueError: If a value is out of range.
-        """
+    def planned_restoration(self, given: Mapping[str, Any] | None = None) -> "tuple[StackInfo, float | None, Table]":
+        """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
         info = io.read_stack_info(self.stack)
         scale = full_scale_of(self.stack, info, self.settings, self.full_scale)
-        return info, scale, _restoration_options(info, scale, self.settings, given or {})
+        return info, scale, _restoration_options(info, scale, self.settings.restoration, given or {})
 
 
 @options
@@ -239,7 +220,7 @@ class RestorationCommand(StackCommand):
     """A command that restores the frames with options of ``restore``."""
 
     restoration: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             RestorationOptions,
             default="from the configuration",
@@ -259,14 +240,15 @@ class RestorationCommand(StackCommand):
             },
         ),
     ]
-    force: bool = option(False, "Write the restored frames even if they are judged no better than the input.")
+    force: bool = False
+    """Write the restored frames even if they are judged no better than the input."""
 
 
 def restored_argument() -> Any:
     """The stack that commands write."""
     return argument(
-        "Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 and "
-        ".mkv are videos with the time stamps and the sound of the input."
+        text="Stack to write, with the data type and full scale of the input. The extension selects the format; .mp4 "
+        "and .mkv are videos with the time stamps and the sound of the input."
     )
 
 
@@ -274,25 +256,17 @@ def restored_argument() -> Any:
 class PixelSizeOptions:
     """Units of length."""
 
-    pixel_size: float | None = option(
-        None,
-        "Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s².",
-        parser=metres,
-        metavar="LENGTH",
-    )
+    pixel_size: float | None = option(None, parser=metres, metavar="LENGTH")
+    """Size of a pixel on the sensor or on the object, e.g. 12.5um: the motion is also stated in µm, µm/s and m/s²."""
 
 
 @options
 class VerdictOptions:
     """What a script requires of the result."""
 
-    require_reliable: str | None = option(
-        None,
-        "For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results "
-        "are written all the same.",
-        parser=_axes,
-        metavar="AXES",
-    )
+    require_reliable: str | None = option(None, parser=_axes, metavar="AXES")
+    """For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results are
+    written all the same."""
 
 
 def stated_rate(info: "StackInfo") -> float | None:
@@ -309,11 +283,7 @@ def check_new(
 ) -> None:
     """Raise an error if results would replace an input, or exist and must not be replaced.
 
-    Args:
-        paths: Files to write, and folders that are written as a whole. An empty folder may exist.
-        overwrite: Whether existing results are replaced.
-        inputs: Files and folders that are read; None for those that were not given.
-        folder: Folder of the results, as in ``check_outputs``.
+    Of folders, which are written as a whole, an empty one may exist. ``folder`` is as in ``check_outputs``.
     """
     paths = list(paths)
     check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
@@ -327,11 +297,7 @@ def check_new(
 
 
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:
-    """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration.
-
-    Raises:
-        ValueError: If file and configuration differ and there is no option.
-    """
+    """Full scale of a stack: from the option, else from the file (or its 8-bit type), else from the configuration."""
     if option is not None or not info.is_integer:
         return option
     if info.full_scale is None:
@@ -345,10 +311,10 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
 
 
 def _restoration_options(
-    info: "StackInfo", full_scale: float | None, config: Config, given: Mapping[str, Any]
-) -> dict[str, Any]:
+    info: "StackInfo", full_scale: float | None, options: Mapping[str, Any], given: Mapping[str, Any]
+) -> Table:
     """Options of ``restore``: those of the configuration file, replaced by those ``given`` on the command line."""
-    options, given = dict(config.restoration), dict(given)
+    options, given = dict(options), dict(given)
     method = given.get("method", options.get("method", "exact"))
     if method != options.get("method", "exact"):  # other options belong to the configured method
         options = {name: value for name, value in options.items() if name in ("saturation", *method_options(method))}
@@ -360,13 +326,10 @@ def _restoration_options(
         given["joint"] = given["joint"] == "all" or int(given["joint"])
     options |= given
     checked = RestorationOptions(**options)
-    if options.get("saturation", "auto") == "auto":
-        options.pop("saturation", None)
-    if options.get("saturation") is not None:
-        if info.is_integer and full_scale is not None:
-            options["saturation"] /= full_scale
-    elif info.is_integer and full_scale is not None:
-        options["saturation"] = 1.0
+    if options.get("saturation") == "auto":
+        del options["saturation"]
+    if info.is_integer and full_scale is not None:  # of frames whose full scale is 1
+        options["saturation"] = (options.get("saturation") or full_scale) / full_scale
     if checked.mosaic is not None:
         from rsvib_torch.frames.mosaic import check_mosaic  # noqa: PLC0415
 

@@ -4,50 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 import rsvib_torch
 from rsvib_torch import detection, imaging, io, stacks
 from rsvib_torch import report as reports
-from rsvib_torch.commands.answers import (
-    command_text,
-    next_step,
-    page_step,
-    restoration_lines,
-    stack_answer,
-    step_parts,
-    steps_after_detection,
-    warn_of_restoration,
-    windows_answer,
-)
+from rsvib_torch.commands import answers
+from rsvib_torch.commands import shared_options as shared
+from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import (
-    CameraOptions,
-    DeviceOptions,
-    PixelSizeOptions,
-    RestorationCommand,
-    StackCommand,
-    VerdictOptions,
-    check_new,
-    full_scale_of,
-    restored_argument,
-    restored_shape,
-)
-from rsvib_torch.commands.terminal import Answer, note, running_command, working
-from rsvib_torch.commands.written_results import (
-    OF_DETECTION,
-    OF_WINDOWS,
-    check_folder,
-    note_lost,
-    remove_old,
-    warn_of_failures,
-    write_detection,
-    write_windows,
-)
+from rsvib_torch.commands.terminal import Answer, current_output, note, working
 from rsvib_torch.core.atomic import check_writable, whole_folder
-from rsvib_torch.core.reading import check_regular
+from rsvib_torch.core.reading import Table, check_regular
 from rsvib_torch.core.text import printable
 from rsvib_torch.core.validation import options
 from rsvib_torch.options import DetectStackOptions
@@ -56,13 +26,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rsvib_torch.config import Config
-    from rsvib_torch.detection import DetectionResult
-    from rsvib_torch.io import StackInfo
     from rsvib_torch.motion.detected_vibration import DetectedVibration
     from rsvib_torch.motion.motion import Motion
-    from rsvib_torch.motion.timing import SensorTiming
-    from rsvib_torch.report import Box
-    from rsvib_torch.stacks import RestoredFrames
 
 
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
@@ -73,18 +38,18 @@ class Stack:
     """Frames in memory."""
 
     frames: Tensor  # (T, H, W) or (T, C, H, W), full scale 1
-    info: StackInfo  # data type and metadata of the file, with exposure times for frame times
+    info: io.StackInfo  # data type and metadata of the file, with exposure times for frame times
     full_scale: float | None  # count that corresponds to full scale; None for floating point
-    timing: SensorTiming  # the sensor, with the frame times of the file
+    timing: rsvib_torch.SensorTiming  # the sensor, with the frame times of the file
 
 
-def load(given: StackCommand, restoration: dict[str, Any] | None = None) -> Stack:
+def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows."""
     from rsvib_torch.stacks.memory import check_stack_fits  # noqa: PLC0415
 
     path, config = given.stack, given.settings
     info = io.read_stack_info(path)
-    scale = full_scale_of(path, info, config, given.full_scale)
+    scale = shared.full_scale_of(path, info, config, given.full_scale)
     check_stack_fits(info, restoration, on_gpu=given.torch_device.type != "cpu")
     with working(f"reading {path}"):
         frames = io.read_stack(path, full_scale=scale)
@@ -95,25 +60,25 @@ def load(given: StackCommand, restoration: dict[str, Any] | None = None) -> Stac
     return Stack(frames.to(given.torch_device), info, scale, timing)
 
 
-def print_notes(info: StackInfo, config: Config) -> None:
+def print_notes(info: io.StackInfo, config: Config) -> None:
     """Print what the file states about orientation, dropped frames and unequal intervals."""
     for sentence in io.describe_stack(info, config.timing):
         note(sentence)
 
 
-def _detect(stack: Stack, config: Config) -> DetectionResult:
+def _detect(stack: Stack, config: Config) -> detection.DetectionResult:
     with working("detecting the vibration"):
-        result: DetectionResult = detection.detect_vibration(stack.frames, stack.timing, **config.detection)
+        result: detection.DetectionResult = detection.detect_vibration(stack.frames, stack.timing, **config.detection)
     return result
 
 
 def _restore(
-    stack: Stack, motion: Motion | DetectedVibration, options: dict[str, Any], force: bool, output: str = "frames"
-) -> RestoredFrames:
+    stack: Stack, motion: Motion | DetectedVibration, options: Table, force: bool, output: str = "frames"
+) -> stacks.RestoredFrames:
     """Restore frames, and judge the result on eight pairs of frames; ``output`` names what will be written."""
     with working("restoring and judging"):
         result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
-    warn_of_restoration(result, output)
+    answers.warn_of_restoration(result, output)
     return result
 
 
@@ -121,10 +86,10 @@ def restore_and_save(
     path: Path,
     stack: Stack,
     motion: Motion | DetectedVibration,
-    options: dict[str, Any],
+    options: Table,
     force: bool,
     report: Path | None = None,
-) -> RestoredFrames:
+) -> stacks.RestoredFrames:
     """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
     result = _restore(stack, motion, options, force)
     frames = result.frames
@@ -133,20 +98,24 @@ def restore_and_save(
     with working(f"writing {path.name}"):
         io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     not_kept = io.metadata_not_kept(stack.info, path, tuple(frames.shape))
-    note_lost(path, not_kept)
+    written.note_lost(path, not_kept)
     if report is not None:
         reports.write_restoration(report, result, options, not_kept)
     return result
 
 
 @options
-class SimulateOptions(CameraOptions, DeviceOptions):
+class SimulateOptions(shared.CameraOptions, shared.DeviceOptions):
     """Options of ``simulate``."""
 
-    scene: Path = argument("Image of the scene at rest, larger than the frames.")
-    frames: Path = argument("Stack to write.")
-    full_scale: float | None = option(None, "Count of the scene's file that corresponds to full scale.")
-    seed: Seed | None = option(None, "Seed of the noise.", show_default="from the configuration")
+    scene: Path = argument()
+    """Image of the scene at rest, larger than the frames."""
+    frames: Path = argument()
+    """Stack to write."""
+    full_scale: float | None = None
+    """Count of the scene's file that corresponds to full scale."""
+    seed: Seed | None = option(None, show_default="from the configuration")
+    """Seed of the noise."""
 
 
 def simulate(given: SimulateOptions) -> Answer:
@@ -157,7 +126,7 @@ def simulate(given: SimulateOptions) -> Answer:
     import torch  # noqa: PLC0415
 
     settings, frames, scene = given.settings_for(None), given.frames, given.scene
-    check_new(io.stack_files(frames), given.overwrite, [*io.stack_files(scene), settings.path])
+    shared.check_new(io.stack_files(frames), given.overwrite, [*io.stack_files(scene), settings.path])
     if settings.simulation is None:
         raise ValueError(
             f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
@@ -184,22 +153,23 @@ def simulate(given: SimulateOptions) -> Answer:
         stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
     line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
-    run_it = command_text("run", frames, frames.with_name("results"), *settings.arguments)
+    run = ("run", frames, frames.with_name("results"), *settings.arguments)
     return Answer(
         {"Simulated frames": [line, f"vibration:\n{vibration}"]},
         {"shape": list(simulated.shape), "dtype": dtype, "vibration": vibration.to_dict()},
         [frames],
-        [next_step("detect the vibration and restore the frames", run_it)],
+        [answers.next_step("detect the vibration and restore the frames", *run)],
     )
 
 
 @options
-class DetectOptions(StackCommand, PixelSizeOptions, VerdictOptions):
+class DetectOptions(shared.StackCommand, shared.PixelSizeOptions, shared.VerdictOptions):
     """Options of ``detect``."""
 
-    out: Path = option(..., "Folder for vibration.json, tables (tones, offsets, spectrum) and figures.")
+    out: Path = option(...)
+    """Folder for vibration.json, tables (tones, offsets, spectrum) and figures."""
     windows: Annotated[
-        dict[str, Any],
+        Table,
         Given(
             DetectStackOptions,
             ("memory", "workers", "follow"),
@@ -220,17 +190,17 @@ def detect(given: DetectOptions) -> Answer:
     The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
     """
     settings, frames, out = given.settings, given.stack, given.out
-    check_folder(out, (*OF_DETECTION, *OF_WINDOWS), given.overwrite, given.inputs)
+    written.check_folder(out, (*written.OF_DETECTION, *written.OF_WINDOWS), given.overwrite, given.inputs)
     windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")}
     windows |= given.windows
     if "window" not in windows and not windows.get("follow"):
         stack = load(given)
         result = _detect(stack, settings)
         with whole_folder(out) as folder:
-            names = write_detection(folder, result, stack.timing, given.pixel_size)
-        remove_old(out, (*OF_DETECTION, *OF_WINDOWS), names)
-        answer = stack_answer(frames, result, given.pixel_size)
-        answer.next_steps += steps_after_detection(result, frames, settings, out / "vibration.json")
+            names = written.write_detection(folder, result, stack.timing, given.pixel_size)
+        written.remove_old(out, (*written.OF_DETECTION, *written.OF_WINDOWS), names)
+        answer = answers.stack_answer(frames, result, given.pixel_size)
+        answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
     else:
         info = io.read_stack_info(frames)
         print_notes(info, settings)
@@ -242,32 +212,34 @@ def detect(given: DetectOptions) -> Answer:
                     settings.timing,
                     **windows,
                     detection=None if windows.get("follow") else settings.detection,
-                    full_scale=full_scale_of(frames, info, settings, given.full_scale),
+                    full_scale=shared.full_scale_of(frames, info, settings, given.full_scale),
                     device=str(given.torch_device),
                     progress=progress,
                 )
-            names = [*write_windows(folder, folder / "manifest.json", given.pixel_size), "manifest.json"]
-        remove_old(out, OF_DETECTION, names)
+            names = [*written.write_windows(folder, folder / "manifest.json", given.pixel_size), "manifest.json"]
+        written.remove_old(out, written.OF_DETECTION, names)
         manifest = stacks.read_manifest(out / "manifest.json")
-        warn_of_failures(manifest)
+        written.warn_of_failures(manifest)
         title = f"Vibration in {len(manifest.windows)} windows of {frames.name}"
-        answer = windows_answer(title, manifest, pixel_size=given.pixel_size)
+        answer = answers.windows_answer(title, manifest, pixel_size=given.pixel_size)
         if windows.get("follow"):
-            run_it = command_text("run", frames, out / "restored", *settings.arguments, "--follow")
-            answer.next_steps.append(next_step("restore the frames", run_it))
+            run = ("run", frames, out / "restored", *settings.arguments, "--follow")
+            answer.next_steps.append(answers.next_step("restore the frames", *run))
         else:
-            answer.next_steps += steps_after_detection(None, frames, settings, out / "manifest.json")
+            answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     answer.files += [out / name for name in names]
     return answer
 
 
 @options
-class RestoreOptions(RestorationCommand):
+class RestoreOptions(shared.RestorationCommand):
     """Options of ``restore``."""
 
-    restored: Path = restored_argument()
-    vibration: Path = option(..., "The vibration.json, or manifest.json of windows, written by detect or run.")
-    report: Path | None = option(None, "JSON file to write: whether restoration helped, with the measured values.")
+    restored: Path = shared.restored_argument()
+    vibration: Path = option(...)
+    """The vibration.json, or manifest.json of windows, written by detect or run."""
+    report: Path | None = None
+    """JSON file to write: whether restoration helped, with the measured values."""
 
 
 def restore_frames(given: RestoreOptions) -> Answer:
@@ -278,42 +250,40 @@ def restore_frames(given: RestoreOptions) -> Answer:
     """
     settings, frames, restored, report = given.settings, given.stack, given.restored, given.report
     outputs, inputs = io.stack_files(restored), [*given.inputs, given.vibration]
-    check_new([*outputs, *([] if report is None else [report])], given.overwrite, inputs)
+    shared.check_new([*outputs, *([] if report is None else [report])], given.overwrite, inputs)
     check_regular(given.vibration)
     with given.vibration.open("rb") as file:
         is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
     if is_manifest:
         if report is not None:
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
-        check_new([*outputs, restored.with_name(f"{restored.name}.manifest.json")], given.overwrite, inputs)
+        shared.check_new([*outputs, restored.with_name(f"{restored.name}.manifest.json")], given.overwrite, inputs)
         return _restore_windows(given)
     info, scale, options = given.planned_restoration(given.restoration)
     detected = reports.read_vibration(given.vibration, io.timing_from_first_frame(settings.timing, info))
-    io.check_stack_target(restored, restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
+    io.check_stack_target(restored, shared.restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
     stack = load(given, options)
     result = restore_and_save(restored, stack, detected, options, given.force, report)
     return Answer(
-        {"Vibration": [detected.summary()], "Restoration": restoration_lines(result, len(stack.frames))},
+        {"Vibration": [detected.summary()], "Restoration": answers.restoration_lines(result, len(stack.frames))},
         {"detection": detected.to_dict(), "restoration": reports.restoration_data(result)},
         [restored, *([] if report is None else [report])],
-        [page_step(frames, frames.with_name("report"), settings)] * result.restored,
+        [answers.page_step(frames, frames.with_name("report"), settings)] * result.restored,
     )
 
 
 def _restore_windows(given: RestoreOptions) -> Answer:
     """Restore a stack with the detections of its windows."""
     from rsvib_torch.core.result_files import decode  # noqa: PLC0415
-    from rsvib_torch.motion.timing import SensorTiming  # noqa: PLC0415
-    from rsvib_torch.report.results import check_same_timing  # noqa: PLC0415
 
     vibration, timing = given.vibration, given.settings.timing
     manifest = stacks.read_manifest(vibration)
-    stored = decode(SensorTiming, manifest.settings.get("sensor"), f"{vibration}: settings.sensor")
+    stored = decode(rsvib_torch.SensorTiming, manifest.settings.get("sensor"), f"{vibration}: settings.sensor")
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
         timing = replace(timing, frame_start_times=stored.frame_start_times)
-    check_same_timing(str(vibration), stored, timing)
+    reports.check_same_timing(str(vibration), stored, timing)
     window = manifest.settings.get("window")
     if "video" in manifest.settings:
         raise ValueError(
@@ -342,27 +312,24 @@ def _restore_windows(given: RestoreOptions) -> Answer:
             device=str(given.torch_device),
             progress=progress,
         )
-    note_lost(given.restored, result.not_kept)
-    answer = windows_answer("Vibration", stacks.read_manifest(result.manifest), result)
+    written.note_lost(given.restored, result.not_kept)
+    answer = answers.windows_answer("Vibration", stacks.read_manifest(result.manifest), result)
     answer.files += [given.restored, result.manifest]
     return answer
 
 
 @options
-class ReportOptions(RestorationCommand, VerdictOptions):
+class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
     """Options of ``report``."""
 
-    out: Path = argument("Folder for report.html and its figures.")
-    edge: list[str] | None = option(
-        None,
-        "Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times.",
-        metavar="EDGE",
-        show_default="edges are searched for",
-    )
-    manifest: Path | None = option(
-        None, "The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."
-    )
-    force: bool = option(False, "Show the restored frames even if they are judged no better than the input.")
+    out: Path = argument()
+    """Folder for report.html and its figures."""
+    edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
+    """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
+    manifest: Path | None = None
+    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."""
+    force: bool = False
+    """Show the restored frames even if they are judged no better than the input."""
 
 
 def report(given: ReportOptions) -> Answer:
@@ -375,7 +342,7 @@ def report(given: ReportOptions) -> Answer:
     boxes = [_edge_box(text) for text in given.edge or []]
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
-    check_folder(out, ["report.html"], given.overwrite, inputs)
+    written.check_folder(out, ["report.html"], given.overwrite, inputs)
     _, _, options = given.planned_restoration(given.restoration)
     stack = load(given, options)
     detection = _detect(stack, settings)
@@ -383,12 +350,11 @@ def report(given: ReportOptions) -> Answer:
     pattern = options.get("mosaic")
     steps = []
     if result.restored:
-        run_it = command_text("run", frames, out, *settings.arguments)
-        steps = [next_step("write the restored frames", run_it)]
+        steps = [answers.next_step("write the restored frames", "run", frames, out, *settings.arguments)]
     elif result.moves:
-        forced = command_text("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
-        steps = [next_step("inspect the restored frames nevertheless", forced)]
-    steps += steps_after_detection(detection, frames, settings)
+        forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
+        steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
+    steps += answers.steps_after_detection(detection, frames, settings)
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
 
     content = reports.Report(
@@ -403,14 +369,14 @@ def report(given: ReportOptions) -> Answer:
         left_alone=result.left_alone,
         options=options,
         version=rsvib_torch.__version__,
-        next_steps=tuple(step_parts(step) for step in steps),
-        command=running_command(),
+        next_steps=tuple(answers.step_parts(step) for step in steps),
+        command=current_output().command,
         windows=windows,
     )
     with whole_folder(out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
-        check_new([out / name for name in files], overwrite=True, inputs=inputs)
-    answer = stack_answer(frames, detection, None, result, len(stack.frames))
+        shared.check_new([out / name for name in files], overwrite=True, inputs=inputs)
+    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
     if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
         answer.results["Restoration of the page, of one vibration in all frames"] = answer.results.pop("Restoration")
         answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
@@ -419,7 +385,7 @@ def report(given: ReportOptions) -> Answer:
     return answer
 
 
-def _edge_box(text: str) -> Box:
+def _edge_box(text: str) -> reports.Box:
     """Position of a slanted edge (top, left, height, width) in px."""
     numbers = [part.strip() for part in text.split(",")]
     if len(numbers) != 4 or not all(number.isdecimal() for number in numbers):

@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Ta
 from rich.text import Text
 
 from rsvib_torch.core.progress import listening
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import json_text, printable, shortened, wrapped
 
 
@@ -27,18 +28,19 @@ class Answer:
     """What a command found and did: the last thing that it prints."""
 
     results: dict[str, list[str]]  # titles of the results, and their lines
-    data: dict[str, Any]  # the same for ``--json``, values that JSON can store
+    data: Table  # the same for ``--json``, values that JSON can store
     files: list[Path] = field(default_factory=list)  # files that were written, the one to open first in front
     next_steps: list[str] = field(default_factory=list)  # what to do next: sentences and commands
     reliable: dict[str, bool] = field(default_factory=dict)  # verdict on each axis, in all windows
 
 
 @dataclass
-class _Output:
+class Output:
     """Form of the output of a command, and its notes and warnings so far."""
 
-    as_json: bool = False
-    quiet: bool = False
+    command: str | None = None  # the command line, as it can be copied into a shell; None outside of the program
+    as_json: bool = False  # print nothing but the answer, as JSON
+    quiet: bool = False  # print no answer and no progress
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -46,33 +48,22 @@ class _Output:
 LOG_AFTER = 20.0  # s; commands that take less write no progress to files
 _SHOWN_AFTER = 2.0  # s, from which the elapsed time is shown beside that of a loop, which may be one of several
 
-_outputs: list[_Output] = [_Output()]  # of the running command, last
-_command_lines: list[str] = []  # the running one is the last
+_outputs: list[Output] = [Output()]  # that of the running command is the last
 
 
 @contextmanager
 def running(arguments: Sequence[str]) -> Iterator[None]:
-    """Remember the command line while it runs."""
-    _command_lines.append(printable(shlex.join(["rsvib", *arguments])))
-    try:
-        yield
-    finally:
-        _command_lines.pop()
-
-
-def running_command() -> str | None:
-    """The running command line, as it can be copied into a shell; None outside of the program."""
-    return _command_lines[-1] if _command_lines else None
-
-
-@contextmanager
-def output_of(*, as_json: bool, quiet: bool) -> Iterator[None]:
-    """Form of the output of a command: its answer as JSON, or neither text nor progress."""
-    _outputs.append(_Output(as_json, quiet))
+    """Collect the output of a command line while it runs."""
+    _outputs.append(Output(printable(shlex.join(["rsvib", *arguments]))))
     try:
         yield
     finally:
         _outputs.pop()
+
+
+def current_output() -> Output:
+    """The output of the running command."""
+    return _outputs[-1]
 
 
 def print_line(message: str) -> None:
@@ -136,6 +127,11 @@ def error_line(message: str, kind: str = "error") -> None:
         console.print(line, soft_wrap=not console.is_terminal)
 
 
+def warn(message: str) -> None:
+    """Print a warning to standard error."""
+    error_line(message, "warning")
+
+
 @contextmanager
 def warnings_in_one_line() -> Iterator[None]:
     """Show Python's warnings without file name and source line, each once."""
@@ -145,7 +141,7 @@ def warnings_in_one_line() -> Iterator[None]:
         line = " ".join(str(message).split())
         if line not in shown:
             shown.add(line)
-            error_line(line, "warning")
+            warn(line)
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -188,14 +184,8 @@ def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int
     """Show the elapsed time, and progress, rate and remaining time of a loop.
 
     In a log, which is not a terminal, they are lines: the first one after ``LOG_AFTER`` seconds, each of the others
-    after twice the time.
-
-    Args:
-        description: What is done.
-        counts: Whether the block reports its frames itself; otherwise, the loops in it report their steps.
-
-    Yields:
-        A function to call with the number of processed frames and the number of all frames.
+    after twice the time. With ``counts``, the block calls the function that it gets with the number of processed frames
+    and of all frames; otherwise, the loops in it report their steps.
     """
     begun = time.monotonic()
     with _progress() as progress:

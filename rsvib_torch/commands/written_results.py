@@ -6,18 +6,17 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import rsvib_torch
 from rsvib_torch import io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
-from rsvib_torch.commands.terminal import error_line, note, working
+from rsvib_torch.commands.terminal import note, warn, working
 from rsvib_torch.core.atomic import check_writable, write_json
 from rsvib_torch.core.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rsvib_torch.detection import DetectionResult
-    from rsvib_torch.motion.timing import SensorTiming
 
 OF_DETECTION = ("vibration.json", "tones.csv", "offsets.csv", "offsets.png", "spectrum.csv", "spectrum.png")
 OF_WINDOWS = ("manifest.json", "tones.csv", "windows.json", "windows.png")
@@ -43,13 +42,13 @@ def draw_safely(path: Path, draw: Callable[[], Figure]) -> list[str]:
     try:
         reports.save_figure(draw(), path)
     except Exception as error:
-        error_line(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}", "warning")
+        warn(f"{path.name} is not drawn: {' '.join(str(error).split()) or type(error).__name__}")
         return []
     return [path.name]
 
 
 def write_detection(
-    folder: Path, result: DetectionResult, timing: SensorTiming, pixel_size: float | None = None
+    folder: Path, result: rsvib_torch.DetectionResult, timing: rsvib_torch.SensorTiming, pixel_size: float | None = None
 ) -> list[str]:
     """Write a detection as JSON, tables and figures, and return the names of the files."""
     with working("drawing the offset curve"):
@@ -86,4 +85,4 @@ def warn_of_failures(manifest: stacks.StackManifest) -> None:
     """Print a warning if detection or restoration failed in windows."""
     failed = sum(record.error is not None for record in manifest.windows)
     if failed:
-        error_line(f"detection failed in {number_of(failed, 'window')}: see manifest.json", "warning")
+        warn(f"detection failed in {number_of(failed, 'window')}: see manifest.json")

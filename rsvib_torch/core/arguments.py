@@ -13,17 +13,7 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, reduce, wraps
-from typing import (
-    Annotated,
-    Any,
-    ParamSpec,
-    Self,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ParamSpec, Self, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -42,14 +32,7 @@ _PLAIN = (bool, float, str, type(None), object)  # types that pydantic checks it
 
 
 def check_tensor(name: str, value: object) -> Tensor:
-    """Return ``value`` if it is a dense tensor of real numbers that has data.
-
-    Example:
-        >>> check_tensor("frames", torch.zeros(2, 3, device="meta"))
-        Traceback (most recent call last):
-        ...
-        TypeError: frames must be a tensor with data, got a meta tensor; load the data onto a device first
-    """
+    """Return ``value`` if it is a dense tensor of real numbers that has data."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a tensor, got {described(value)}")
     if value.is_nested:
@@ -71,10 +54,6 @@ def as_numbers(name: str, value: object, device: torch.device | None = None) -> 
     """Return a copy of a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
 
     By default on the device of a tensor.
-
-    Example:
-        >>> as_numbers("amplitude", [3, 5]).dtype
-        torch.float64
     """
     if isinstance(value, Tensor):
         return check_tensor(name, value).to(dtype=torch.float64, device=device, copy=True)
@@ -143,14 +122,7 @@ def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
 
 
 def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> None:
-    """Check that tensors are floating-point images of the shapes of ``check_shapes``.
-
-    Example:
-        >>> check_images({"scene": torch.zeros(4, 5, dtype=torch.uint8)}, {"scene": "... H W"})
-        Traceback (most recent call last):
-        ...
-        TypeError: scene must be a floating-point tensor, got torch.uint8; divide counts by their full scale
-    """
+    """Check that tensors are floating-point images of the shapes of ``check_shapes``."""
     for name, image in images.items():
         if not image.is_floating_point():
             raise TypeError(
@@ -160,14 +132,7 @@ def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> Non
 
 
 def check_pixels(name: str, pixels: Tensor) -> None:
-    """Raise a ``ValueError`` if a pixel of a floating-point tensor is NaN, infinite or beyond all scales.
-
-    Example:
-        >>> check_pixels("frames", torch.tensor([[0.0, torch.inf]]))
-        Traceback (most recent call last):
-        ...
-        ValueError: frames must be finite, but pixel (0, 1) is inf
-    """
+    """Raise a ``ValueError`` if a pixel of a floating-point tensor is NaN, infinite or beyond all scales."""
     if not pixels.numel():
         return
     ends = torch.stack(pixels.detach().aminmax())  # one pass; propagates NaN and infinity
@@ -181,15 +146,8 @@ def check_pixels(name: str, pixels: Tensor) -> None:
         )
 
 
-def check_broadcast(**tensors: Any) -> None:
-    """Raise a ``ValueError`` unless tensors broadcast; other values are omitted.
-
-    Example:
-        >>> check_broadcast(u=torch.zeros(3), v=torch.zeros(2))
-        Traceback (most recent call last):
-        ...
-        ValueError: u and v do not fit together: (3,), (2,)
-    """
+def check_broadcast(**tensors: object) -> None:
+    """Raise a ``ValueError`` unless tensors broadcast; other values are omitted."""
     given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
     if len(given) < 2:
         return
@@ -201,12 +159,7 @@ def check_broadcast(**tensors: Any) -> None:
 
 
 def check_device(name: str, value: object) -> torch.device:
-    """Return ``value`` as a device on which tensors can be computed.
-
-    Example:
-        >>> check_device("device", "cpu")
-        device(type='cpu')
-    """
+    """Return ``value`` as a device on which tensors can be computed."""
     if not isinstance(value, (str, torch.device)):
         raise TypeError(f"{name} must be a device such as 'cpu' or 'cuda', got {described(value)}")
     try:
@@ -239,7 +192,7 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         if not torch.compiler.is_compiling():
-            kinds = _hints(function)
+            kinds = hints_of(function)
             for name, value in (*zip(names, args, strict=False), *kwargs.items()):
                 if name in kinds:
                     _checked(name, value, kinds[name])
@@ -260,12 +213,8 @@ def checked_methods(kind: type[R]) -> type[R]:
 
 
 def check_fields(value: Any) -> None:
-    """Check the types of the fields of a dataclass against their annotations; lists become tuples, tensors are copied.
-
-    Raises:
-        TypeError: If a field has another type; numbers may be infinite or NaN.
-    """
-    kinds = _hints(value.__class__)
+    """Check the fields of a dataclass against their annotations; lists become tuples, tensors are copied."""
+    kinds = hints_of(value.__class__)
     for name in (field.name for field in fields(value)):
         given = getattr(value, name)
         made = _checked(name, given, kinds[name], finite=False)
@@ -275,7 +224,7 @@ def check_fields(value: Any) -> None:
 
 
 @cache
-def _hints(owner: Any) -> dict[str, Any]:
+def hints_of(owner: Any) -> dict[str, Any]:
     """Annotations of the arguments of a function, or of the fields of a class."""
     given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
     if isinstance(owner, type):
@@ -285,7 +234,7 @@ def _hints(owner: Any) -> dict[str, Any]:
     return get_type_hints(types.SimpleNamespace(__annotations__=given), names, known, include_extras=True)
 
 
-def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
+def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> Any:
     """The value, or a tuple in place of a list or array, if it is of a kind."""
     adapter, members = _adapter(kind, finite)
     if torch.device in members and value is not None:
@@ -300,7 +249,7 @@ def _checked(name: str, value: Any, kind: Any, *, finite: bool = True) -> Any:
 
 
 @cache
-def _adapter(kind: Any, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
+def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
     """The check of an annotation, None where the function converts the value itself; and the members of a union."""
     members = members_of(kind)
     made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1
@@ -337,5 +286,5 @@ class _Instance:
 
     kind: type
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    def __get_pydantic_core_schema__(self, source: object, handler: object) -> core_schema.CoreSchema:
         return core_schema.is_instance_schema(self.kind)

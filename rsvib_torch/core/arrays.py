@@ -73,12 +73,7 @@ def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
 
 
 def channels_appear_last(shape: Sequence[int]) -> bool:
-    """Whether the last axis is one of up to four channels of an image of more than four pixels along each axis.
-
-    Example:
-        >>> channels_appear_last((2, 48, 64, 3)), channels_appear_last((2, 3, 48, 64))
-        (True, False)
-    """
+    """Whether the last axis is one of up to four channels of an image of more than four pixels along each axis."""
     return len(shape) >= 3 and shape[-1] <= 4 < min(shape[-3:-1])
 
 
@@ -104,14 +99,6 @@ def channel_axis(name: str, shape: Sequence[int], channels: Channels) -> int:
     Shapes are (T, H, W), (T, C, H, W) and (B, T, C, H, W); with ``channels="last"`` (T, H, W, C) and (B, T, H, W, C).
     Without ``channels``, a shape is refused that appears to have up to four channels last in an image of more than four
     pixels along each axis, or the frames on the last axis or behind three channels.
-
-    Example:
-        >>> channel_axis("frames", (2, 48, 64, 3), "last")
-        -1
-        >>> channel_axis("frames", (2, 48, 64, 3), None)
-        Traceback (most recent call last):
-        ...
-        ValueError: frames of shape (2, 48, 64, 3) appear to have their channels last: pass channels="last" or...
     """
     check_choice("channels", channels, (None, "first", "last"))
     shape = tuple(shape)

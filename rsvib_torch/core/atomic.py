@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rsvib_torch.core.text import json_text
 
@@ -128,14 +128,7 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 
 
 def check_not_special(path: str | os.PathLike[str]) -> None:
-    """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one.
-
-    Example:
-        >>> check_not_special(os.devnull)
-        Traceback (most recent call last):
-        ...
-        FileExistsError: cannot write /dev/null: it is a device, pipe or socket; choose another name
-    """
+    """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise FileExistsError(f"cannot write {os.fspath(path)}: it is a device, pipe or socket; choose another name")
 
@@ -143,10 +136,7 @@ def check_not_special(path: str | os.PathLike[str]) -> None:
 def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True) -> None:
     """Raise an ``OSError`` with the reason if ``path`` must not be replaced by a file, or written into as a folder.
 
-    Args:
-        path: The file or folder to write.
-        kind: As in ``StackFormat``.
-        parent_exists: Whether the folder of a file must exist.
+    ``kind`` is as in ``StackFormat``; ``parent_exists`` states whether the folder of a file must exist.
     """
     size = len(os.fsencode(path.name))
     if size > _LONGEST_NAME:
@@ -174,15 +164,8 @@ def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[s
     """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
 
     It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
-    keeps its other files.
-
-    Args:
-        path: The file or folder.
-        kind: As in ``StackFormat``.
-        companions: Endings of files beside it, as in ``StackFormat``.
-
-    Yields:
-        The temporary name, which the block creates.
+    keeps its other files. The block creates what has the temporary name. ``kind``, and ``companions``, the endings of
+    files beside it, are as in ``StackFormat``.
     """
     target = Path(path)
     endings = (*companions, "")  # what describes a file is there before it
@@ -224,11 +207,7 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield part
 
 
-def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-    """Write a table as JSON with one key per line, atomically.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+def write_json(path: str | os.PathLike[str], content: Mapping[str, object]) -> None:
+    """Write a table as JSON with one key per line, atomically."""
     with whole_file(path) as part:
         part.write_text(json_text(content) + "\n", encoding="utf-8")

@@ -190,14 +190,10 @@ def factor_banded(halves: Tensor, count: int) -> BandedFactor:
 
 
 def skew_band(band: Tensor) -> Tensor:
-    """Both sides of Hermitian bands, row by row.
+    """Both sides (K + b, 2 b + 1, S), ``[k, b + d] = A[k, k + d]``, of Hermitian bands, row by row.
 
-    Args:
-        band: Lower band (K, b + 1, S), ``band[k, d] = A[k + d, k]``; entries below the last row are not read. Real or
-            complex; the batch S comes last, so that each step works on contiguous memory.
-
-    Returns:
-        (K + b, 2 b + 1, S), ``[k, b + d] = A[k, k + d]``.
+    The lower band is (K, b + 1, S), ``band[k, d] = A[k + d, k]``; entries below the last row are not read. It is real
+    or complex; the batch S comes last, so that each step works on contiguous memory.
     """
     count, diagonals, size = band.shape
     width = diagonals - 1

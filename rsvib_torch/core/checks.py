@@ -3,9 +3,11 @@
 import math
 from importlib import import_module
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 from rsvib_torch.core.text import quoted
+
+Error = TypeVar("Error", bound=Exception)
 
 # Largest magnitude of numbers and pixels of public functions: squares of float32 are finite up to 1.8e19, and sums of
 # squares over an image of 1e8 px up to 1.8e15. No quantity in px, s or Hz reaches it.
@@ -33,6 +35,16 @@ def described(value: object) -> str:
     return type(value).__name__
 
 
+def named(error: Error, argument: str, problem: str) -> Error:
+    """The error with the argument that it is about and what is wrong with it, as commands state it for an option."""
+    vars(error).update(argument=argument, problem=problem)
+    return error
+
+
+def _refused(kind: type[Error], name: str, problem: str) -> Error:
+    return named(kind(f"{name} {problem}"), name, problem)
+
+
 def check_single(name: str, value: Any) -> None:
     """Raise a ``ValueError`` if a result or a motion is a batch."""
     if value.batch_shape:
@@ -40,73 +52,44 @@ def check_single(name: str, value: Any) -> None:
 
 
 def check_number(
-    name: str,
-    value: object,
-    *,
-    above: float = -math.inf,
-    at_least: float = -math.inf,
-    at_most: float = math.inf,
+    name: str, value: object, *, above: float = -math.inf, at_least: float = -math.inf, at_most: float = math.inf
 ) -> float:
-    """Return ``value`` as a finite float within its bounds; booleans are refused.
-
-    Example:
-        >>> check_number("row_time", 2e-5, above=0.0)
-        2e-05
-    """
+    """Return ``value`` as a finite float within its bounds; booleans are refused."""
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise TypeError(f"{name} must be a number, got {described(value)}")
+        raise _refused(TypeError, name, f"must be a number, got {described(value)}")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf if value == abs(value) else -math.inf  # a whole number beyond float64
     if not math.isfinite(number):
-        raise ValueError(f"{name} must be finite, got {number}")
+        raise _refused(ValueError, name, f"must be finite, got {number}")
     if number <= above:
-        raise ValueError(f"{name} must be larger than {above:g}, got {number:g}")
-    if number < at_least:
-        raise ValueError(f"{name} must be at least {at_least:g}, got {number:g}")
-    if number > at_most:
-        raise ValueError(f"{name} must be at most {at_most:g}, got {number:g}")
+        raise _refused(ValueError, name, f"must be larger than {above:g}, got {number:g}")
+    if not at_least <= number <= at_most:
+        bound = f"at least {at_least:g}" if number < at_least else f"at most {at_most:g}"
+        raise _refused(ValueError, name, f"must be {bound}, got {number:g}")
     return number
 
 
 def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
-    """Raise a ``ValueError`` that lists the choices unless ``value`` is one of them.
-
-    Example:
-        >>> check_choice("method", "bands", ("bands",))
-    """
+    """Raise a ``ValueError`` that lists the choices unless ``value`` is one of them."""
     # only values of the same types are compared: a tensor has no truth value
     if not isinstance(value, tuple(type(choice) for choice in choices)) or value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}; got {described(value)}")
+        raise _refused(ValueError, name, f"must be one of {', '.join(map(repr, choices))}; got {described(value)}")
 
 
 def check_whole_number(name: str, value: object, *, at_least: int, at_most: int = 2**63 - 1) -> int:
-    """Return ``value`` as an int from ``at_least`` to ``at_most``, by default the largest index of an array.
-
-    Example:
-        >>> check_whole_number("band_rows", 32, at_least=4)
-        32
-    """
+    """Return ``value`` as an int from ``at_least`` to ``at_most``, by default the largest index of an array."""
     if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{name} must be a whole number, got {described(value)}")
+        raise _refused(TypeError, name, f"must be a whole number, got {described(value)}")
     if not at_least <= value <= at_most:
         bound = f"at least {at_least}" if value < at_least else f"at most {at_most}"
-        raise ValueError(f"{name} must be {bound}, got {described(value).removesuffix(' (int)')}")
+        raise _refused(ValueError, name, f"must be {bound}, got {described(value).removesuffix(' (int)')}")
     return value
 
 
 def needed_package(name: str, purpose: str, extra: str) -> Any:
-    """Import an optional package.
-
-    Args:
-        name: Module to import.
-        purpose: What needs it, for the message.
-        extra: Extra of this package that installs it.
-
-    Raises:
-        ModuleNotFoundError: If it is missing, naming the extra to install.
-    """
+    """Import an optional package that ``purpose`` needs; an error names the extra of this package that installs it."""
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

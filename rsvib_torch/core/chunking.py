@@ -7,12 +7,7 @@ from torch import Tensor
 
 
 def runs(count: int, size: int) -> list[slice]:
-    """Consecutive slices of ``size`` indices that cover ``count``; the last one may be shorter.
-
-    Example:
-        >>> runs(5, 2)
-        [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
-    """
+    """Consecutive slices of ``size`` indices that cover ``count``; the last one may be shorter."""
     return [slice(first, min(first + size, count)) for first in range(0, count, size)]
 
 

@@ -33,14 +33,8 @@ def fourier_sums(times: Array, values: Array, grid: tuple[float, int, int]) -> A
 
     The values are spread over a grid of times with a Kaiser-Bessel kernel, transformed, and divided by the transform of
     the kernel (Fessler and Sutton, IEEE Trans. Signal Process. 51, 560, 2003), to 1e-7 of the sum of their moduli.
-
-    Args:
-        times: (B, N, G) s.
-        values: (B, ..., N, G) real.
-        grid: Step of the frequencies in Hz, and first and number of its multiples.
-
-    Returns:
-        (B, ..., F) complex.
+    Times (B, N, G) are in s, values (B, ..., N, G) real, sums (B, ..., F) complex. The grid is the step of the
+    frequencies in Hz, and first and number of its multiples.
 
     Example:
         >>> times, values = np.array([0.1, 0.25, 0.7]), np.array([1.0, 2.0, -1.0])

@@ -25,24 +25,12 @@ def free_memory(root: Path = Path("/")) -> int:
     """Memory in bytes that this process can allocate in addition to what it has: the smallest of all limits.
 
     Files in the page cache count as free, as the system drops them when memory is needed.
-
-    Example:
-        >>> free_memory() > 1_000_000
-        True
     """
     return max(0, min([int(psutil.virtual_memory().available), *_free_in_groups(root), *_free_addresses()]))
 
 
 def check_fits(what: str, needed: int, remedy: str) -> None:
-    """Raise a ``ValueError``, from ``what`` to ``remedy``, if ``needed`` bytes more exceed the free memory.
-
-    Example:
-        >>> check_fits("frames", 1000, "read fewer")
-        >>> check_fits("16 frames", 10**18, "read fewer")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        ValueError: 16 frames need 1e+09 GB of memory, of which ... are free; read fewer
-    """
+    """Raise a ``ValueError``, from ``what`` to ``remedy``, if ``needed`` bytes more exceed the free memory."""
     free = free_memory()
     if needed > free:
         raise ValueError(f"{what} need {size_text(needed)} of memory, of which {size_text(free)} are free; {remedy}")

@@ -29,16 +29,8 @@ def rows_of_numbers(
 ) -> NDArray[np.float64]:
     """Numbers (N, C) in some columns of comma-separated lines; empty lines are skipped.
 
-    Args:
-        path: The file, for messages.
-        lines: Lines after the names of the columns.
-        header: Names of all columns.
-        columns: Numbers C of the columns, from 0.
-        first_line: Number of the first of the lines in the file, from 1.
-
-    Raises:
-        ValueError: If a name occurs twice, a value is not a finite number, a line has more cells than the header, or
-            there are too many lines.
+    ``lines`` follow the ``header``, the names of all columns; C ``columns`` are read. ``first_line`` is the number of
+    the first of the lines in the file, for errors.
     """
     repeated = next((header[column] for column in columns if header.count(header[column]) > 1), None)
     if repeated is not None:

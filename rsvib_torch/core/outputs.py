@@ -1,7 +1,7 @@
 """Outputs must not replace inputs: one check of paths for all functions and commands that write files."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from itertools import combinations
 from pathlib import Path
 
@@ -34,11 +34,6 @@ def _same(path: _Path, other: _Path) -> bool:
     return (identity is not None and identity == _identity(other)) or not _places(path).isdisjoint(_places(other))
 
 
-def _members(folder: _Path) -> Iterator[Path]:
-    for place, _, names in os.walk(folder):
-        yield from (Path(place, name) for name in names)
-
-
 def _conflict(output: _Path, source: _Path) -> str | None:
     """Why writing a file would change an input; None if it does not."""
     if _same(output, source):
@@ -51,7 +46,7 @@ def _conflict(output: _Path, source: _Path) -> str | None:
         return f"it lies inside the input folder {source}"
     identity = _identity(output)
     if identity is not None and not os.path.isdir(output):
-        for member in _members(source):
+        for member in (Path(place, name) for place, _, names in os.walk(source) for name in names):
             if _identity(member) == identity:
                 return f"it is the same file as {member} of the input"
     return None
@@ -62,13 +57,6 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
 
     An output must not be an input under any name (another path, a link, a hard link), lie inside an input folder, or
     contain an input. The ``folder`` of the outputs may contain an input file, but not an input folder.
-
-    Example:
-        >>> check_outputs(["restored.tif"], ["frames.tif"])
-        >>> check_outputs(["frames.tif"], ["frames.tif"])
-        Traceback (most recent call last):
-        ...
-        ValueError: cannot write frames.tif: it is the same file as the input frames.tif; choose another name
     """
     outputs, inputs = list(outputs), list(inputs)
     for output in outputs:

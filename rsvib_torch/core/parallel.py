@@ -48,10 +48,6 @@ def in_parallel(work: Callable[[Item], Result], items: Iterable[Item], device: t
 
     The threads share the number of threads that PyTorch may use within each operation. On other devices, or with one
     thread, it is a plain loop.
-
-    Example:
-        >>> in_parallel(lambda value: float(value.sum()), torch.ones(3, 2), torch.device("cpu"))
-        [2.0, 2.0, 2.0]
     """
     items = list(items)
     within = torch.get_num_threads()

@@ -57,12 +57,6 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """Run a function without autocast and TF32: splines, transforms and fits need all digits of float32.
 
     The device is that of the first tensor among the arguments.
-
-    Example:
-        >>> product = full_precision(torch.matmul)
-        >>> with torch.autocast("cpu", dtype=torch.bfloat16):
-        ...     product(torch.eye(2), torch.eye(2)).dtype
-        torch.float32
     """
 
     @wraps(function)
@@ -99,11 +93,6 @@ def without_gradients(function: Callable[P, R]) -> Callable[P, R]:
     Operations on small tensors take 10 to 15 % less time than with ``torch.no_grad`` (detection in two frames of
     512 x 512 px, and a frame of ``VibrationTracker``). Derivatives that the function itself computes would be zero.
     NumPy does not warn of NaN and infinite values in the tables of fits, as PyTorch does not of those in tensors.
-
-    Example:
-        >>> doubled = without_gradients(lambda values: 2 * values)
-        >>> doubled(torch.ones(2)).requires_grad_().is_inference()
-        False
     """
 
     @wraps(function)

@@ -4,9 +4,7 @@ A result is a dataclass of tensors, numbers, texts and other results. ``Result``
 its own ``summary`` with the functions below.
 """
 
-import base64
 import html
-import io
 import itertools
 import math
 import os
@@ -24,8 +22,11 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_fields, check_shapes, checked_methods
 from rsvib_torch.core.checks import check_number, described, needed_package
 from rsvib_torch.core.figures import FIGURES, figure_of
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import texts
-from rsvib_torch.core.text import text_table, wrapped
+from rsvib_torch.core.result_files import figure_png, result_of, save_result, write_figure
+from rsvib_torch.core.text import AXES, data_uri, text_table, wrapped
+from rsvib_torch.core.validation import read_json
 
 if TYPE_CHECKING:
     import pandas
@@ -35,19 +36,12 @@ if TYPE_CHECKING:
 # Text
 
 
-AXIS_NAMES = ("x", "y", "roll", "zoom")
+AXIS_NAMES = AXES
 AXIS_UNITS = ("px", "px", "rad", "of the scale")
 
 
 def axis_rows(batch_shape: Sequence[int], axes: int = 2) -> list[tuple[tuple[int, ...], list[str]]]:
-    """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table.
-
-    Example:
-        >>> axis_rows(())
-        [((0,), ['x']), ((1,), ['y'])]
-        >>> axis_rows((1,))
-        [((0, 0), ['0', 'x']), ((0, 1), ['0', 'y'])]
-    """
+    """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table."""
     indices = itertools.product(*map(range, batch_shape), range(axes))
     return [(at, [", ".join(map(str, at[:-1]))] * bool(batch_shape) + [AXIS_NAMES[at[-1]]]) for at in indices]
 
@@ -58,7 +52,11 @@ def axis_head(batch_shape: Sequence[int]) -> list[str]:
 
 
 def verdict_table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], batch_shape: Sequence[int], reliable: Any, reasons: Any
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    batch_shape: Sequence[int],
+    reliable: Tensor,
+    reasons: tuple[Any, ...],
 ) -> list[str]:
     """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
     head = [*axis_head(batch_shape), *head]
@@ -72,12 +70,7 @@ def verdict_table(
 
 
 def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
-    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons.
-
-    Example:
-        >>> verdict_lines([True, False], [(), ("too short", "noisy")])
-        ['x: reliable', 'y: not reliable:', ' - too short', ' - noisy']
-    """
+    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons."""
     lines = []
     for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):
         lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
@@ -88,7 +81,7 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
 # Dictionaries
 
 
-def plain_values(value: Any) -> Any:
+def plain_values(value: object) -> Any:
     """A value as JSON can store it: tensors as nested lists, None for numbers that are not finite, results as tables.
 
     Example:
@@ -111,13 +104,8 @@ def plain_values(value: Any) -> Any:
 # Tables
 
 
-def joined_columns(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Columns of a table from its lines; a cell that a line does not have is None.
-
-    Example:
-        >>> joined_columns([{"axis": "x", "amplitude_px": 3.1}, {"axis": "y"}])
-        {'axis': ['x', 'y'], 'amplitude_px': [3.1, None]}
-    """
+def joined_columns(lines: Sequence[Mapping[str, object]]) -> dict[str, list[object]]:
+    """Columns of a table from its lines; a cell that a line does not have is None."""
     names = dict.fromkeys(name for line in lines for name in line)
     return {name: [line.get(name) for line in lines] for name in names}
 
@@ -129,10 +117,6 @@ def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict
         amplitude: A in px.
         frequency: f in Hz.
         pixel_size: Size of a pixel in m.
-
-    Example:
-        >>> {name: round(value, 3) for name, value in physical_tone(2.0, 50.0, 10e-6).items()}
-        {'amplitude_um': 20.0, 'velocity_um_per_s': 6283.185, 'acceleration_m_per_s2': 1.974}
     """
     angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
     return {
@@ -158,12 +142,7 @@ Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dime
 
 
 def _dimensions(stated: str, count: int, name: str) -> tuple[str, ...]:
-    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``.
-
-    Example:
-        >>> _dimensions("... A=2-4 K", 3, "amplitude"), _dimensions("P 2", 2, "pairs")
-        (('index', 'axis', 'tone'), ('pair', 'pairs_2'))
-    """
+    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``."""
     symbols = [entry.partition("=")[0] for entry in stated.split() if "..." not in entry]
     batch = count - len(symbols)
     leading = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
@@ -244,7 +223,7 @@ class Result(Summarised):
                 return value.shape[: value.ndim + 1 - len(stated.split())]
         return ()
 
-    def _fields_of_batch(self) -> dict[str, Any]:
+    def _fields_of_batch(self) -> Table:
         """Fields that have one entry for each result of a batch, by the leading dimensions that their shapes state."""
         return {
             name: value
@@ -283,37 +262,18 @@ class Result(Summarised):
             object.__setattr__(result, name, joined)
         return result
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Table:
         """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
         return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result as JSON, which ``load`` reads; an existing file is replaced.
-
-        Args:
-            path: The file to write; its folder must exist.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
-        from rsvib_torch.core.result_files import save_result  # noqa: PLC0415 - algorithms do not write files
-
+        """Write the result as JSON, which ``load`` reads; an existing file is replaced."""
         save_result(self, Path(path))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that ``save`` wrote.
-
-        Args:
-            path: The file.
-
-        Raises:
-            OSError: If the file cannot be opened.
-            ValueError: If it does not contain a result of this class.
-        """
-        from rsvib_torch.core.result_files import load_result  # noqa: PLC0415
-
-        result: Self = load_result(cls, Path(path))
+        """Read a file that ``save`` wrote."""
+        result: Self = result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
         return result
 
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
@@ -331,15 +291,7 @@ class Result(Summarised):
         raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
 
     def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
-        """``table`` as a ``pandas.DataFrame``; missing values are NaN.
-
-        Args:
-            pixel_size: As in ``table``.
-
-        Raises:
-            ModuleNotFoundError: If pandas is not installed, with the extra to install.
-            TypeError: If this kind of result has no table.
-        """
+        """``table`` as a ``pandas.DataFrame``; missing values are NaN."""
         frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
             self.table(pixel_size=pixel_size)
         )
@@ -350,9 +302,6 @@ class Result(Summarised):
 
         Tensors of a result within this one have the name of its field in front (``std_amplitude``); those of a motion
         have their own. ``index`` counts the results of a batch.
-
-        Raises:
-            ModuleNotFoundError: If xarray is not installed, with the extra to install.
         """
         package = needed_package("xarray", "to_xarray", "tables")
         variables = dict(self._variables(()))
@@ -399,11 +348,6 @@ class Result(Summarised):
 
         Returns:
             The figure, which notebooks show.
-
-        Raises:
-            OSError: If the picture cannot be written.
-            TypeError: If there is no figure of this kind of result.
-            ValueError: If it is a batch that has no figure.
         """
         draw = figure_of(type(self), len(self.batch_shape))
         if draw is None:
@@ -415,18 +359,14 @@ class Result(Summarised):
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
-            from rsvib_torch.core.result_files import save_figure  # noqa: PLC0415
-
-            save_figure(figure, Path(path))
+            write_figure(figure, path)
         return figure
 
     def _repr_html_(self) -> str:
         text = super()._repr_html_()
         if figure_of(type(self), len(self.batch_shape)) is None:
             return text
-        picture = io.BytesIO()
-        self.plot().savefig(picture, format="png", dpi=70, facecolor="white")
-        return f'{text}<img src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
+        return f'{text}<img src="{data_uri(figure_png(self.plot(), dpi=70), "image/png")}">'
 
 
 class JudgedResult(Result):

@@ -21,22 +21,14 @@ class ReasonKind:
 
     Sentence and remedy are templates with the fields ``value``, ``limit``, ``axis``, ``other`` (the axis across it) and
     the names of the details. A part in square brackets is omitted if one of its details is not given.
-
-    Attributes:
-        sentence: Template of the sentence.
-        remedy: Template of what the user can do; empty if nothing is known.
-        compares: The quantity, and from which limit on it is a reason; empty if there is no limit.
-        unit: Unit of value and limit; empty for a ratio, a count, or nothing.
-        refuses: What is refused.
-        free_model: Whether ``detect_motion`` may explain the frames.
     """
 
-    sentence: str
-    remedy: str = ""
-    compares: str = ""
-    unit: str = ""
-    refuses: str = "the axis"
-    free_model: bool = False
+    sentence: str  # template of the sentence
+    remedy: str = ""  # template of what the user can do; empty if nothing is known
+    compares: str = ""  # the quantity, and from which limit on it is a reason; empty if there is no limit
+    unit: str = ""  # unit of value and limit; empty for a ratio, a count, or nothing
+    refuses: str = "the axis"  # what is refused
+    free_model: bool = False  # whether ``detect_motion`` may explain the frames
 
 
 @dataclass(frozen=True)
@@ -95,21 +87,14 @@ class Reason:
         """The text after the name of the axis."""
         return str(self) if self.axis is None else f"{self.axis}: {self}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The reason as JSON can store it, with its text; None for numbers that are not finite."""
-        numbers = {"value": self.value, "limit": self.limit, **self.details}
-        for name, number in numbers.items():
-            if isinstance(number, float) and not math.isfinite(number):
-                numbers[name] = None
-        value, limit = numbers.pop("value"), numbers.pop("limit")
-        return {
-            "code": self.code,
-            "axis": self.axis,
-            "value": value,
-            "limit": limit,
-            "details": numbers,
-            "text": str(self),
+        numbers = {
+            name: None if isinstance(number, float) and not math.isfinite(number) else number
+            for name, number in {"value": self.value, "limit": self.limit, **self.details}.items()
         }
+        compared = {name: numbers.pop(name) for name in _COMPARED}
+        return {"code": self.code, "axis": self.axis, **compared, "details": numbers, "text": str(self)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Reason":
@@ -135,12 +120,7 @@ def texts(findings: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def read_findings(values: Any) -> Any:
-    """Reasons in nested lists as JSON files have them.
-
-    Example:
-        >>> texts(read_findings([[], [{"code": "of a later version", "text": "blind"}]]))
-        ((), ('blind',))
-    """
+    """Reasons in nested lists as JSON files have them."""
     if isinstance(values, Mapping):
         return Reason.from_dict(values)
     if not isinstance(values, (list, tuple)):
@@ -353,7 +333,7 @@ _RECORDED = {
     ),
     "axes_mirrored": _of_result(
         "the mirrored axes {axes} fit better than every rotation: the frames are mirrored, or the recording has "
-        "left-handed axes",
+        "left-handed axes"
     ),
     "axes_ambiguous": _of_result("the axes {axes} explain the frames as well", "rotate the camera about all axes"),
     "focal_length_uncertain": _of_result(

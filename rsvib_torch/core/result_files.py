@@ -1,18 +1,22 @@
-"""Files of results: JSON, which ``Result.load`` reads again, and pictures of figures; all replace a file as a whole."""
+"""Files of results: JSON, which ``Result.load`` reads again, and pictures of figures."""
 
+import io
 import math
+import os
 import types
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 import torch
 from torch import Tensor
 
+from rsvib_torch.core.arguments import check_fields, hints_of
 from rsvib_torch.core.atomic import whole_file, write_json
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import read_findings
 from rsvib_torch.core.text import quoted
-from rsvib_torch.core.validation import read_json
+from rsvib_torch.core.validation import members_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,9 +27,8 @@ def save_result(result: Any, path: Path) -> None:
     write_json(path, {"format": result.file_format, "version": 1, **result.to_dict(), "units": dict(result.units)})
 
 
-def load_result(kind: type[Any], path: Path) -> Any:
-    """Read a result of a class from a file that ``save_result`` wrote, see ``Result.load``."""
-    data = read_json(path, f"file of {kind.__name__}.save")
+def result_of(kind: type[Any], data: Table, path: Path) -> Any:
+    """A result of a class from the content of a file that ``save_result`` wrote, see ``Result.load``."""
     if data.get("format") != kind.file_format or data.get("version") != 1:
         raise ValueError(
             f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "
@@ -37,65 +40,50 @@ def load_result(kind: type[Any], path: Path) -> Any:
         raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
 
 
-def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a figure as a picture; the ending selects PNG, SVG or PDF."""
-    with whole_file(path) as part:
-        figure.savefig(part, dpi=150, facecolor="white")
-
-
-def decode(kind: Any, value: Any, path: str, missing: float = math.nan) -> Any:
-    """A value of an annotated type from what ``plain_values`` made of it.
+def decode(kind: object, value: object, path: str, missing: float = math.nan) -> Any:
+    """A value of an annotated type from what ``plain_values`` made of it; ``check_fields`` checks the other types.
 
     ``path`` is its place in the file, for messages; ``missing`` is what None stands for in a tensor.
     """
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None:
-            return None
-        kind = next(member for member in get_args(kind) if member is not types.NoneType)
+    kind = next(iter(members_of(kind)))
+    origin, parts = get_origin(kind), get_args(kind)
     if kind is Tensor:
         return _tensor(value, path, missing)
-    if is_dataclass(kind) and isinstance(kind, type):
+    if is_dataclass(kind):
         return _dataclass(kind, value, path)
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is dict:
-        if not isinstance(value, dict):
-            raise ValueError(f"{path}: expected a table, got {quoted(value)}")
+    if origin is dict and isinstance(value, dict):
         return {key: decode(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
-    if origin is tuple and is_dataclass(parts[0]):
-        if not isinstance(value, list):
-            raise ValueError(f"{path}: expected a list of tables, got {quoted(value)}")
+    if origin is tuple and is_dataclass(parts[0]) and isinstance(value, list):
         return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
-    if origin is Literal and value not in parts:
-        raise ValueError(f"{path}: expected {' or '.join(map(repr, parts))}, got {quoted(value)}")
-    if kind in (float, int, str, bool) and not isinstance(value, (float, int) if kind is float else kind):
-        raise ValueError(f"{path}: expected {kind.__name__}, got {quoted(value)}")
     return value if kind is Any else _tuples(value)
 
 
-def _dataclass(kind: type[Any], value: Any, path: str) -> Any:
+def _dataclass(kind: Any, value: object, path: str) -> Any:
     if not isinstance(value, dict):
         raise ValueError(f"{path}: expected a table, got {quoted(value)}")
-    # SensorTiming does not import torch, whose Tensor its annotations name
-    hints, start = get_type_hints(kind, localns={"Tensor": torch.Tensor}), f"{path}." if path else ""
-    missing = getattr(kind, "_MISSING", math.nan)
-    values: dict[str, Any] = {}
+    hints, start, missing = hints_of(kind), f"{path}." if path else "", getattr(kind, "_MISSING", math.nan)
+    values: Table = {}
     for field in fields(kind):
         if field.name in value:
-            stated = value[field.name]
+            stated, hint = value[field.name], hints[field.name]
             if field.name in ("findings", "left_alone"):
                 values[field.name] = read_findings(stated)
+            elif stated is not None or types.NoneType not in get_args(hint):
+                values[field.name] = decode(hint, stated, start + field.name, missing)
             else:
-                values[field.name] = decode(hints[field.name], stated, start + field.name, missing)
+                values[field.name] = None
         elif field.default is MISSING and field.default_factory is MISSING:
             raise ValueError(f"{start}{field.name}: missing key")
     try:
-        return kind(**values)
+        made = kind(**values)
+        check_fields(made)
+        return made
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}" if path else str(error)) from error
 
 
-def _tensor(value: Any, path: str, missing: float) -> Tensor:
-    def filled(entry: Any) -> Any:
+def _tensor(value: object, path: str, missing: float) -> Tensor:
+    def filled(entry: object) -> object:
         return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
 
     values = filled(value)
@@ -108,5 +96,18 @@ def _tensor(value: Any, path: str, missing: float) -> Tensor:
     return tensor
 
 
-def _tuples(value: Any) -> Any:
+def _tuples(value: object) -> object:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def figure_png(figure: "Figure", dpi: int) -> bytes:
+    """A figure as PNG image."""
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=dpi, facecolor="white", format="png")
+    return picture.getvalue()
+
+
+def write_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
+    """Write a figure as an image file; its ending selects the format."""
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=dpi, facecolor="white")

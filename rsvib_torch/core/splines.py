@@ -17,14 +17,7 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
     """Weights of the ``degree + 1`` B-splines that are not zero at a position.
 
     The value at ``x = n + fraction`` is ``sum_k weights[k] c[n - degree // 2 + k]`` with coefficients ``c``
-    of a spline of odd degree; 1 is linear interpolation.
-
-    Args:
-        fraction: Fractional positions in [0, 1], any shape S.
-        degree: Degree of the spline.
-
-    Returns:
-        Tensor of shape (S, degree + 1); its last axis sums to 1.
+    of a spline of odd degree; 1 is linear interpolation. Fractions (...) in [0, 1] have weights (..., degree + 1).
 
     Example:
         >>> bspline_weights(torch.tensor(0.25), 1).tolist()
@@ -40,15 +33,10 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
 def spline_taps(
     times: Array, start: float, spacing: float, count: int, *, degree: int = 3, derivative: int = 0
 ) -> tuple[NDArray[np.int64], Array]:
-    """The coefficients (..., degree + 1) that a spline depends on at times (...), and their factors.
+    """The coefficients (..., degree + 1) of a spline, or its derivative, at times (...), and their factors.
 
-    Args:
-        times: s; the spline is constant beyond its ends.
-        start: s, of the first knot.
-        spacing: s, between knots.
-        count: Number of coefficients.
-        degree: Degree of the spline.
-        derivative: Order of the derivative with respect to the time.
+    The first of ``count`` coefficients belongs to the knot at ``start``; times and ``spacing`` are in s. The spline is
+    constant beyond its ends.
 
     Example:
         >>> index, factors = spline_taps(np.array([0.5]), 0.0, 1.0, 4, degree=1)
@@ -67,13 +55,8 @@ def spline_taps(
 def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Arrange the taps of several nodes, each at a cell of its own, on one grid of taps per row.
 
-    Args:
-        cells: Position (..., N) of the first tap of each node, whole numbers.
-        weights: (..., N, K) weights of consecutive taps.
-
-    Returns:
-        Lowest cell (...) of the nodes, int64, and weights (..., N, J) of the J taps from there on, 0 where a node has
-        no tap.
+    Cells (..., N), whole numbers, are those of the first of K consecutive taps (..., N, K). The result is the lowest
+    cell (...) of the nodes, int64, and weights (..., N, J) of the J taps from there on, 0 where a node has none.
 
     Example:
         >>> first, taps = spread_taps(torch.tensor([3.0, 4.0]), torch.tensor([[0.5, 0.5], [0.75, 0.25]]))
@@ -163,15 +146,7 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
     """B-spline coefficients along ``dim`` that interpolate the samples, with mirrored ends.
 
     The inverse of the sampled spline is applied as a finite symmetric filter, cut where it is below 1e-9
-    (float32: 3e-8).
-
-    Args:
-        samples: Tensor of samples.
-        degree: Odd degree of the spline; 1 returns the samples.
-        dim: Axis to filter.
-
-    Returns:
-        Coefficients of the same shape.
+    (float32: 3e-8). The degree is odd; 1 returns the samples.
     """
     if degree == 1:
         return samples
@@ -207,16 +182,9 @@ def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
 def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Tensor:
     """Correlate along an axis with several kernels, at places where these lie inside ("valid").
 
-    Products with small dense matrices are faster than convolutions.
-
-    Args:
-        samples: Real or complex, at least as long as the kernels along ``dim``.
-        kernels: (Q, N) taps, of the same dtype.
-        dim: Axis to filter.
-        step: Samples between neighbouring values.
-
-    Returns:
-        Values like the samples, but ``(n - N) // step + 1`` of n along ``dim``; a leading dimension counts kernels.
+    Products with small dense matrices are faster than convolutions. Samples are real or complex, and n >= N along
+    ``dim``; kernels (Q, N) are of the same dtype. The values have a leading dimension for the kernels, and
+    ``(n - N) // step + 1`` entries along ``dim``.
 
     Example:
         >>> correlated(torch.arange(5.0), torch.tensor([[-1.0, 1.0], [0.5, 0.5]]), 0).tolist()

@@ -1,15 +1,18 @@
 """Numbers, tables and JSON as text, without torch."""
 
+import base64
 import json
 import math
 import shutil
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+
+AXES = ("x", "y", "roll", "zoom")  # components of a motion
 
 # Marks that change the direction of the text after them, and separators of lines.
 _INVISIBLE = frozenset("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
@@ -83,44 +86,22 @@ def measured_text(
 
 
 def shortened(text: str, most: int = 1000) -> str:
-    """A text without its middle if it is longer than ``most`` characters: it may repeat an option, or what a file has.
-
-    Example:
-        >>> shortened("a" * 100 + "b", 8)
-        'aaaaaa…ab'
-    """
+    """A text without its middle if it is longer than ``most`` characters, as options and contents of files can be."""
     return text if len(text) <= most else f"{text[: most - most // 4]}…{text[-(most // 4) :]}"
 
 
 def one_line(message: object, most: int = 400) -> str:
-    """A message in one line of about ``most`` characters.
-
-    Example:
-        >>> one_line(" two  words ")
-        'two words'
-    """
+    """A message in one line of about ``most`` characters."""
     return shortened(" ".join(str(message).split()), most)
 
 
 def quoted(value: object) -> str:
-    """A value of the user in a message: as in Python, in at most 200 characters.
-
-    Example:
-        >>> quoted("a"), quoted([1.5]), len(quoted("a" * 10**6))
-        ("'a'", '[1.5]', 201)
-    """
+    """A value of the user in a message: as in Python, in at most 200 characters."""
     return one_line(repr(value), 200)
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int = 20) -> str:
-    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept.
-
-    Example:
-        >>> print(text_table(("axis", "amplitude (px)"), [("x", "3.1"), ("y", "5.2")]))
-        axis  amplitude (px)
-        x     3.1
-        y     5.2
-    """
+    """A table as text with aligned columns; of more than ``most`` rows the first and the last are kept."""
     rows = [tuple(row) for row in rows]
     if len(rows) > most:
         omitted = (f"… {len(rows) - most} more",) + ("",) * (len(head) - 1)
@@ -132,12 +113,7 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, most: int 
 
 
 def number_of(count: int, noun: str) -> str:
-    """A number and its noun.
-
-    Example:
-        >>> number_of(1, "frame"), number_of(2, "frame")
-        ('1 frame', '2 frames')
-    """
+    """A number and its noun."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -147,7 +123,12 @@ def wrapped(text: str) -> str:
     return textwrap.fill(text, width, subsequent_indent="   ", break_long_words=False, break_on_hyphens=False)
 
 
-def json_text(content: Mapping[str, Any]) -> str:
+def data_uri(content: bytes, kind: str) -> str:
+    """Data URI of bytes of a MIME type."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def json_text(content: Mapping[str, object]) -> str:
     """A table as JSON with one key per line."""
     lines = (f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
     return "{\n" + ",\n".join(lines) + "\n}"

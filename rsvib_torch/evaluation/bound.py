@@ -371,11 +371,6 @@ def cramer_rao_bound(
         Standard deviations in the layout of ``detection.std``: infinite without information (amplitude and phase
         at a blind frequency), 0 for tones of amplitude 0 and for a known acceleration.
 
-    Raises:
-        TypeError: If the scene is not a floating-point tensor.
-        ValueError: If the scene does not fit the frames and motion, there are fewer than two frames, or an option is
-            out of range.
-
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)
         >>> scene = torch.rand(128, 96, generator=torch.Generator().manual_seed(0))

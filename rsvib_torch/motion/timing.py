@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
 from rsvib_torch.core.reading import read_toml
@@ -317,40 +317,27 @@ class SensorSection(Section):
     ``frame_rows``).
     """
 
-    row_time: float = Field(
-        description="Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row "
-        "period; 'rsvib calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because "
-        "sensors have blanking rows."
-    )
-    exposure_time: float | None = Field(
-        default=None,
-        description="Exposure time in s: the setting of the camera (shutter, integration time), not the frame period.",
-    )
-    exposure_rows: float | None = Field(default=None, description="Exposure time divided by row_time.")
-    frame_rate: float | None = Field(
-        default=None,
-        description="Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate.",
-    )
-    frame_rows: float | None = Field(
-        default=None,
-        description="Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time).",
-    )
-    scan_axis: Literal["y", "x"] = Field(
-        default="y",
-        description="'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side).",
-    )
-    readout_direction: Literal["forward", "reverse"] = Field(
-        default="forward",
-        description="'forward' if the top row (or left column) is read first, 'reverse' if the last one is.",
-    )
-    frame_start_times: list[float] | None = Field(
-        default=None,
-        description="Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced "
-        "(dropped frames, irregular clocks); strictly increasing.",
-    )
-    full_scale: float | None = Field(
-        default=None, description="Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."
-    )
+    row_time: float
+    """Time between the exposure starts of adjacent rows, in s. Data sheets call it line time or row period; 'rsvib
+    calibrate' measures it with a flickering light. It is not 1 / (frame rate x rows), because sensors have blanking
+    rows."""
+    exposure_time: float | None = None
+    """Exposure time in s: the setting of the camera (shutter, integration time), not the frame period."""
+    exposure_rows: float | None = None
+    """Exposure time divided by row_time."""
+    frame_rate: float | None = None
+    """Frames per second of the sensor. A slow-motion or time-lapse video is played at another rate."""
+    frame_rows: float | None = None
+    """Frame period divided by row_time, blanking rows included: 1 / (frame rate x row_time)."""
+    scan_axis: Literal["y", "x"] = "y"
+    """'y' if image rows are exposed one after another, 'x' for image columns (a camera on its side)."""
+    readout_direction: Literal["forward", "reverse"] = "forward"
+    """'forward' if the top row (or left column) is read first, 'reverse' if the last one is."""
+    frame_start_times: list[float] | None = None
+    """Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced (dropped frames,
+    irregular clocks); strictly increasing."""
+    full_scale: float | None = None
+    """Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -1,6 +1,5 @@
 """Figures of detections and restorations, and values with their standard deviations as text."""
 
-import io
 import math
 import os
 import textwrap
@@ -10,32 +9,26 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
+from rsvib_torch import detection
 from rsvib_torch.calibration import RowTimeCalibration
 from rsvib_torch.core.arguments import check_shapes, checks_arguments
-from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.figures import FIGURES
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.core.reading import Table
+from rsvib_torch.core.result_files import figure_png, write_figure
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.core.validation import Count
-from rsvib_torch.detection import (
-    AccelerometerComparison,
-    ClockAlignment,
-    DetectionResult,
-    DisplacementSpectrum,
-    MotionCheck,
-    MotionDetection,
-    RotationAlignment,
-    SweptTone,
-)
+from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.imaging import row_psf
@@ -48,15 +41,19 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 
-_Resolution = Annotated[int, Field(ge=1, le=10_000)]
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
-_AXIS_COLOURS = {"x": "#14487a", "y": "#c8102e"}
-_FIT_COLOUR = _AXIS_COLOURS["y"]
-_LEGEND_ABOVE: dict[str, Any] = {"fontsize": 9, "frameon": False, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
-_TITLE: dict[str, Any] = {"loc": "left", "fontsize": 9.5, "color": _INK}
-_HEADING: dict[str, Any] = {"loc": "left", "fontsize": 12, "fontweight": "bold", "color": _INK}
+_X_COLOUR, _Y_COLOUR = "#14487a", "#c8102e"
+_AXIS_COLOURS = {"x": _X_COLOUR, "y": _Y_COLOUR}
+_FIT_COLOUR = _Y_COLOUR
+_LEGEND: Table = {"fontsize": 9, "frameon": False}
+_LEGEND_ABOVE: Table = {**_LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
+_TITLE: Table = {"loc": "left", "fontsize": 9.5, "color": _INK}
+_HEADING: Table = {"loc": "left", "fontsize": 12, "fontweight": "bold", "color": _INK}
 _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
-_QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", "#14487a"])  # poor ... good
+_QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", _X_COLOUR])  # poor ... good
+
+
+Panels = NDArray[Any]  # (rows, columns) of ``Axes``
 
 
 class _Drawing(Figure):
@@ -66,47 +63,28 @@ class _Drawing(Figure):
         return figure_png(self, dpi=90)
 
 
-def figure_png(figure: Figure, dpi: int) -> bytes:
-    """A figure as PNG image."""
-    picture = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(picture, dpi=dpi, facecolor="white", format="png")
-    return picture.getvalue()
-
-
 def tones_text(result: DetectionResult, axis: int) -> list[str]:
     """Amplitude and frequency of every tone of an axis, one text each."""
     vibration, std = result.vibration, result.std
     return [
         f"{measured_text(vibration.amplitude[axis, tone], std.amplitude[axis, tone])} {AXIS_UNITS[axis]} at "
         f"{measured_text(vibration.frequency[axis, tone], std.frequency[axis, tone])} Hz"
-        for tone in range(vibration.amplitude.shape[-1])
-        if float(vibration.amplitude[axis, tone]) > 0
+        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist()
     ]
 
 
 @checks_arguments
-def save_figure(figure: Figure, path: str | os.PathLike[str], *, dpi: _Resolution = 150) -> None:
+def save_figure(
+    figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
+) -> None:
     """Write a figure as an image file, atomically.
 
     Args:
         figure: The figure.
         path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
         dpi: Pixels per inch.
-
-    Raises:
-        OSError: If the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> import rsvib_torch as rsv
-        >>> path = Path(tempfile.mkdtemp()) / "motion.png"
-        >>> rsv.save_figure(rsv.motion_figure(rsv.Vibration([3.1, 5.2], [50.0, 30.0])), path)
-        >>> path.exists()
-        True
     """
-    with whole_file(path) as part:
-        FigureCanvasAgg(figure).print_figure(str(part), dpi=dpi, facecolor="white")
+    write_figure(figure, path, dpi)
 
 
 def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", heading: str = "") -> None:
@@ -121,23 +99,40 @@ def plain_axes(panel: Axes, x: str = "", y: str = "", *, title: str = "", headin
     panel.set_title(heading or title, **(_HEADING if heading else _TITLE))
 
 
-def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Any]:
+def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid: Any) -> tuple[Figure, Panels]:
     """A figure of a size in inches, and its panels (rows, columns)."""
     figure = _Drawing(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
-def _plot_axes(panel: Axes, x: Any, values: Tensor, std: Tensor | None = None, *, legend: bool = True) -> None:
+def _two_panels() -> tuple[Figure, list[tuple[int, str, Axes]]]:
+    """A figure with a panel for x and y, each with the number and the name of its axis."""
+    figure, panels = _panels(13, 4.2, 1, 2, sharex=True)
+    return figure, list(zip(range(2), "xy", panels[0], strict=True))
+
+
+def _plot_axes(
+    panel: Axes, x: NDArray[Any] | Tensor, values: Tensor, std: Tensor | None = None, *, legend: bool = True
+) -> None:
     """Draw values (N, 2) of x and y in their colours, with bands of two standard deviations."""
-    for values_of, std_of, (name, colour) in zip(
-        values.detach().cpu().T, [None] * 2 if std is None else std.cpu().T, _AXIS_COLOURS.items(), strict=True
-    ):
-        panel.plot(x, values_of, color=colour, linewidth=1.3, label=name)
-        if std_of is not None:
-            low, high = values_of - 2 * std_of, values_of + 2 * std_of
-            panel.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
+    for axis, (name, colour) in enumerate(_AXIS_COLOURS.items()):
+        of_axis = values[:, axis].detach().cpu()
+        panel.plot(x, of_axis, color=colour, linewidth=1.3, label=name)
+        if std is not None:
+            reach = 2 * std[:, axis].cpu()
+            panel.fill_between(x, of_axis - reach, of_axis + reach, color=colour, alpha=0.2, linewidth=0)
     if legend:
-        panel.legend(fontsize=9, frameon=False, ncols=2)
+        panel.legend(**_LEGEND, ncols=2)
+
+
+def _marker(colour: str, reliable: bool) -> Table:
+    """Style of points: hollow if they are not reliable."""
+    return {"color": colour, "marker": "o", "linestyle": "none", "markerfacecolor": colour if reliable else "white"}
+
+
+def _error_bar(std: Tensor) -> float:
+    """Two standard deviations; 0 if they are not known."""
+    return 2 * float(std) if math.isfinite(float(std)) else 0.0
 
 
 def _symbol(label: str, **style: Any) -> Line2D:
@@ -164,7 +159,7 @@ def _shown_pairs(result: DetectionResult) -> slice:
     return slice(first, first + _SHOWN_PAIRS)
 
 
-def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) -> Any:
+def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) -> PathCollection:
     """Draw the offsets of an axis with their fit, and below the residuals; returns the coloured points."""
     curve, shown = result.offsets, _shown_pairs(result)
     times = curve.times.cpu().numpy() * 1e3
@@ -198,21 +193,19 @@ def _draw_offsets(upper: Axes, lower: Axes, result: DetectionResult, axis: int) 
     return points
 
 
-def _offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Any]:
+def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, height: float) -> tuple[Figure, Panels]:
     """Figure of the offsets of some axes with their fit and residuals, and its panels (2, axes)."""
     check_single("result", result)
     sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
     figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
-    points: Any = None
-    for column, axis in enumerate(axes):
-        points = _draw_offsets(panels[0, column], panels[1, column], result, axis)
+    points = [_draw_offsets(panels[0, column], panels[1, column], result, axis) for column, axis in enumerate(axes)]
     symbols = [
         _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
         _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
         _symbol("not measured", color=_GREY, marker="x", markersize=5),
     ]
     _legend_below(figure, symbols)
-    bar = figure.colorbar(points, ax=panels, fraction=0.025, pad=0.01)
+    bar = figure.colorbar(points[-1], ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
     return figure, panels
@@ -227,19 +220,15 @@ def offset_figure(result: DetectionResult) -> Figure:
     the lower edge are rows that were not measured; the line is the offset curve of the detected vibration. Of more than
     13 frames, the upper panels have the 9 neighbouring frames with the largest residual, and the lower ones all.
 
-    Args:
-        result: A detection (not a batch).
-
     Example:
-        >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.detection import detect_vibration
         >>> frames, timing, _ = example_frames()
-        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
-        >>> [panel.get_ylabel() for panel in rsv.offset_figure(detection).axes]
+        >>> [panel.get_ylabel() for panel in offset_figure(detect_vibration(frames, timing, method="bands")).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     axes = result.vibration.num_axes
-    figure, panels = _offset_panels(result, range(axes), 6.5 * axes, 6.4)
+    figure, panels = offset_panels(result, range(axes), 6.5 * axes, 6.4)
     for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
         heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
         upper.set_title(heading, **_HEADING, pad=36)
@@ -269,13 +258,12 @@ def windows_figure(
         time_label: Label of the horizontal axis.
 
     Example:
-        >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.detection import detect_vibration
         >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
-        >>> figure = rsv.windows_figure([0.0, 2 * timing.frame_period], parts)
-        >>> [panel.get_ylabel() for panel in figure.axes]
-        ['amplitude (px)', 'amplitude (px)', 'frequency (Hz)', 'frequency (Hz)']
+        >>> parts = [detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> len(windows_figure([0.0, 2 * timing.frame_period], parts).axes)
+        4
     """
     figure, panels = _panels(11, 5.6, 2, 2, sharex=True)
     for axis, name in enumerate("xy"):
@@ -288,11 +276,9 @@ def windows_figure(
                 reliable = bool(found.reliable[axis])
                 for tone in found.vibration.amplitude[axis].nonzero()[:, 0].tolist():
                     value = float(getattr(found.vibration, quantity)[axis, tone])
-                    std = 2 * float(getattr(found.std, quantity)[axis, tone])
-                    error = std if reliable and math.isfinite(std) else 0.0
-                    style: dict[str, Any] = {} if reliable else {"markerfacecolor": "white"}
-                    colour = _AXIS_COLOURS[name] if tone == 0 else _GREY
-                    panel.errorbar(time, value, error, fmt="o", markersize=5, capsize=2, color=colour, **style)
+                    error = _error_bar(getattr(found.std, quantity)[axis, tone]) if reliable else 0.0
+                    style = _marker(_AXIS_COLOURS[name] if tone == 0 else _GREY, reliable)
+                    panel.errorbar(time, value, error, markersize=5, capsize=2, **style)
                     reliable_values += [value - error, value + error] if reliable else []
             if reliable_values:
                 low, high = min(reliable_values), max(reliable_values)
@@ -331,8 +317,7 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
         last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
 
     Example:
-        >>> figure = motion_figure(Vibration([3.1, 5.2], [50.0, 30.0]))
-        >>> figure.axes[0].get_xlabel()
+        >>> motion_figure(Vibration([3.1, 5.2], [50.0, 30.0])).axes[0].get_xlabel()
         'time (ms)'
     """
     check_single("motion", motion)
@@ -354,7 +339,7 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     return figure
 
 
-def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
+def _title_refusal(panel: Axes, result: detection.MotionDetection | detection.SweptTone) -> None:
     """State above a figure which axes are not reliable, with the first reason."""
     lines = [
         textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
@@ -364,13 +349,13 @@ def _title_refusal(panel: Axes, result: MotionDetection | SweptTone) -> None:
     panel.set_title("\n".join(lines), **_TITLE)
 
 
-def _swept_figure(result: SweptTone) -> Figure:
+def _swept_figure(result: detection.SweptTone) -> Figure:
     figure = motion_figure(result.motion)
     _title_refusal(figure.axes[0], result)
     return figure
 
 
-def free_motion_figure(result: MotionDetection) -> Figure:
+def free_motion_figure(result: detection.MotionDetection) -> Figure:
     """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
     figure, ((panel,),) = _panels(8, 3.6)
     for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
@@ -386,25 +371,20 @@ def verdict_figure(verdict: RestorationVerdict) -> Figure:
     pairs = np.arange(len(verdict.outcome))
     for axis in range(2):
         for values, style, colour, label in (
-            (verdict.misfit_before, "o-", _AXIS_COLOURS["x"], "frames as taken"),
-            (verdict.misfit_after, "s-", _AXIS_COLOURS["y"], "after restoration"),
+            (verdict.misfit_before, "o-", _X_COLOUR, "frames as taken"),
+            (verdict.misfit_after, "s-", _Y_COLOUR, "after restoration"),
             (verdict.resolution, ":", _GREY, "smallest visible"),
         ):
             panels[axis].plot(pairs, values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
         panels[axis].set_ylim(bottom=0)
-    panels[0].legend(fontsize=9, frameon=False)
-    panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_AXIS_COLOURS["x"], markersize=4)
+    panels[0].legend(**_LEGEND)
+    panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_X_COLOUR, markersize=4)
     panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
     titles = ("displacement along x (px rms)", "displacement along y (px rms)", "estimated improvement (dB)")
     for panel, title in zip(panels, titles, strict=True):
         panel.xaxis.get_major_locator().set_params(integer=True)
         plain_axes(panel, "pair of frames", title=title)
     return figure
-
-
-def axis_offset_figure(result: DetectionResult, axis: int) -> Figure:
-    """Draw the offset curve of one axis of a detection (not a batch) with its fit and residuals."""
-    return _offset_panels(result, [axis], 5.6, 4.4)[0]
 
 
 @checks_arguments
@@ -414,16 +394,11 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     The offset gain is ``|2 sin(pi f m T_row) sinc(f T_e)|``, px of offset per px of displacement (Eqs. 2 and 7 of Liu
     et al. 2023). Blind frequencies are dashed lines.
 
-    Args:
-        result: A detection (not a batch).
-        timing: The sensor.
-
     Example:
-        >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.detection import detect_vibration
         >>> frames, timing, _ = example_frames()
-        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
-        >>> rsv.gain_figure(detection, timing).axes[-1].get_xlabel()
+        >>> gain_figure(detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
         'frequency (Hz)'
     """
     check_single("result", result)
@@ -436,20 +411,18 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     for panel in (upper, lower):
         for blind in blind_frequencies(timing, highest).tolist():
             panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
-    labels: dict[str, Any] = {}
+    labels: Table = {}
     for axis, name in enumerate("xy"):
         reliable = bool(result.reliable[axis])
-        style: dict[str, Any] = {"color": _AXIS_COLOURS[name], "marker": "o", "markersize": 6, "linestyle": "none"}
-        style |= {} if reliable else {"markerfacecolor": "white"}
+        style = _marker(_AXIS_COLOURS[name], reliable) | {"markersize": 6}
         for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist():
             at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
             tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
             labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
-            errors = [2 * float(values[axis, tone]) for values in (std.amplitude, std.frequency)]
-            bars = [error if math.isfinite(error) else 0.0 for error in errors]
-            lower.errorbar(at, amplitude, bars[0], bars[1], capsize=3, elinewidth=1.4, **style)
+            bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
+            lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
     if labels:
-        upper.legend(list(labels.values()), list(labels), fontsize=9, frameon=False, loc="upper right", ncols=2)
+        upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
     upper.set_ylim(0, 2.4)
     lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
     upper.set_xlim(0, highest)
@@ -470,11 +443,6 @@ def motion_blur(vibration: Motion, starts: Tensor, timing: SensorTiming) -> Tens
 def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figure:
     """Draw mean displacement and motion blur of every row of frame 0.
 
-    Args:
-        vibration: The motion (not a batch).
-        timing: The sensor.
-        num_rows: Rows of a frame.
-
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
         >>> figure = rows_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=512)
@@ -486,9 +454,10 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Fig
     starts = timing.row_starts(1, num_rows)[0]
     figure, panels = _panels(5.6, 4.6, 2, sharex=True)
     curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
-    for panel, values, label in zip(panels[:, 0], curves, ("displacement (px)", "motion blur (px)"), strict=True):
+    for panel, values in zip(panels[:, 0], curves, strict=True):
         _plot_axes(panel, np.arange(num_rows), values, legend=panel is panels[0, 0])
-        plain_axes(panel, "row (in readout order)" if panel is panels[1, 0] else "", label)
+    plain_axes(panels[0, 0], "", "displacement (px)")
+    plain_axes(panels[1, 0], "row (in readout order)", "motion blur (px)")
     panels[1, 0].set_ylim(bottom=0)
     return figure
 
@@ -499,17 +468,9 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
 
     Each kernel is centred on the mean displacement of its row, rounded to whole px; all have the same grey scale.
 
-    Args:
-        vibration: The motion (not a batch).
-        timing: The sensor.
-        num_rows: Rows of a frame.
-
     Example:
-        >>> import rsvib_torch as rsv
-        >>> timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-        >>> vibration = rsv.Vibration(amplitude=[3.1, 5.2], frequency=[50.0, 30.0])
-        >>> figure = rsv.psf_figure(vibration, timing, num_rows=2048)
-        >>> len(figure.axes)  # rows and exposures
+        >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
+        >>> len(psf_figure(Vibration([3.1, 5.2], [50.0, 30.0]), timing, num_rows=2048).axes)
         24
     """
     check_single("vibration", vibration)
@@ -532,7 +493,7 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
     extent = (-reach - 0.5, reach + 0.5, reach + 0.5, -reach - 0.5)
     for index, panel in enumerate(panels.flat):
         panel.imshow(cells[index], cmap="Greys", vmin=0, vmax=cells.max(), interpolation="nearest", extent=extent)
-        panel.plot(path[index, :, 0], path[index, :, 1], color=_AXIS_COLOURS["y"], linewidth=1.6)
+        panel.plot(*path[index].T, color=_Y_COLOUR, linewidth=1.6)
         panel.set_title(f"row {int(rows[index])}", fontsize=9, loc="left", pad=3)
         panel.set(xticks=[], yticks=[])
         panel.spines[:].set_color(_GRID)
@@ -556,7 +517,7 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str,
     points = points or {}
     highest = 0.5 * max([1, *points.values()])
     frequency = torch.linspace(0, highest, 101, dtype=torch.float64, device="cpu")
-    colours = (_GREY, _AXIS_COLOURS["x"])[-len(curves) :]
+    colours = (_GREY, _X_COLOUR)[-len(curves) :]
     for colour, (name, edges) in zip(colours, curves.items(), strict=True):
         values = [edge.at(frequency.to(edge.lsf.device) / points.get(name, 1)).cpu() for edge in edges]
         for value in values:
@@ -576,7 +537,7 @@ def _finish_mtf(panel: Axes, highest: float, label: str, legend: str | None = No
         panel.axvline(0.5, color=_GREY, linewidth=0.8, linestyle=":", zorder=0)
     panel.set_xlim(0, highest)
     panel.set_ylim(0, max(1.05, panel.get_ylim()[1]))
-    panel.legend(title=legend, fontsize=9, frameon=False)
+    panel.legend(title=legend, **_LEGEND)
     plain_axes(panel, "spatial frequency (cycles/px)", label)
 
 
@@ -667,9 +628,9 @@ def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
-    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    figure, panels = _two_panels()
     times, good = (values.cpu().numpy() for values in (1e3 * curve.times, curve.good))
-    for axis, (name, panel) in enumerate(zip("xy", panels, strict=True)):
+    for axis, name, panel in panels:
         offsets = curve.offsets[..., axis].cpu().numpy()[good]
         std = None if curve.std is None else curve.std[..., axis].cpu().numpy()[good]
         panel.errorbar(times[good], offsets, std, fmt=".", color=_AXIS_COLOURS[name], ecolor=_GRID, zorder=2)
@@ -691,23 +652,24 @@ def _calibration_figure(result: RowTimeCalibration) -> Figure:
     return figure
 
 
+_BLIND_COLOUR = "#ececec"
 _LABELLED_LINES = 6  # per axis; more labels would cover each other
 
 
-def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
+def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     """Draw amplitude spectrum and power spectral density of each axis, their noise, and the blind bands in grey."""
     axes = len(result.amplitude)
     figure, panels = _panels(6.5 * axes, 6.4, 2, axes, sharex=True)
     frequency, half = result.frequency.cpu().numpy(), 0.25 * result.resolution  # half of a step
-    blind = np.diff(result.blind.cpu().numpy().astype(int), prepend=0, append=0)
-    spans = list(zip(np.flatnonzero(blind > 0), np.flatnonzero(blind < 0), strict=True))  # blind neighbours
+    # first and last of each run of blind neighbours
+    runs = np.flatnonzero(np.diff(result.blind.cpu().numpy(), prepend=False, append=False)).reshape(-1, 2) - [0, 1]
     for axis, name in enumerate(AXIS_NAMES[:axes]):
         unit, colour = AXIS_UNITS[axis], _AXIS_COLOURS.get(name, _INK)
         curves = ((result.amplitude, result.noise, unit), (result.psd, result.noise_psd, f"{unit}²/Hz"))
         for panel, (of_axes, of_noise, unit_of_panel) in zip(panels[:, axis], curves, strict=True):
             values, noise = of_axes[axis].cpu().numpy(), of_noise[axis].cpu().numpy()
-            for first, behind in spans:
-                panel.axvspan(frequency[first] - half, frequency[behind - 1] + half, color="#ececec", linewidth=0)
+            for first, last in frequency[runs]:
+                panel.axvspan(first - half, last + half, color=_BLIND_COLOUR, linewidth=0)
             panel.plot(frequency, values, color=colour, linewidth=0.8)
             panel.plot(frequency, noise, color=_INK, linewidth=0.9, linestyle="--")
             panel.set(xscale="log", yscale="log", xlim=(frequency[0], frequency[-1]))
@@ -728,37 +690,36 @@ def _spectrum_figure(result: DisplacementSpectrum) -> Figure:
                 panels[0, axis].annotate(text, (at, amplitude), (0, 4), **place)
                 labelled.append(at)
     symbols = [
-        _symbol("displacement", color=_AXIS_COLOURS["x"], marker="", linewidth=0.8),
+        _symbol("displacement", color=_X_COLOUR, marker="", linewidth=0.8),
         _symbol("noise (rms)", color=_INK, marker="", linewidth=0.9, linestyle="--"),
-        _symbol("blind: the frames cannot show this frequency", color="#ececec", marker="s", markersize=9),
+        _symbol("blind: the frames cannot show this frequency", color=_BLIND_COLOUR, marker="s", markersize=9),
     ]
     _legend_below(figure, symbols)
     return figure
 
 
-def _check_figure(result: MotionCheck) -> Figure:
+def _check_figure(result: detection.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
-    times = 1e3 * result.times.cpu()
-    for axis, (name, panel) in enumerate(zip("xy", panels, strict=True)):
-        before, after = (
-            f"{label} {measured_text(values[axis], digits=3)} px rms"
-            for label, values in (("offsets", result.before), ("without the motion", result.after))
-        )
-        panel.plot(times, result.offsets[:, axis].cpu(), ".", color=_GREY, label=before)
-        panel.plot(times, result.residual[:, axis].cpu(), ".", color=_AXIS_COLOURS[name], label=after)
+    figure, panels = _two_panels()
+    for axis, name, panel in panels:
+        for what, rms, offsets, colour in (
+            ("offsets", result.before, result.offsets, _GREY),
+            ("without the motion", result.after, result.residual, _AXIS_COLOURS[name]),
+        ):
+            label = f"{what} {measured_text(rms[axis], digits=3)} px rms"
+            panel.plot(1e3 * result.times.cpu(), offsets[:, axis].cpu(), ".", color=colour, label=label)
         panel.axhline(0.0, color=_INK, linewidth=0.8)
         panel.legend(fontsize=9)
         plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
     return figure
 
 
-def _accelerometer_figure(result: AccelerometerComparison) -> Figure:
+def _accelerometer_figure(result: detection.AccelerometerComparison) -> Figure:
     """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
-    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    figure, panels = _two_panels()
     times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
     shown = (times - middle).abs() < 4 / result.frequency.min()  # 8 periods of the slowest tone
-    for axis, (name, panel) in enumerate(zip("xy", panels, strict=True)):
+    for axis, name, panel in panels:
         for label, values, colour in (
             ("accelerometer", result.measured, _GREY),
             ("frames", result.predicted, _AXIS_COLOURS[name]),
@@ -769,7 +730,7 @@ def _accelerometer_figure(result: AccelerometerComparison) -> Figure:
     return figure
 
 
-def _rotation_figure(result: RotationAlignment) -> Figure:
+def _rotation_figure(result: detection.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
     times = result.times.cpu()
@@ -778,7 +739,7 @@ def _rotation_figure(result: RotationAlignment) -> Figure:
         rms = float((measured - predicted).square().mean().sqrt())
         panel = panels[axis, 0]
         panel.plot(times, predicted, color=_FIT_COLOUR, linewidth=1.3, label="gyroscope")
-        panel.plot(times, measured, "o", color=_AXIS_COLOURS["x"], markersize=3.5, label="frames")
+        panel.plot(times, measured, "o", color=_X_COLOUR, markersize=3.5, label="frames")
         panel.plot(times, measured - predicted, color=_GREY, linewidth=1.0, label=f"difference, {rms:.3g} {unit} rms")
         panel.legend(**_LEGEND_ABOVE, ncols=3)
         heading = "Between consecutive frames" if axis == 0 else ""
@@ -790,14 +751,14 @@ FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
-        (DisplacementSpectrum, 0): _spectrum_figure,
-        (MotionDetection, 0): free_motion_figure,
-        (SweptTone, 0): _swept_figure,
+        (detection.DisplacementSpectrum, 0): _spectrum_figure,
+        (detection.MotionDetection, 0): free_motion_figure,
+        (detection.SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,
-        (ClockAlignment, 0): lambda result: motion_figure(result.motion),
-        (RotationAlignment, 0): _rotation_figure,
-        (MotionCheck, 0): _check_figure,
-        (AccelerometerComparison, 0): _accelerometer_figure,
+        (detection.ClockAlignment, 0): lambda result: motion_figure(result.motion),
+        (detection.RotationAlignment, 0): _rotation_figure,
+        (detection.MotionCheck, 0): _check_figure,
+        (detection.AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(

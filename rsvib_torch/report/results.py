@@ -2,18 +2,20 @@
 
 import csv
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file, write_json
 from rsvib_torch.core.checks import check_single
 from rsvib_torch.core.presentation import Result, plain_values
+from rsvib_torch.core.reading import Table
+from rsvib_torch.core.result_files import result_of
 from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import read_json
 from rsvib_torch.detection import DetectionResult
@@ -30,21 +32,6 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
         path: The file to write; an existing file is replaced.
         result: A detection (not a batch).
         timing: The sensor; by default ``result.timing``.
-
-    Raises:
-        OSError: If the file cannot be written.
-        ValueError: If the result is a batch, or the timing is unknown.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
-        >>> frames, timing, _ = example_frames()
-        >>> import tempfile
-        >>> detection = rsv.detect_vibration(frames, timing, method="bands", tones=1)
-        >>> path = tempfile.mkdtemp() + "/vibration.json"
-        >>> rsv.write_vibration(path, detection)
-        >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
-        [111.0, 90.0]
     """
     check_single("result", result)
     timing = timing or result.timing
@@ -66,48 +53,50 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
 
     Example:
+        >>> import tempfile
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.evaluation import example_frames
         >>> frames, timing, _ = example_frames()
-        >>> import tempfile
         >>> path = tempfile.mkdtemp() + "/vibration.json"
-        >>> rsv.detect_vibration(frames, timing).save(path)
-        >>> found = rsv.read_vibration(path, timing)
-        >>> restored = rsv.restore(frames, timing, found, method="dewarp", check=False)
-        >>> found.reliable.tolist()
-        [True, True]
+        >>> rsv.write_vibration(path, rsv.detect_vibration(frames, timing))
+        >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
+        [110.0, 90.0]
     """
-    path = Path(path)
+    result = load_detection(Path(path))
+    if timing is not None and result.timing is not None:
+        check_same_timing(str(path), result.timing, timing)
+    return DetectedVibration.of(result)
+
+
+def load_detection(path: Path) -> DetectionResult:
+    """Read a ``vibration.json``; an error states what to give instead of other files."""
     data = read_json(path, "vibration.json")
     if data.get("format") != DetectionResult.file_format:
         raise ValueError(
             f"{path}: not a vibration.json, but a file of the format {quoted(data.get('format'))}; give the "
             "vibration.json, or the manifest.json of windows, that rsvib detect or run wrote"
         )
-    result = DetectionResult.load(path)
+    result: DetectionResult = result_of(DetectionResult, data, path)
     if result.batch_shape:
         raise ValueError(f"{path}: a batch of detections; read it with DetectionResult.load, and pass one of them")
-    if timing is not None and result.timing is not None:
-        check_same_timing(str(path), result.timing, timing)
-    return DetectedVibration.of(result)
+    return result
 
 
 def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -> None:
     """Raise an error if a detection was stored with another timing than that of the frames to be restored."""
+
+    def equal(first: ArrayLike, second: ArrayLike) -> bool:
+        if np.shape(first) != np.shape(second) or {str, type(None)} & {type(first), type(second)}:
+            return bool(first == second)
+        return np.allclose(first, second, rtol=1e-9, atol=0.0)  # up to rounding
+
     theirs, ours = stored.to_dict(), timing.to_dict()
-    different = [name for name in ours if not _equal(theirs[name], ours[name])]
+    different = [name for name in ours if not equal(theirs[name], ours[name])]
     if different:
         values = ", ".join(f"{name}={theirs[name]!r} (here {ours[name]!r})" for name in different)
         raise ValueError(
             f"{source}: the vibration was detected with another timing: {values}; detect it again, or correct [sensor]"
         )
-
-
-def _equal(first: Any, second: Any) -> bool:
-    """Whether two values of a timing are equal, numbers up to rounding."""
-    if np.shape(first) != np.shape(second) or {str, type(None)} & {type(first), type(second)}:
-        return bool(first == second)
-    return np.allclose(first, second, rtol=1e-9, atol=0.0)
 
 
 @checks_arguments
@@ -118,28 +107,6 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     between the frames by ``offset``; the vibration predicts ``fitted``; ``residual = offset - fitted`` remains after
     correction. All are the displacement in the later frame minus that in the earlier one, in px along x and y, in rad
     for roll. ``std`` is the standard deviation of the offset and of the residual, if it is known.
-
-    Args:
-        path: The file to write; an existing file is replaced.
-        result: A detection (not a batch).
-
-    Raises:
-        OSError: If the file cannot be written.
-        ValueError: If the result is a batch.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
-        >>> frames, timing, _ = example_frames()
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> path = Path(tempfile.mkdtemp()) / "offsets.csv"
-        >>> rsv.write_offsets(path, rsv.detect_vibration(frames, timing, method="bands", tones=1))
-        >>> columns = path.read_text().splitlines()[0].split(",")
-        >>> columns[:6]
-        ['earlier_frame', 'later_frame', 'row', 'time_s', 'offset_x_px', 'offset_y_px']
-        >>> columns[6:]
-        ['fitted_x_px', 'fitted_y_px', 'residual_x_px', 'residual_y_px', 'quality']
     """
     check_single("result", result)
     curve = result.offsets
@@ -157,16 +124,15 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     columns["quality"] = curve.quality
     if curve.std is not None:
         columns |= {f"std_{name}": curve.std[..., axis] for axis, name in enumerate(axes)}
-    values = [plain_values(column.flatten()) for column in columns.values()]
-    _write_csv(path, columns, zip(*values, strict=True))
+    write_columns(path, {name: plain_values(column.flatten()) for name, column in columns.items()})
 
 
-def _write_csv(path: str | os.PathLike[str], head: Iterable[str], lines: Iterable[Iterable[Any]]) -> None:
-    """Write a table; None becomes an empty cell."""
+def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable[object]]) -> None:
+    """Write columns of one length by name as CSV; None becomes an empty cell."""
     with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(head)
-        writer.writerows(lines)
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
 
 
 @checks_arguments
@@ -177,10 +143,6 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
         path: The file to write; an existing file is replaced.
         result: A result that has a table. Its unknown values are empty cells.
         pixel_size: Size of a pixel in m, to add columns in um, um/s and m/s^2.
-
-    Raises:
-        OSError: If the file cannot be written.
-        TypeError: If the result has no table.
 
     Example:
         >>> import tempfile
@@ -193,11 +155,10 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
         ...     print(len(file.readlines()))  # a tone along x and y each, below the header
         3
     """
-    columns = result.table(pixel_size=pixel_size)
-    _write_csv(path, columns, zip(*columns.values(), strict=True))
+    write_columns(path, result.table(pixel_size=pixel_size))
 
 
-def restoration_data(result: RestoredFrames) -> dict[str, Any]:
+def restoration_data(result: RestoredFrames) -> Table:
     """What was restored, and whether that helped, as values that JSON can store."""
     verdict = result.verdict
     return {
@@ -211,21 +172,14 @@ def restoration_data(result: RestoredFrames) -> dict[str, Any]:
 
 
 def write_restoration(
-    path: str | os.PathLike[str], result: RestoredFrames, options: dict[str, Any], not_kept: Sequence[str] = ()
+    path: str | os.PathLike[str], result: RestoredFrames, options: Table, not_kept: Sequence[str] = ()
 ) -> None:
-    """Write whether frames were restored, with which options, and whether that helped, as JSON.
+    """Write whether frames were restored, with which options of ``restore``, and whether that helped, as JSON.
 
-    Args:
-        path: The file to write.
-        result: Restored frames with their verdict.
-        options: Options of ``restore``.
-        not_kept: Metadata of the input that the output does not contain.
-
-    Raises:
-        OSError: If the file cannot be written.
+    ``not_kept`` names metadata of the input that the output does not contain.
     """
     verdict = result.verdict
-    content: dict[str, Any] = {"format": "rsvib restoration", "version": 1, "options": options}
+    content: Table = {"format": "rsvib restoration", "version": 1, "options": options}
     content |= {**restoration_data(result), "not_kept": list(not_kept)}
     if verdict is not None:
         pairs = {name: plain_values(value) for name, value in vars(verdict).items() if isinstance(value, Tensor)}

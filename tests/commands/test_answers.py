@@ -314,7 +314,7 @@ def in_terminal(arguments, columns):
 
 LOOPS = """
 import time
-from rsvib_torch.commands.terminal import output_of, working
+from rsvib_torch.commands.terminal import current_output, working
 from rsvib_torch.core.progress import listening, steps
 
 with working("restoring"):
@@ -328,7 +328,8 @@ with working("restoring frames.tif", counts=True) as progress:
     time.sleep(0.3)
     progress(20, 100)
     time.sleep(0.3)
-with output_of(as_json=False, quiet=True), working("reading quietly"):
+current_output().quiet = True
+with working("reading quietly"):
     steps(2, "frames")()
     time.sleep(0.3)
 """

@@ -11,7 +11,7 @@ from small_stack import CONFIG, TIMING, write_small
 
 from rsvib_torch import process_stack
 from rsvib_torch.commands.shared_options import check_new
-from rsvib_torch.commands.terminal import running, running_command
+from rsvib_torch.commands.terminal import current_output, running
 from rsvib_torch.core.text import printable
 from rsvib_torch.io import StackFormat, formats, open_stack
 
@@ -142,4 +142,4 @@ def test_links_without_target_are_not_replaced_and_names_are_shown_as_they_are(t
     with pytest.raises(FileExistsError, match=r"out.tif; choose another name, or replace them with --overwrite"):
         check_new([tmp_path / "out.tif"], overwrite=False, inputs=[])
     with running(["a\u202eb\x1b.tif"]):
-        assert running_command() == r"rsvib 'a\u202eb\x1b.tif'"
+        assert current_output().command == r"rsvib 'a\u202eb\x1b.tif'"

@@ -26,8 +26,8 @@ from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.io import write_stack
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
-from rsvib_torch.report.html import Report, before_after, write_page, write_report_page
-from rsvib_torch.report.html.page import frames_in_turn, measure_edges, whole_frame
+from rsvib_torch.report.html.page import Report, frames_in_turn, measure_edges, whole_frame, write_report_page
+from rsvib_torch.report.html.template import before_after, write_page
 from rsvib_torch.report.html.words import TERMS, about_rows, overall_result, verdict_sentences
 from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
 from rsvib_torch.restoration import RestorationVerdict

@@ -53,14 +53,6 @@ class MtfCurve(
         far: () amplitude of the tail in ``esf`` and ``lsf``.
         levels: (2,) values of the dark and the bright side at the middle of the edge.
         noise: () standard deviation of the noise of a pixel, root mean square over the ROI.
-
-    Example:
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> y, x = torch.meshgrid(torch.arange(60.0) - 30, torch.arange(40.0) - 20, indexing="ij")
-        >>> sharp, blurred = (rsv.slanted_edge_mtf(torch.special.ndtr((x + 0.1 * y) / s)) for s in (0.5, 1.0))
-        >>> bool(sharp.mtf50 > blurred.mtf50)  # cycles per pixel
-        True
     """
 
     frequency: Tensor
@@ -94,17 +86,7 @@ class MtfCurve(
 
     @checks_arguments
     def at(self, frequency: float | Tensor) -> Tensor:
-        """MTF at frequencies of any shape, cycles/px, computed from the line spread function.
-
-        Args:
-            frequency: 0 ... 1 cycles/px.
-
-        Returns:
-            float64 tensor in the shape of ``frequency``.
-
-        Raises:
-            ValueError: If a frequency is negative, above 1 or not finite.
-        """
+        """MTF at frequencies of any shape, cycles/px, computed from the line spread function."""
         if not isinstance(frequency, Tensor):
             check_number("frequency", frequency, at_least=0.0, at_most=1.0)
         wanted = torch.as_tensor(frequency, dtype=torch.float64, device=self.lsf.device)
@@ -135,7 +117,6 @@ def slanted_edge_mtf(roi: ArrayLike) -> MtfCurve:
         The curve up to 1 cycle/px, with MTF50, standard deviations, and the spread functions.
 
     Raises:
-        TypeError: If the ROI does not hold real numbers.
         ValueError: If it is not one finite image, too small, contains no edge, the edge is not slanted or too close to
             45 degrees or to a border alongside it, or is clipped.
 

@@ -14,15 +14,9 @@ def edge_spread(distance: Tensor, sigma: Tensor, slope: Tensor) -> tuple[Tensor,
 
     The pixel, projected on the normal of the edge, is the convolution of two boxes, as wide as the cosine and the
     sine of the edge's angle. Their convolution with the error function of the optics is a second difference of its
-    second integral, ``J(x) = ((x^2 + sigma^2) Phi(x / sigma) + sigma x phi(x / sigma)) / 2``.
-
-    Args:
-        distance: px from the edge along its normal, positive on the bright side.
-        sigma: () blur of the optics in px.
-        slope: () tangent of the angle between edge and pixel.
-
-    Returns:
-        The edge spread function, the line spread function, and the derivative by sigma of the first.
+    second integral, ``J(x) = ((x^2 + sigma^2) Phi(x / sigma) + sigma x phi(x / sigma)) / 2``. Distances are in px
+    along the normal, positive on the bright side; ``slope`` is the tangent of the angle between edge and pixel. The
+    result is the edge spread function, the line spread function, and the derivative by sigma of the first.
     """
     cosine = torch.rsqrt(1 + slope.square())
     wide, narrow = 0.5 * cosine, 0.5 * cosine * slope.abs()

@@ -30,12 +30,9 @@ class Tail:
     """Part of an edge spread function that decays as slowly as diffraction: ``-x w / (x^2 + w^2)``.
 
     Its Fourier transform has a closed form, so that it need not be sampled to infinity.
-
-    Args:
-        width: w in px.
     """
 
-    width: float
+    width: float  # w in px
 
     def esf(self, distance: Tensor) -> Tensor:
         """Value at distances in px from the edge."""

@@ -47,10 +47,6 @@ def resolution_chart(
     Returns:
         float32 tensor (height, width) with values in 0 ... 1.
 
-    Raises:
-        TypeError: If a size is not a whole number.
-        ValueError: If the chart or its fields are too small, or the blur is too narrow to be sampled (below 0.4 px).
-
     Example:
         >>> chart = resolution_chart(256, 320)
         >>> chart.shape, bool(chart.min() > 0)

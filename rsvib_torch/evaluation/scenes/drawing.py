@@ -93,12 +93,7 @@ def fractal_texture(
 
 
 class Canvas:
-    """An image to paint on, one shape after another, each within its own window.
-
-    Args:
-        image: (H, W), painted in place.
-        sigma: Blur of the optics in px.
-    """
+    """An image to paint on, one shape after another, each within its own window."""
 
     def __init__(self, image: Tensor, sigma: float) -> None:
         self.image = image

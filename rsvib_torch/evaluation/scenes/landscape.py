@@ -63,10 +63,6 @@ def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6
     Returns:
         float32 tensor (height, width) with values in 0 ... 1.
 
-    Raises:
-        TypeError: If a size or the seed is not a whole number.
-        ValueError: If the image is too small or the blur too narrow to be sampled (below 0.4 px).
-
     Example:
         >>> scene = city_and_fields(128, 96, seed=3)
         >>> scene.shape, bool(scene.min() >= 0 and scene.max() <= 1)

@@ -66,7 +66,6 @@ def write_gcsv(
         sample_rate: Samples per second; by default as stated above.
 
     Raises:
-        OSError: If the file cannot be written.
         ValueError: If the motion has no camera, is a batch, or zooms, which rates do not contain; or if too many
             samples are necessary.
 

@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.atomic import whole_file
 from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import quoted
 from rsvib_torch.core.validation import Count, Number, Positive, read_json, validated
 from rsvib_torch.motion.camera import Camera
@@ -60,7 +61,7 @@ def camera_isd(
     look: tuple[float, float, float],
     radii: tuple[Positive, Positive] = (6378.137, 6356.752),
     ephemeris_time: float = 0.0,
-) -> dict[str, Any]:
+) -> Table:
     """Build the ISD of a still frame camera, for users who have none: ``write_isd`` adds the motion.
 
     The axes of the sensor are those of ``Camera`` (x to the right along samples, y down along lines, z along the
@@ -79,9 +80,6 @@ def camera_isd(
     Returns:
         The ISD, which ``json.dump`` can write.
 
-    Raises:
-        ValueError: If the look direction is zero, or a number is out of range.
-
     Example:
         >>> isd = camera_isd(Camera(2e5), (1024, 1024), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
         >>> isd["focal_length_model"], isd["detector_center"]
@@ -98,7 +96,7 @@ def camera_isd(
     pointing = Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward]))
     f = camera.focal_length
     k1, k2, p1, p2, k3 = camera.distortion
-    lens: dict[str, Any] = {"radial": {"coefficients": [0.0, 0.0, 0.0]}}
+    lens: Table = {"radial": {"coefficients": [0.0, 0.0, 0.0]}}
     if any(camera.distortion):  # usgscsm does not divide by the focal length
         lens = {"radtan": {"coefficients": [k1 / f**2, k2 / f**4, p1 / f, p2 / f, k3 / f**6]}}
     once = {"ephemeris_times": [ephemeris_time], "reference_frame": 1}
@@ -174,7 +172,6 @@ def write_isd(
         The model that was written.
 
     Raises:
-        OSError: If a file cannot be read or written.
         ValueError: If the motion is a batch, the ISD lacks a field or has another focal length, columns are exposed one
             after another, or no permitted model is accurate enough; the message states the errors and their reasons.
 
@@ -212,7 +209,7 @@ def write_isd(
                 "them: motion.with_camera(...)"
             )
     reasons = []
-    found: dict[str, Any] | None = None
+    found: Table | None = None
     written: Literal["frame", "line-scan"] = "frame"
     if model in ("auto", "frame"):
         found, reason = _with_jitter(camera, lines, displacement, timing, tolerance)
@@ -256,7 +253,7 @@ def _displacements(motion: Motion, timing: SensorTiming, size: tuple[int, int], 
 class _Camera:
     """The fields of an ISD of a camera at rest, and its rays."""
 
-    def __init__(self, isd: dict[str, Any], source: str) -> None:
+    def __init__(self, isd: Table, source: str) -> None:
         self.isd, self.source = isd, source
         self.size: tuple[int, int] = (self.value(Count, "image_lines"), self.value(Count, "image_samples"))
         self.focal_length = self.value(Number, "focal_length_model", "focal_length")
@@ -337,7 +334,7 @@ class _Camera:
 
 def _with_jitter(
     camera: _Camera, times: Array, displacement: Array, timing: SensorTiming, tolerance: float
-) -> tuple[dict[str, Any] | None, str]:
+) -> tuple[Table | None, str]:
     """The ISD with jitter polynomials, None if they are not accurate enough, and their error."""
     times, displacement = times[_PADDING:-_PADDING], displacement[_PADDING:-_PADDING]
     low, high = displacement.min(1), displacement.max(1)
@@ -376,7 +373,7 @@ def _with_jitter(
 
 def _as_line_scan(
     camera: _Camera, displacement: Array, timing: SensorTiming, tolerance: float
-) -> tuple[dict[str, Any] | None, str]:
+) -> tuple[Table | None, str]:
     """The ISD of a line scanner with one quaternion per row, None if it is not accurate enough, and its error."""
     rows = len(displacement)
     line = np.arange(rows)[:, None] - _PADDING + 0.5
@@ -414,7 +411,7 @@ def _as_line_scan(
     if np.linalg.norm(np.cross(position, velocity)) == 0:  # usgscsm divides by it; the direction is not used
         velocity = np.cross(position, np.eye(3)[np.argmin(np.abs(position))]) * 1e-9
 
-    def states(name: str, times: Array, **values: Array) -> dict[str, Any]:
+    def states(name: str, times: Array, **values: Array) -> Table:
         """A table of states with new values; what describes the old ones is left out."""
         kept = {key: value for key, value in camera.isd[name].items() if key in ("unit", "reference_frame")}
         new = {key: np.broadcast_to(value, (len(times), value.shape[-1])).tolist() for key, value in values.items()}

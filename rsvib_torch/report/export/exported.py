@@ -9,11 +9,7 @@ Size = tuple[Count, Count]  # (height, width) of the frames in px
 
 
 def num_rows_of(motion: Motion, timing: SensorTiming, size: Size) -> int:
-    """Number of rows, along the scan axis, of frames of a size.
-
-    Raises:
-        ValueError: If the motion is a batch (a file holds one), or the frame period is shorter than the readout.
-    """
+    """Number of rows, along the scan axis, of frames of a size."""
     check_single("motion", motion)
     rows = size[int(timing.scan_axis)]
     timing.check_rows(rows)

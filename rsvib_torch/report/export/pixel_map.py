@@ -44,9 +44,6 @@ def sampling_map(motion: Motion, timing: SensorTiming, size: Size, num_frames: C
         (T, H, W, 2) float64 px, (x, y) from the centre of the first pixel, as ``cv2.remap`` uses them. Positions
         outside of the frame were not recorded.
 
-    Raises:
-        ValueError: If the motion is a batch, or moves by more than the frame within a frame.
-
     Example:
         >>> from rsvib_torch import SensorTiming, Vibration
         >>> timing = SensorTiming(row_time=1e-4, exposure_rows=1, frame_rows=100)
@@ -118,10 +115,6 @@ def write_stmap(
 
     Returns:
         The files.
-
-    Raises:
-        OSError: If a file cannot be written.
-        ValueError: As for ``sampling_map``.
 
     Example:
         >>> import tempfile

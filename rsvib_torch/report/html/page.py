@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
@@ -36,42 +37,25 @@ Box = tuple[int, int, int, int]  # top, left, height, width in px
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Content of a report page.
+    """Content of a report page."""
 
-    Attributes:
-        title: Heading.
-        subtitle: Line below.
-        frames: (T, H, W) or (T, C, H, W) input frames, full scale 1.
-        restored: Frames after restoration, or one frame restored jointly from all; on a finer grid with as many times
-            the rows and columns.
-        was_restored: Whether ``restored`` is restored, or the unchanged input.
-        timing: The sensor.
-        detection: The detection (not a batch).
-        verdict: Comparison of pairs of frames; None if they could not be compared.
-        left_alone: A reason for each axis that was not restored.
-        options: Options of ``restore``.
-        version: Version of the package.
-        next_steps: What to do next, and the command that does it, or an empty text.
-        command: The command line that wrote the page; None for a page written from Python.
-        windows: Windows of the stack that were processed separately; None if there are none.
-        created: Time at which the page was made.
-    """
-
-    title: str
-    subtitle: str
-    frames: Tensor
+    title: str  # heading
+    subtitle: str  # line below
+    frames: Tensor  # (T, H, W) or (T, C, H, W) input frames, full scale 1
+    # frames after restoration, or one frame restored jointly from all; on a finer grid with as many times the rows and
+    # columns
     restored: Tensor
-    was_restored: bool
-    timing: SensorTiming
-    detection: DetectionResult
-    verdict: RestorationVerdict | None
-    left_alone: tuple[Reason, ...]
-    options: dict[str, Any]
-    version: str
-    next_steps: tuple[tuple[str, str], ...] = ()
-    command: str | None = None
-    windows: StackManifest | None = None
-    created: datetime = field(default_factory=lambda: datetime.now().astimezone())
+    was_restored: bool  # whether ``restored`` is restored, or the unchanged input
+    timing: SensorTiming  # the sensor
+    detection: DetectionResult  # the detection (not a batch)
+    verdict: RestorationVerdict | None  # comparison of pairs of frames; None if they could not be compared
+    left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
+    options: Table  # options of ``restore``
+    version: str  # version of the package
+    next_steps: tuple[tuple[str, str], ...] = ()  # what to do next, and the command that does it, or an empty text
+    command: str | None = None  # the command line that wrote the page; None for a page written from Python
+    windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
+    created: datetime = field(default_factory=lambda: datetime.now().astimezone())  # time at which the page was made
 
 
 @dataclass(frozen=True)
@@ -99,13 +83,13 @@ def _region(top: int, left: int, height: int, width: int) -> str:
     return f"rows {top} … {top + height - 1}, columns {left} … {left + width - 1}"
 
 
-def _find_edges(image: Tensor, per_direction: int = 3, searched: int = 2048) -> list[Box]:
-    """The strongest edges of each direction in the central ``searched`` px of a frame."""
+def _find_edges(image: Tensor) -> list[Box]:
+    """The three strongest edges of each direction in the central part of a frame."""
+    searched = 2048  # px
     top, left = (max(0, (size - searched) // 2) for size in image.shape)
     edges = find_slanted_edges(image[top : top + searched, left : left + searched])
-    vertical = [edge for edge in edges if edge.near_vertical][:per_direction]
-    horizontal = [edge for edge in edges if not edge.near_vertical][:per_direction]
-    return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in vertical + horizontal]
+    chosen = [[edge for edge in edges if edge.near_vertical == vertical][:3] for vertical in (True, False)]
+    return [(edge.top + top, edge.left + left, edge.height, edge.width) for edge in chain(*chosen)]
 
 
 def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = None) -> tuple[list[Edge], list[str]]:
@@ -123,22 +107,21 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
                 f"{columns} px"
             )
     edges, notes = [], []
+
+    def measured(frame: Tensor, box: Box, scale: int, where: str) -> MtfCurve | None:
+        top, left, height, width = (scale * side for side in box)
+        try:
+            return slanted_edge_mtf(frame[top : top + height, left : left + width])
+        except ValueError as error:
+            notes.append(f"The edge at {_region(*box)} was not measured{where}: {error}.")
+            return None
+
     for box in _find_edges(after[::points, ::points]) if boxes is None else boxes:
-        top, left, height, width = box
-        crop = (slice(top, top + height), slice(left, left + width))
-        finer = tuple(slice(points * side.start, points * side.stop) for side in crop)
-        try:
-            restored = slanted_edge_mtf(after[finer])
-        except ValueError as error:
-            if boxes is not None:
-                notes.append(f"The edge at {_region(*box)} was not measured: {error}.")
-            continue
-        raw = None
-        try:
-            raw = slanted_edge_mtf(before[crop])
-        except ValueError as error:
-            notes.append(f"The edge at {_region(*box)} was not measured in the input: {error}.")
-        edges.append(Edge(box, raw, restored, points))
+        restored = measured(after, box, points, "")
+        if restored is not None:
+            edges.append(Edge(box, measured(before, box, 1, " in the input"), restored, points))
+        elif boxes is None:  # nobody asked for this edge
+            notes.pop()
     return edges, notes
 
 
@@ -152,12 +135,11 @@ def _edge_row(edge: Edge, restored: bool) -> list[str]:
 def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> dict[str, Drawing]:
     """Figures of the edges of each direction, by the name of their file."""
     drawings = {}
-    for direction in ("horizontal", "vertical"):
+    for direction in sorted({edge.direction for edge in edges}):
         chosen = [edge for edge in edges if edge.direction == direction]
-        if chosen:
-            before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
-            curves = dict(zip(names, (before, after), strict=False))
-            drawings[f"mtf_{direction}"] = drawing(plots.mtf_figure(curves, points={names[-1]: chosen[0].points}))
+        before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
+        curves = dict(zip(names, (before, after), strict=False))
+        drawings[f"mtf_{direction}"] = drawing(plots.mtf_figure(curves, points={names[-1]: chosen[0].points}))
     return drawings
 
 
@@ -184,22 +166,20 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
     grey = _grey(frames[-1]).float()
     place = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)[0]
     pair = before_after(*frames, names=names, caption="", full_at=(place[0] + 48, place[1] + 48))
-    parts = [
-        f"Frame {index}"
-        if len(report.restored) > 1 or not report.was_restored
-        else f"Frame {index}, and one image restored jointly from all frames"
-    ]
+    caption = f"Frame {index}"
+    if report.was_restored and len(report.restored) == 1:
+        caption += ", and one image restored jointly from all frames"
     if pair.scale < 1:
-        parts[0] += f", reduced to {100 * pair.scale:.2g} %"
+        caption += f", reduced to {100 * pair.scale:.2g} %"
     if pair.full is not None:
         part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
-        parts.append(f"The magnifier shows {part}")
+        caption += f". The magnifier shows {part}"
     (black, white), (low, high) = pair.levels, PERCENTILES
-    parts.append(
-        f"Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} "
-        f"and {high:g}{' of both images' if len(frames) > 1 else ''}."
+    caption += (
+        f". Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles "
+        f"{low:g} and {high:g}{' of both images' if len(frames) > 1 else ''}."
     )
-    return replace(pair, caption=". ".join(parts))
+    return replace(pair, caption=caption)
 
 
 def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
@@ -233,9 +213,8 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
     pairs = [(part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for stack in frames]
     caption = f"Frames {first} and {first + 1}, {_region(row, column, size, size)}."
     if any(moved):
-        caption += (
-            f" Frame {first + 1} is moved by {-moved[0]} px along x and {-moved[1]} px along y, the uniform motion."
-        )
+        shift = f"{-moved[0]} px along x and {-moved[1]} px along y"
+        caption += f" Frame {first + 1} is moved by {shift}, the uniform motion."
     if len(frames) > 1:
         caption += (
             " The motion between the input frames is the vibration; it is absent from the restored frames where "
@@ -244,28 +223,10 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
     return blink(pairs, names=names, frames=(first, first + 1), caption=caption)
 
 
-def _windows(manifest: StackManifest) -> dict[str, Any]:
-    """Lines and table of the tones of all windows of a stack."""
-    vibration, restoration = manifest.lines()
-    head, rows = manifest.tone_table()
-    lines = [*vibration[1:], *(restoration if manifest.output is not None else [])]
-    return {"lines": lines, "head": head, "rows": rows}
-
-
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
-    """Write ``report.html`` and its figures as PNG files into a folder.
+    """Write ``report.html`` and its figures as PNG files into an existing folder; returns the names of the files.
 
-    Args:
-        folder: An existing folder.
-        report: The content.
-        edges: Positions of slanted edges in the frame on the page; None searches for them.
-
-    Returns:
-        Names of the files.
-
-    Raises:
-        OSError: If a file cannot be written.
-        ValueError: If an edge is not inside the frame.
+    ``edges`` are positions of slanted edges in the frame on the page; None searches for them.
     """
     result, timing = report.detection, report.timing
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
@@ -279,7 +240,9 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     after = report.restored[last] if report.was_restored else None
     detail = finer[last] if report.was_restored else before
     axes = AXIS_NAMES[: result.vibration.num_axes]
-    figures = {f"offsets_{name}": drawing(plots.axis_offset_figure(result, axis)) for axis, name in enumerate(axes)}
+    figures = {
+        f"offsets_{name}": drawing(plots.offset_panels(result, [axis], 5.6, 4.4)[0]) for axis, name in enumerate(axes)
+    }
     figures["offset_gain"] = drawing(plots.gain_figure(result, timing))
     if bool(centre.moving_axes().any()):
         figures["rows"] = drawing(plots.rows_figure(centre, timing, num_rows))
@@ -290,20 +253,19 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     figures |= _mtf_drawings(measured, names)
     restored = report.was_restored
     sentences = words.verdict_sentences(
-        result,
-        removed,
-        timing,
-        num_rows,
-        restored=restored,
-        left_alone=report.left_alone,
-        verdict=report.verdict,
+        result, removed, timing, num_rows, restored=restored, left_alone=report.left_alone, verdict=report.verdict
     )
     if not restored and report.windows is not None and report.windows.totals()["restored"]:
         sentences[0] = words.WINDOWS_RESTORED
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
-    if report.windows is not None and report.windows.gyroscope is None:  # no tones are searched for otherwise
-        starts = [record.start_time for record in report.windows.windows]
-        figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
+    windows = None
+    if report.windows is not None:
+        vibration, restoration = report.windows.lines()
+        lines = [*vibration[1:], *(restoration if report.windows.output is not None else [])]
+        windows = {"lines": lines, "table": report.windows.tone_table()}
+        if report.windows.gyroscope is None:  # no tones are searched for otherwise
+            starts = [record.start_time for record in report.windows.windows]
+            figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
         "report": report,
@@ -321,7 +283,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         ],
         "tones": words.detected_tones(result),
         "at_centre": " at the centre of the frame" if removed.num_axes > 2 else "",
-        "windows": None if report.windows is None else _windows(report.windows),
+        "windows": windows,
         "mtf_head": mtf_head,
         "mtf_rows": [_edge_row(edge, restored) for edge in measured],
         "mtf_notes": notes,

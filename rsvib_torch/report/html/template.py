@@ -1,6 +1,5 @@
 """Self-contained HTML pages: images as data URIs, and templates that escape all text."""
 
-import base64
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -12,10 +11,14 @@ import jinja2
 import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.report.plots import figure_png, picture
+from rsvib_torch.core.reading import Table
+from rsvib_torch.core.result_files import figure_png
+from rsvib_torch.core.text import data_uri
+from rsvib_torch.report.plots import picture
 
 GreyLevels = tuple[float, float]  # values that are drawn black and white, full scale 1
 PERCENTILES = (0.2, 99.8)  # of the values of the images; few saturated or dead pixels do not reduce the contrast
@@ -30,12 +33,8 @@ class Drawing:
     """A figure of a page."""
 
     png: bytes  # the image
+    uri: str  # the same as a data URI
     width: int  # largest width on the page in px
-
-    @property
-    def uri(self) -> str:
-        """The image as a data URI."""
-        return data_uri(self.png, "image/png")
 
 
 @dataclass(frozen=True)
@@ -67,43 +66,39 @@ class Blink:
     height: int  # height of the images in px
 
 
-def data_uri(content: bytes, kind: str) -> str:
-    """Data URI of bytes of a MIME type."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
 def drawing(figure: Figure) -> Drawing:
     """Render a figure as PNG."""
-    return Drawing(figure_png(figure, dpi=140), round(100 * figure.get_figwidth()))
+    png = figure_png(figure, dpi=140)
+    return Drawing(png, data_uri(png, "image/png"), round(100 * figure.get_figwidth()))
 
 
-def _pixels(image: Tensor, longest: int | None = None) -> Any:
+def _pixels(image: Tensor, longest: int | None = None) -> NDArray[np.float32]:
     """Image (H, W) or (C, H, W) as OpenCV has it, reduced by averaging if a side exceeds ``longest``."""
-    pixels = picture(image).flip(-1).numpy()  # OpenCV: blue, green, red
+    pixels: NDArray[np.float32] = picture(image).flip(-1).numpy()  # OpenCV: blue, green, red
     height, width = pixels.shape[:2]
     scale = 1.0 if longest is None else longest / max(height, width)
     if scale < 1:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float32)
     return pixels
 
 
-def _grey_levels(images: Sequence[Any]) -> GreyLevels:
+def _grey_levels(images: Sequence[NDArray[np.float32]]) -> GreyLevels:
     """``PERCENTILES`` of the values of images that are not missing."""
     values = np.concatenate([image[np.isfinite(image)] for image in images])
     low, high = np.percentile(values, PERCENTILES) if len(values) else (0.0, 1.0)
     return float(low), float(high)
 
 
-def _encoded(pixels: Any, levels: GreyLevels, exact: bool) -> str:
+def _encoded(pixels: NDArray[np.float32], levels: GreyLevels, exact: bool) -> str:
     """Data URI of an image: PNG if ``exact``, else JPEG."""
     low, high = levels
     grey_levels = np.nan_to_num((pixels - low) / max(high - low, 1e-6)).clip(0, 1) * 255
-    quality = () if exact else _JPEG
-    encoded, content = cv2.imencode(".png" if exact else ".jpg", grey_levels.round().astype(np.uint8), quality)
+    kind = "png" if exact else "jpeg"
+    encoded, content = cv2.imencode(f".{kind}", grey_levels.round().astype(np.uint8), () if exact else _JPEG)
     if not encoded:
         raise ValueError(f"OpenCV cannot encode an image of shape {pixels.shape}")
-    return data_uri(content.tobytes(), "image/png" if exact else "image/jpeg")
+    return data_uri(content.tobytes(), f"image/{kind}")
 
 
 def before_after(
@@ -127,7 +122,7 @@ def before_after(
     reduced = [_pixels(image, longest) for image in images]
     levels, full = _grey_levels(reduced), None
 
-    def pair(pixels: Sequence[Any], text: str = "", **place: Any) -> BeforeAfter:
+    def pair(pixels: Sequence[NDArray[np.float32]], text: str = "", **place: Any) -> BeforeAfter:
         uris = tuple(_encoded(image, levels, exact) for image in pixels)
         return BeforeAfter(uris, names, text, pixels[0].shape[1], pixels[0].shape[0], levels, **place)
 
@@ -167,7 +162,7 @@ def _explained(text: str, terms: Mapping[str, str]) -> Markup:
     )
 
 
-def write_page(path: str | os.PathLike[str], template: str, content: dict[str, Any]) -> None:
+def write_page(path: str | os.PathLike[str], template: str, content: Table) -> None:
     """Write a page from a template of the package; text is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("rsvib_torch.report.html"),

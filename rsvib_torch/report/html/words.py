@@ -3,9 +3,10 @@
 import math
 from collections.abc import Sequence
 from datetime import datetime
-from typing import Any, Literal
+from typing import Literal
 
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
@@ -95,19 +96,16 @@ def _axis_sentences(result: DetectionResult, axis: int) -> list[str]:
 def _blind_sentences(result: DetectionResult, timing: SensorTiming, within: float = 3.0) -> list[str]:
     """A sentence for every tone that is less than ``within`` Hz away from a blind frequency."""
     sentences = []
-    for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes]):
-        for tone in range(result.vibration.amplitude.shape[-1]):
-            frequency = float(result.vibration.frequency[axis, tone])
-            if float(result.vibration.amplitude[axis, tone]) <= 0:
-                continue
-            blind = blind_frequencies(timing, frequency + 2 * within)
-            nearest = float(blind[(blind - frequency).abs().argmin()]) if len(blind) else math.inf
-            if abs(nearest - frequency) < within:
-                sentences.append(
-                    f"The tone at {frequency:.1f} Hz along {name} is {abs(nearest - frequency):.1f} Hz from the blind "
-                    f"frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified "
-                    f"(offset gain {abs(float(result.gain[axis, tone])):.2f})."
-                )
+    for axis, tone in result.vibration.amplitude.nonzero().tolist():
+        frequency = float(result.vibration.frequency[axis, tone])
+        blind = blind_frequencies(timing, frequency + 2 * within)
+        nearest = float(blind[(blind - frequency).abs().argmin()]) if len(blind) else math.inf
+        if abs(nearest - frequency) < within:
+            sentences.append(
+                f"The tone at {frequency:.1f} Hz along {AXIS_NAMES[axis]} is {abs(nearest - frequency):.1f} Hz from "
+                f"the blind frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified "
+                f"(offset gain {abs(float(result.gain[axis, tone])):.2f})."
+            )
     return sentences
 
 
@@ -147,7 +145,7 @@ def verdict_sentences(
 
 
 def tried_sentences(
-    result: DetectionResult, options: dict[str, Any], verdict: RestorationVerdict | None, found: Sequence[str]
+    result: DetectionResult, options: Table, verdict: RestorationVerdict | None, found: Sequence[str]
 ) -> list[str]:
     """What was tried where no frame was restored: the detection, its findings ``found``, and the restoration."""
     curve = result.offsets
@@ -164,7 +162,7 @@ def tried_sentences(
     return [*sentences, f"Frames were restored{f' with {chosen}' * bool(chosen)} and judged; they are not written."]
 
 
-def about_rows(created: datetime, version: str, command: str | None, options: dict[str, Any]) -> list[list[str]]:
+def about_rows(created: datetime, version: str, command: str | None, options: Table) -> list[list[str]]:
     """Lines of the table of the report itself: when and how it was made."""
     rows = [["created", created.isoformat(" ", "seconds")], ["program", f"rsvib_torch {version}"]]
     if command is not None:
