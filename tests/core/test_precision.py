@@ -14,7 +14,7 @@ VIBRATION = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9])
 
 @pytest.fixture(scope="module", name="frames")
 def make_frames():
-    return rsv.simulate_frames(city_and_fields(160, 160, seed=3), TIMING, VIBRATION, 3, frame_size=(96, 96))
+    return rsv.simulate_frames(city_and_fields(160, 160, seed=8), TIMING, VIBRATION, 3, frame_size=(96, 96))
 
 
 def inference_tensors(value, name):
