@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -65,3 +66,14 @@ def figures_are_not_arranged(request, monkeypatch):
 
     if not ARRANGED & set(request.path.parts):
         monkeypatch.setattr(FigureCanvasAgg, "print_figure", print_figure)
+
+
+@pytest.fixture(name="set_free")
+def replace_free_memory(monkeypatch):
+    """Sets the free memory of the machine, in bytes."""
+
+    def set_free(size):
+        memory = psutil.virtual_memory()._replace(available=size)
+        monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+
+    return set_free

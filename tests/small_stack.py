@@ -5,7 +5,6 @@ import json
 import numpy as np
 import tifffile
 from scipy import ndimage
-from small_config import CAMERA
 from truth import Motion, crop, take_frames
 
 from rsvib_torch import SensorTiming, process_stack
@@ -20,6 +19,23 @@ OPTIONS = {
     "workers": 1,
 }
 WINDOWS = 8
+CAMERA = """
+[sensor]
+row_time = 1e-4
+exposure_rows = 6
+frame_rows = 104
+full_scale = 4095
+
+[detection]
+method = "bands"
+band_rows = 16
+band_step = 8
+search = 6
+tones = 1
+
+[restoration]
+method = "dewarp"
+"""
 CONFIG = f"""{CAMERA}
 [stack]
 window = 3

@@ -8,7 +8,7 @@ import benchmark
 import pytest
 import torch
 from benchmark import SECTIONS, module_of
-from benchmarks import error_bars, gpu, live, pipeline, video
+from benchmarks import gpu, pipeline, video
 from harness import Timed, defaults, in_turns, read_result, shown_seconds, write_result
 
 import rsvib_torch as rsv
@@ -67,12 +67,6 @@ def test_operations_transfers_and_bytes_are_counted():
     assert 400 + 600 <= count.moved < 2000
 
 
-def test_cases_without_time_are_left_out():
-    results = gpu.rows(defaults(gpu, gpu_sizes=(96,), gpu_stacks=(1, 2), gpu_seconds=0.0))
-    assert [row["left_out"] for row in results[1:]] == ["no time left"] * 7
-    assert any("no time left" in line for line in gpu.lines(results, defaults(gpu)))
-
-
 @pytest.mark.parametrize("name", SECTIONS)
 def test_sections_have_quick_options_of_the_same_names(name):
     try:
@@ -82,18 +76,6 @@ def test_sections_have_quick_options_of_the_same_names(name):
     assert set(section.QUICK) <= set(section.OPTIONS)
     assert callable(section.rows)
     assert callable(section.lines)
-
-
-def test_errors_of_a_fixed_motion_are_near_the_bound():
-    errors = list(error_bars.tones("no roll", 0, 160))
-    assert [quantity for quantity, *_ in errors[::3]] == ["x amplitude", "y amplitude"]
-    assert all(abs(error) < 8 * bound and std > 0 for _, error, std, bound in errors)
-
-
-def test_row_times_from_motion_are_relative_to_the_true_one():
-    ((quantity, error, std, _),) = error_bars.by_motion("row time by motion: 83 Hz along x, known to 12 %", 0, 128)
-    assert quantity == "relative row time"
-    assert abs(error) < min(4 * std, 1e-3)
 
 
 def test_results_are_stored_and_read_back(tmp_path):
@@ -138,21 +120,6 @@ def test_one_command_writes_markdown_and_json(tmp_path, capsys):
     text = (tmp_path / "benchmark.md").read_text()
     assert text in capsys.readouterr().out + "\n"
     assert sum(line.startswith("| cpu | 96² | 1 |") for line in text.splitlines()) == 4
-
-
-def test_live():
-    size = 192  # of frames of 128 px, the start from row bands misses one axis
-    pixels = live.frames_of(size, live.Changing(), 8)
-    moving, _ = live.residual(pixels, size)
-    assert 1.2 < moving < 3.0  # px: rows move, and a stabiliser of whole frames does not help
-    assert live.residual(live.phase_correlated(pixels), size)[0] > 0.9 * moving
-    restored = live.tracked_frames(pixels, size, "dewarp")()
-    assert live.residual(restored[4:], size)[0] < 0.1 * moving
-    times = live.np.array([0.1, 0.3, 1.3])
-    changing = live.Changing(sweep=2.0, doublings=1.0)
-    assert changing.amplitude(times)[0] == pytest.approx([2.1, 2.1, 4.2])
-    angle = 2 * live.np.pi * (52.0 * 1.3 + 1.0) + 0.5  # 2 Hz/s during one second: one cycle more
-    assert changing.displacement(times)[0, -1] == pytest.approx(4.2 * live.np.sin(angle))
 
 
 def test_video():

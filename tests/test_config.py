@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import pytest
-import torch
+from refusals import refuses
 
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import blind_frequencies
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SENSOR = "[sensor]\nrow_time = 2e-5\nexposure_rows = 20\nframe_rows = 512\n"
@@ -62,12 +61,6 @@ def test_shipped_configs(name, amplitude, frequency, image_motion, num_frames):
     assert vibration.gain(config.timing.frame_period).abs().min() > 0.5
     assert set(config.detection) <= {"method", "registration", "tones", "band_rows", "band_step", "search"}
     assert config.restoration == {"method": "exact"}
-
-
-def test_every_shipped_config_has_a_test():
-    assert {path.name for path in CONFIGS.iterdir()} == {"iso12233.toml", "in_orbit.toml", "push_scan.toml"}
-    timing = read_config(CONFIGS / "iso12233.toml").timing
-    torch.testing.assert_close(blind_frequencies(timing, 30.0), torch.tensor([1 / (2048 * 20.52e-6)]).double())
 
 
 def test_only_the_sensor_is_required_and_missing_options_are_not_filled_in(tmp_path):
@@ -186,5 +179,4 @@ def test_files_that_are_not_configurations(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_config(tmp_path / "none.toml")
     (tmp_path / "image.toml").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(ValueError, match=r"image\.toml: not a TOML file"):
-        read_config(tmp_path / "image.toml")
+    refuses(lambda: read_config(tmp_path / "image.toml"), r"image\.toml: not a TOML file")

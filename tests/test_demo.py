@@ -70,12 +70,3 @@ def test_report_is_written_and_named(demo, scene):
     assert "The vibration of the camera was measured and removed; restoration improves the frames." in text
     assert "python scripts/demo.py --quick --out" in text
     assert f"report with all figures: {path}" in "\n".join(line for line in demo[1] if isinstance(line, str))
-
-
-def test_tables_are_printed(demo):
-    tables = [thing for thing in demo[1] if hasattr(thing, "columns")]
-    assert [table.title for table in tables] == [
-        f"{scene}: {what}" for scene in ("chart", "city") for what in ("vibration", "frames")
-    ]
-    assert [column.header for column in tables[0].columns] == ["axis", "quantity", "true", "detected", "error"]
-    assert [table.row_count for table in tables] == [6, 2, 6, 2]

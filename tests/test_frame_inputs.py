@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 
 import rsvib_torch as rsv
 from rsvib_torch.core.arrays import as_tensor
@@ -57,10 +58,8 @@ FUNCTIONS = {
 def test_channels_last_is_an_option_and_refused_without_it(colour, name):
     function, last = FUNCTIONS[name], colour.permute(0, 2, 3, 1)
     message = 'frames of shape (3, 284, 202, 3) appear to have their channels last: pass channels="last" or frames.perm'
-    with pytest.raises(ValueError, match=re.escape(message)):
-        function(last)
-    with pytest.raises(ValueError, match=r"appear to be one image \(H, W, C\): pass frames\[None\]"):
-        function(last[0].numpy())
+    refuses(lambda: function(last), re.escape(message))
+    refuses(lambda: function(last[0].numpy()), r"appear to be one image \(H, W, C\): pass frames\[None\]")
     found, expected = function(last, channels="last"), function(colour)
     for attribute in ("vibration.amplitude", "motion.coefficients", "after", "offsets", "predicted_gain"):
         values = [found, expected]
@@ -75,13 +74,11 @@ def test_channels_last_is_an_option_and_refused_without_it(colour, name):
 def test_channels_last_in_calibration_and_files(colour, tmp_path):
     rows = torch.arange(512)
     light = (0.4 + 0.2 * torch.cos(2 * torch.pi * rows / 64))[None, :, None, None].expand(1, 512, 16, 3)
-    with pytest.raises(ValueError, match="appear to have their channels last"):
-        rsv.calibrate_row_time(light, 1000.0)
+    refuses(lambda: rsv.calibrate_row_time(light, 1000.0), "appear to have their channels last")
     found = rsv.calibrate_row_time(light, 1000.0, channels="last")
     assert found.row_time == pytest.approx(1 / 64e3, rel=1e-6)
     last = colour.permute(0, 2, 3, 1)
-    with pytest.raises(ValueError, match="appear to have their channels last"):
-        rsv.write_stack(tmp_path / "frames.tif", last)
+    refuses(lambda: rsv.write_stack(tmp_path / "frames.tif", last), "appear to have their channels last")
     assert not list(tmp_path.iterdir())
     rsv.write_stack(tmp_path / "frames.tif", last, channels="last")
     assert torch.equal(rsv.read_stack(tmp_path / "frames.tif"), colour)
@@ -89,8 +86,7 @@ def test_channels_last_in_calibration_and_files(colour, tmp_path):
 
 def test_channels_last_in_blocks_scenes_and_quality(grey, colour):
     last = colour.permute(0, 2, 3, 1).numpy()
-    with pytest.raises(ValueError, match="appear to have their channels last"):
-        rsv.restore_block(last, TIMING)
+    refuses(lambda: rsv.restore_block(last, TIMING), "appear to have their channels last")
     block = partial(rsv.restore_block, timing=TIMING, restoration={"method": "dewarp"})
     restored = block(last, channels="last")
     np.testing.assert_array_equal(np.moveaxis(restored, -1, 1), block(colour.numpy()))

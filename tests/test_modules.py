@@ -202,16 +202,6 @@ def test_gradients_reach_frames_and_vibration(method):
         torch.testing.assert_close(gradient, numeric.detach(), rtol=1e-4, atol=1e-6)
 
 
-def test_no_gradient_through_detection(frames):
-    """Frames from a trainable layer are detected and restored; its gradient is that of the restoration only."""
-    images = frames[0].clone().requires_grad_()
-    found = rsv.VibrationDetector(TIMING, method="bands", tones=1)(images).vibration
-    assert not found.amplitude.requires_grad
-    rsv.VibrationRestorer(TIMING, method="dewarp", check=False)(images, found).square().sum().backward()
-    assert torch.isfinite(images.grad).all()
-    assert images.grad.abs().max() > 0.1
-
-
 def unit(kind, axis):
     one = torch.zeros(3, 2, dtype=torch.float64)
     one[kind, axis] = 1.0

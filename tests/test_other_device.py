@@ -72,11 +72,9 @@ WORK = {
     "detect": lambda images, timing: rsv.detect_vibration(images, timing).vibration,
     "detect, long exposures": lambda images, timing: rsv.detect_vibration(images, timing).vibration,
     "detect, bands": lambda images, timing: rsv.detect_vibration(images, timing, method="bands").vibration,
-    "detect, phase": lambda images, timing: rsv.detect_vibration(images, timing, registration="phase").vibration,
-    "detect, projection": lambda images, timing: (
-        rsv.detect_vibration(images, timing, registration="projection").vibration
-    ),
-    "detect, few columns": lambda images, timing: rsv.detect_vibration(images, timing, columns=100).vibration,
+    "detect, columns": lambda images, timing: rsv.detect_vibration(images, timing, columns=100).vibration,
+    "projection": lambda images, timing: rsv.register_bands(images, timing, method="projection"),
+    "phase": lambda images, timing: rsv.register_bands(images, timing, method="phase"),
     "detect, holes": lambda images, timing: rsv.detect_vibration(with_missing(images), timing).vibration,
     "detect, batch": lambda images, timing: (
         rsv.detect_vibration(images[None, :, None].expand(2, -1, -1, -1, -1), timing).vibration
@@ -84,17 +82,14 @@ WORK = {
     "free": lambda images, timing: rsv.detect_vibration(images, timing, model="free").motion,
     "swept": lambda images, timing: rsv.detect_vibration(images, timing, model="swept").amplitude,
     "exact": lambda images, timing: rsv.restore(images, timing, SHAKE),
-    "exact, detected": lambda images, timing: rsv.restore(images, timing, rsv.detect_vibration(images, timing)),
     "exact, segments": lambda images, timing: rsv.restore(images, timing, SHAKE, segments=2, chunk_frequencies=16),
     "exact, long exposures": lambda images, timing: rsv.restore(images, timing, SHAKE),
     "joint": lambda images, timing: rsv.restore(images, timing, SHAKE, joint=True),
     "edges": lambda images, timing: rsv.restore(images, timing, SHAKE, prior="edges"),
     "holes": lambda images, timing: rsv.restore(with_missing(images), timing, SHAKE),
     "saturated": lambda images, timing: rsv.restore(images.clamp(max=0.6), timing, SHAKE, saturation=0.6),
-    "counts": lambda images, timing: rsv.restore((images * 255).byte(), timing, SHAKE),
     "colour, batch": lambda images, timing: rsv.restore(images[None, :, None].expand(2, -1, 3, -1, -1), timing, SHAKE),
     "across columns": lambda images, timing: rsv.restore(images, replace(timing, scan_axis=-1), SHAKE),
-    "banded": lambda images, timing: rsv.restore(images, timing, SHAKE, method="banded"),
     "dewarp": lambda images, timing: rsv.restore(images, timing, SHAKE, method="dewarp"),
     "richardson-lucy": lambda images, timing: rsv.restore(
         images, timing, SHAKE, method="richardson-lucy", iterations=5

@@ -1,4 +1,4 @@
-"""Properties that hold for all inputs: signs, orientation and adjoints."""
+"""Properties that hold for all inputs: signs and adjoints."""
 
 import math
 
@@ -6,13 +6,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsvib_torch import FreeMotion, SensorTiming, Vibration, row_psf, simulate_frames
-from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
+from rsvib_torch import FreeMotion, SensorTiming, Vibration, row_psf
 from rsvib_torch.imaging import blur_rows, blur_rows_adjoint
 
 few = settings(max_examples=20, deadline=None, derandomize=True, database=None)
 seeds = st.integers(0, 2**31)
-sizes = st.integers(1, 40)
 
 
 def numbers(low, high):
@@ -60,9 +58,6 @@ def random_tensor(seed, *shape):
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-# Signs
-
-
 @settings(few, max_examples=8)
 @given(motions(), timings(), numbers(0.0, 0.05))
 def test_offset_is_later_minus_earlier_and_changes_sign_with_the_order(motion, timing, start):
@@ -75,43 +70,12 @@ def test_offset_is_later_minus_earlier_and_changes_sign_with_the_order(motion, t
     torch.testing.assert_close(offset, means[1] - means[0], rtol=0, atol=2e-3)
 
 
-# Orientation
-
-
-@few
-@given(timings(), seeds, sizes, sizes)
-def test_orientation_of_frames_is_inverted(timing, seed, height, width):
-    frames = random_tensor(seed, 2, height, width)
-    rows = frames_to_row_order(frames, timing)
-    assert torch.equal(frames_from_row_order(rows, timing), frames)
-    assert torch.equal(frames_to_row_order(rows, timing.in_row_order()), rows)
-
-
-@settings(few, max_examples=8)
-@given(vibrations(), timings(), seeds)
-def test_turned_sensor_records_turned_frames(vibration, timing, seed):
-    scene = random_tensor(seed, 112, 104)
-    frames = simulate_frames(scene, timing, vibration, frame_size=(20, 16))
-    in_rows = simulate_frames(
-        frames_to_row_order(scene, timing),
-        timing.in_row_order(),
-        vibration.to_row_order(timing),
-        frame_size=(16, 20) if timing.scan_axis == -1 else (20, 16),
-    )
-    torch.testing.assert_close(frames, frames_from_row_order(in_rows, timing), rtol=0, atol=1e-9)
-
-
-# Adjoints: <A x, y> = <x, A^T y>
-
-
 @few
 @given(vibrations(), timings(), seeds, st.sampled_from(["linear", "cubic"]), st.integers(3, 20), st.integers(3, 20))
 def test_adjoint_of_the_blur(vibration, timing, seed, interpolation, height, width):
+    """<A x, y> = <x, A^T y>."""
     psf = row_psf(vibration, timing.row_starts(1, 9)[0], timing, interpolation=interpolation, quadrature="gauss")
     scene, frame = random_tensor(seed, 2, height, width), random_tensor(seed + 1, 2, 9, 7)
     blurred = blur_rows(scene, psf, frame_width=7, origin=(1, -2))
     adjoint = blur_rows_adjoint(frame, psf, scene.shape, origin=(1, -2))
     torch.testing.assert_close((blurred * frame).sum(), (scene * adjoint).sum(), rtol=1e-10, atol=1e-10)
-
-
-# Splits

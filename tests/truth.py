@@ -8,9 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.interpolate import BSpline
+from torch import Tensor
 
 from rsvib_torch import SensorTiming, Vibration
 
@@ -101,6 +103,21 @@ def take_frames(
             total += (moved @ spectra) * factors.reshape(height, -1)[:, : spectra.shape[1]]
         frames[p] = np.fft.irfft(total, n=scene.shape[1], axis=1)[:, margin : margin + width]
     return frames + noise * np.random.default_rng(seed).standard_normal(frames.shape)
+
+
+def recorded(
+    size: tuple[int, int],
+    timing: SensorTiming,
+    motion: Motion,
+    num_frames: int = 2,
+    noise: float = 0.0,
+    *,
+    seed: int = 0,
+    margin: int = MARGIN,
+) -> Tensor:
+    """Frames (T, H, W), float32, of a scene that is drawn from the seed, which is that of the noise as well."""
+    scene = draw_scene(size[0] + 2 * margin, size[1] + 2 * margin, seed)
+    return torch.from_numpy(take_frames(scene, timing, motion, num_frames, noise, seed=seed, margin=margin)).float()
 
 
 def crop(scene: Array, margin: int = MARGIN) -> Array:

@@ -10,6 +10,7 @@ import pytest
 import torch
 from kornia.geometry.boxes import Boxes
 from kornia.geometry.keypoints import Keypoints
+from refusals import refuses
 from scipy.optimize import brentq
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 
@@ -396,13 +397,10 @@ def test_bad_options(options, error, match):
 
 
 def test_wrong_use_is_refused():
-    with pytest.raises(TypeError, match="timing must be a SensorTiming"):
-        RollingShutterVibration(2e-5)
+    refuses(lambda: RollingShutterVibration(2e-5), "timing must be a SensorTiming", TypeError)
     augmentation = RollingShutterVibration(TIMING)
-    with pytest.raises(ValueError, match="no vibration has been drawn yet"):
-        augmentation.drawn_vibration()
-    with pytest.raises(ValueError, match="less than the 400 rows"):
-        augmentation(torch.zeros(1, 1, 400, 8))
+    refuses(augmentation.drawn_vibration, "no vibration has been drawn yet")
+    refuses(lambda: augmentation(torch.zeros(1, 1, 400, 8)), "less than the 400 rows")
     images = torch.rand(1, 1, 40, 32)
     for data_key, value in (
         ("input", images),

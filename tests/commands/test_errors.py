@@ -2,9 +2,7 @@
 
 import json
 import os
-from pathlib import Path
 
-import numpy as np
 import pytest
 from program import refused, rsvib
 from small_stack import CONFIG, TIMING, write_small
@@ -13,7 +11,7 @@ from rsvib_torch import process_stack
 from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import current_output, running
 from rsvib_torch.core.text import printable
-from rsvib_torch.io import StackFormat, formats, open_stack
+from rsvib_torch.io import StackFormat, formats
 
 ONE_WINDOW = CONFIG.partition("[stack]")[0]
 
@@ -81,29 +79,6 @@ def test_figures_that_cannot_be_drawn_are_a_warning(camera, monkeypatch, capsys)
     names = set(os.listdir("results"))
     assert {"restored.tif", "manifest.json", "vibration.json", "offsets.csv"} <= names
     assert not any(name.endswith(".png") for name in names)
-
-
-def test_frames_beyond_all_scales_are_written_unchanged(camera):
-    frames = np.linspace(0.0, 1.0, 4 * 96 * 64, dtype=np.float32).reshape(4, 96, 64)
-    frames[:3] = np.stack([frame / 4095.0 for frame in read("frames.tif")])
-    frames[3, 4, 5] = 3e38
-    np.save("floats.npy", frames)
-    config = ONE_WINDOW.replace("full_scale = 4095\n", "")
-    Path("floats.toml").write_text(config)
-    arguments = ["run", "floats.npy", "results", "--config", "floats.toml", "--output", "out.npy"]
-    assert rsvib(*arguments) == 0
-    assert np.load("results/out.npy")[3, 4, 5] == np.float32(3e38)
-    record = json.loads(Path("results/manifest.json").read_text())["windows"][0]
-    assert list(record["bad_frames"]) == ["3"]
-    assert "reaches 3e+38" in record["bad_frames"]["3"]
-
-
-def read(path):
-    reader = open_stack(path)
-    try:
-        return [reader.frame(index).astype(np.float32) for index in range(reader.info.shape[0])]
-    finally:
-        reader.close()
 
 
 NAMES = [b"a\xff\xfe it's $HOME", "red\x1b[31m line\nbreak \u202etxt".encode()]

@@ -7,8 +7,7 @@ import pytest
 import tifffile
 import torch
 from program import refused, rsvib
-from small_config import CAMERA
-from small_stack import MOTION, draw_counts
+from small_stack import CAMERA, MOTION, draw_counts
 
 import rsvib_torch as rsv
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-import small_config
 from program import refused, rsvib
+from small_stack import CAMERA as SMALL
 from small_stack import HEIGHT, STILL, WIDTH, write_small
 
 from rsvib_torch import read_stack, read_stack_info
 
-CAMERA = small_config.CAMERA.partition("[restoration]")[0]
+CAMERA = SMALL.partition("[restoration]")[0]
 CONFIG = f"""{CAMERA}
 [restoration]
 joint = true
@@ -22,7 +22,6 @@ pixel = 1.0
 [stack]
 window = 3
 """
-OPTIONS = ("--scale", 2, "--joint", "all", "--mosaic", "RGGB", "--optics-sigma", 0.4)
 
 
 @pytest.fixture(scope="module", name="place")
@@ -38,15 +37,6 @@ def make_place(tmp_path_factory):
 def restore(place, out, *more):
     vibration = ("--config", place / "camera.toml", "--vibration", place / "found" / "vibration.json")
     return ("restore", place / "raw.tif", out, *vibration, *more)
-
-
-def test_options(place, tmp_path):
-    assert rsvib(*restore(place, tmp_path / "out.tif", *OPTIONS)) == 0
-    image = read_stack(tmp_path / "out.tif")
-    assert image.shape == (1, 3, 2 * HEIGHT, 2 * WIDTH)
-    error = image[0, :, ::2, ::2].double().numpy() - STILL
-    assert np.sqrt(np.mean(error[:, 12:-12, 12:-12] ** 2)) < 0.05  # sharper than the scene
-    assert np.abs(error[0] - error[1])[12:-12, 12:-12].mean() < 0.01  # grey
 
 
 def test_run_in_windows_with_keys_of_the_configuration(place, tmp_path):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 from program import refused, rsvib
-from small_config import CAMERA
-from small_stack import HEIGHT, WIDTH, write_small
+from small_stack import CAMERA, HEIGHT, WIDTH, write_small
 
 from rsvib_torch import read_stack_info, write_stack
 from rsvib_torch.evaluation import example_frames

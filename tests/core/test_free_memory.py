@@ -9,9 +9,8 @@ GB = 10**9
 
 
 @pytest.fixture(autouse=True)
-def _large_machine(monkeypatch):
-    memory = psutil.virtual_memory()._replace(available=100 * GB)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+def _large_machine(set_free):
+    set_free(100 * GB)
 
 
 def write(root, files):

@@ -48,16 +48,6 @@ def test_one_thread_is_a_loop():
     )
 
 
-def test_the_caller_takes_part(two_threads):
-    both = threading.Barrier(2, timeout=20)
-
-    def work(_):
-        both.wait()
-        return threading.current_thread()
-
-    assert threading.main_thread() in in_parallel(work, range(2), CPU)
-
-
 def test_errors_are_raised_and_no_further_item_begins(two_threads):
     both, begun = threading.Barrier(2, timeout=20), []
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import pytest
 import torch
-from detections import findings_of
+from refusals import refuses
 from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -120,29 +120,6 @@ def test_a_detection_prints_in_eight_lines(detection, monkeypatch):
     assumed = "assumed: row_time=4e-05 s; frequencies scale inversely with it, or differ by multiples of 83.33 Hz"
     assert (lines[5], lines[7]) == (assumed, HIDDEN)
     assert lines[6].startswith("assumed: exposure_rows=12: the blur agrees with ")
-
-
-def test_reasons_tones_and_image_motion_are_printed(detection):
-    std = replace(detection.std, **{n: torch.full((2, 2), 0.01) for n in ("amplitude", "frequency", "period", "phase")})
-    vibration = rsv.Vibration([[2.0, 0.5], [0.0, 0.0]], [[60.0, 145.0], [0.0, 0.0]], 0.1, [20.0, 0.0])
-    changed = replace(
-        detection,
-        vibration=vibration,
-        std=replace(std, image_motion=torch.tensor([0.1, 0.1])),
-        std_if_hidden_tone=None,
-        reliable=torch.tensor([True, False]),
-        findings=findings_of([[], ["no significant tone " * 8, "blind"]]),
-    )
-    lines = changed.summary().splitlines()
-    assert [line.split()[0] for line in lines[1:4]] == ["x", "x", "y"]
-    assert lines[3] == "y     no tone"
-    assert lines[4] == "image motion 20.00 ± 0.10 px/s along x, 0.00 ± 0.10 px/s along y"
-    assert lines[5] == "x: reliable"
-    assert lines[6] == "y: not reliable:"
-    assert lines[7].startswith(" - no significant tone")
-    assert lines[8].startswith("   ")
-    assert " - blind" in lines[9:]
-    assert max(map(len, lines)) <= 100
 
 
 def test_batches_print_as_a_compact_table(windows):
@@ -272,12 +249,9 @@ def test_a_saved_detection_is_a_vibration_json(detection, windows, frames, tmp_p
     with pytest.raises(ValueError, match="detected with another timing: row_time=4e-05"):
         rsv.read_vibration(path, replace(TIMING, row_time=5e-5))
     windows.save(path)
-    with pytest.raises(ValueError, match=r"a batch of detections; read it with DetectionResult\.load"):
-        rsv.read_vibration(path)
-    with pytest.raises(ValueError, match=r"result is a batch of shape \(3,\): pass one"):
-        rsv.write_vibration(path, windows)
-    with pytest.raises(ValueError, match="timing unknown: pass timing="):
-        rsv.write_vibration(path, replace(detection, timing=None))
+    refuses(lambda: rsv.read_vibration(path), r"a batch of detections; read it with DetectionResult\.load")
+    refuses(lambda: rsv.write_vibration(path, windows), r"result is a batch of shape \(3,\): pass one")
+    refuses(lambda: rsv.write_vibration(path, replace(detection, timing=None)), "timing unknown: pass timing=")
 
 
 def test_the_description_of_a_stack_is_one_line():

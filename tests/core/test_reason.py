@@ -6,7 +6,7 @@ from string import Formatter
 
 import pytest
 
-from rsvib_torch.core.reason import GROUPS, REASONS, Reason, read_findings, texts
+from rsvib_torch.core.reason import GROUPS, REASONS, Reason, read_findings
 
 VALUE, LIMIT = 3.0, 7.0
 
@@ -52,21 +52,6 @@ def test_infinite_numbers_are_read_again():
     stored = json.loads(json.dumps(reason.to_dict(), allow_nan=False))
     assert stored["value"] is None
     assert str(Reason.from_dict(stored)) == str(reason)
-
-
-def test_parts_without_their_details_are_omitted():
-    given = {"exposure_rows": 20.0, "likely": 31.0}
-    with_hint = Reason("blur_contradicts_exposure", None, 2.6, 2.5, given)
-    assert "about 31 rows" in str(with_hint)
-    assert "about" not in str(Reason("blur_contradicts_exposure", None, 2.6, 2.5, {"exposure_rows": 20.0}))
-    roll = Reason("rows_unexplained", "roll", 0.3, 0.05, {"radius": 120.0})
-    assert str(roll).endswith(" (px: at 120 px from the centre)")
-
-
-def test_texts_of_an_axis_omit_its_name():
-    reason = Reason("no_contrast", "y")
-    assert texts((reason,)) == (f"y: {reason}",)
-    assert texts(((), (reason,))) == ((), (str(reason),))
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from program import refused, rsvib
+from refusals import refuses
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -122,11 +123,9 @@ def test_periodic_motion_has_ambiguous_clock_offsets(tmp_path, scene):
 def test_clock_offsets_beyond_the_recording_are_reported(frames, tmp_path):
     clock = np.arange(5.0, 6.0, 1e-3)
     recorded = rsv.read_motion(log(tmp_path / "a.csv", clock, angles(clock)), unit="rad", focal_length=900)
-    with pytest.raises(ValueError, match="covers the frames from 5"):
-        rsv.align_motion(frames, TIMING, recorded, offsets=(7.0, 8.0))
+    refuses(lambda: rsv.align_motion(frames, TIMING, recorded, offsets=(7.0, 8.0)), "covers the frames from 5")
     short = rsv.read_motion(log(tmp_path / "b.csv", clock[:20], angles(clock[:20])), unit="rad", focal_length=900)
-    with pytest.raises(ValueError, match="shorter than the frames"):
-        rsv.align_motion(frames, TIMING, short)
+    refuses(lambda: rsv.align_motion(frames, TIMING, short), "shorter than the frames")
 
 
 def test_command(frames, gyroscope, tmp_path, capsys):
@@ -211,7 +210,6 @@ def test_missing_pixels_do_not_change_the_result(frames, gyroscope):
 @pytest.mark.parametrize("function", [rsv.align_motion, rsv.check_motion])
 def test_batches_are_refused(frames, function):
     recorded = at(np.arange(-0.01, 0.1, 5e-4))
-    with pytest.raises(ValueError, match="takes one"):
-        function(frames[None, :, None], TIMING, recorded)
+    refuses(lambda: function(frames[None, :, None], TIMING, recorded), "takes one")
     with pytest.raises(ValueError, match=r"recorded is a batch of shape \(2,\)|motion is a batch of shape \(2,\)"):
         function(frames, TIMING, recorded.expanded(2))

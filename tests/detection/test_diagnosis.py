@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from truth import Motion, draw_scene, take_frames
+from truth import Motion, recorded
 
 from rsvib_torch import SensorTiming, detect_vibration
 
@@ -26,14 +26,9 @@ class Walk(Motion):
         return 1.5 * waves.sum(-1) / np.linalg.norm(amplitude, axis=-1)
 
 
-def frames_of(motion, num_frames=4):
-    scene = draw_scene(HEIGHT + 80, WIDTH + 80, 8)
-    return torch.from_numpy(take_frames(scene, TIMING, motion, num_frames, 0.005)).float()
-
-
 @pytest.fixture(scope="module")
 def frames():
-    return frames_of(MOTION)
+    return recorded((HEIGHT, WIDTH), TIMING, MOTION, 4, 0.005, seed=8)
 
 
 def causes(found):
@@ -95,7 +90,7 @@ def test_a_wrong_readout_is_named(frames, wrong, code, agreeing):
 
 
 def test_a_motion_that_is_no_sum_of_tones_names_no_timing():
-    found = detect_vibration(frames_of(Walk()), TIMING)
+    found = detect_vibration(recorded((HEIGHT, WIDTH), TIMING, Walk(), 4, 0.005, seed=8), TIMING)
     codes = {reason.code for of_axis in found.findings for reason in of_axis}
     assert codes & {"rows_unexplained", "neighbours_unexplained", "too_many_tones"}
     assert causes(found) == []

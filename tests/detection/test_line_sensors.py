@@ -54,12 +54,3 @@ def test_delay_of_one_period_is_blind(ground):
     timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, delay], LINES, 4)
     found = rsv.detect_vibration(images(ground, delay / LINE_TIME), timing)
     assert not found.reliable[0]
-
-
-def test_bad_values():
-    with pytest.raises(ValueError, match=r"delays must have at least two entries, got \[0.0\]"):
-        rsv.SensorTiming.line_sensors(1e-4, [0.0], 900)
-    with pytest.raises(ValueError, match="strictly increasing"):
-        rsv.SensorTiming.line_sensors(1e-4, [0.0, 0.0], 900)
-    with pytest.raises(ValueError, match="longer than 10 ms"):
-        rsv.SensorTiming.line_sensors(0.1, [0.0, 1.0], 900)

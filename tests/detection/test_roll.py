@@ -1,5 +1,6 @@
 """Detection and restoration of frames of a camera that rolls and zooms, against an independent camera."""
 
+import json
 import warnings
 from dataclasses import replace
 
@@ -7,20 +8,19 @@ import numpy as np
 import pytest
 import torch
 from field_truth import FieldMotion, LensMotion, take_field_frames
+from program import rsvib
 from truth import decibel, draw_scene
 
 from rsvib_torch import (
     Camera,
-    DetectionResult,
     SensorTiming,
     detect_motion,
     detect_vibration,
     judge_restoration,
     restore,
-    row_psf,
     visible_pixels,
+    write_stack,
 )
-from rsvib_torch.report.results import read_vibration
 
 TIMING = SensorTiming(row_time=8e-5, exposure_rows=12, frame_rows=280)
 TRUTH = FieldMotion((1.4, 1.9, 2.5e-3, 0.0), (38.0, 31.0, 26.0, 0.0), (0.3, 1.1, 2.0, 0.0))
@@ -100,17 +100,6 @@ def test_ignored_roll_is_named_as_the_reason(rolling):
     assert apart.details["remedy"] == "'auto'"
 
 
-def test_the_result_is_printed_saved_and_read(detection, tmp_path):
-    text = str(detection)
-    assert "roll" in text
-    assert "rad" in text
-    path = tmp_path / "vibration.json"
-    detection.save(path)
-    again = DetectionResult.load(path)
-    torch.testing.assert_close(again.vibration.amplitude, detection.vibration.amplitude)
-    assert read_vibration(path).vibration.num_axes == 3
-
-
 @pytest.mark.parametrize(("method", "least_gain"), [("dewarp", 2.0), ("exact", 3.0)])
 def test_frames_are_restored(rolling, detection, method, least_gain):
     """The gain over a restoration without roll is the effect of this motion, not of the vibration."""
@@ -183,11 +172,6 @@ def test_visible_pixels_follow_the_roll():
     assert np.mean(mask.numpy() != expected) < 0.15 * np.mean(~expected)
 
 
-def test_row_functions_refuse_roll():
-    with pytest.raises(ValueError, match="not defined with roll, zoom or a camera"):
-        row_psf(TRUTH.vibration(3), TIMING.row_starts(1, 8), TIMING)
-
-
 def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
     lens = (-0.12, 0.05, 1e-3, -2e-3, 0.01)
     truth = LensMotion((3.0, 4.0, 0.0, 0.0), (38.0, 31.0, 0.0, 0.0), (0.3, 1.1, 0.0, 0.0), 300.0, (6.0, -4.0), lens)
@@ -220,15 +204,34 @@ def test_focal_length_gives_the_attitude_of_a_camera_with_a_wide_field():
     ("options", "message"),
     [
         ({"columns": 64, "roll": True}, "columns=64 goes with roll=False"),
-        ({"roll": "yes"}, "roll must be True or False or 'auto', got 'yes'"),
         ({"model": "swept", "roll": True}, "model='swept' has no option 'roll'; its options are"),
         ({"model": "free", "zoom": "auto"}, "zoom must be True or False, got 'auto'"),
         ({"principal_point": (1.0, 2.0)}, "principal_point=.* requires focal_length"),
         ({"distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, "distortion=.* requires focal_length"),
         ({"focal_length": 300.0, "distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)}, "not invertible in frames of 96 x 128 px"),
-        ({"focal_length": 300.0, "columns": 64}, "columns=64 goes with roll=False"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
     with pytest.raises((ValueError, TypeError), match=message):
         detect_vibration(torch.rand(2, 128, 96), TIMING, **options)
+
+
+def test_commands_write_the_results_of_a_rolling_camera(rolling, tmp_path, capsys):
+    text = "[sensor]\nrow_time = 8e-5\nexposure_rows = 12\nframe_rows = 280\nfull_scale = 4095\n"
+    text += "[detection]\nroll = true\ntones = 1\n[restoration]\nmethod = 'dewarp'\n"
+    (tmp_path / "camera.toml").write_text(text)
+    write_stack(tmp_path / "frames.tif", rolling[1].clamp(0, 1), dtype="uint16", full_scale=4095)
+    config = ("--config", tmp_path / "camera.toml")
+    assert rsvib("report", tmp_path / "frames.tif", tmp_path / "page", *config, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["detection"]["reliable"] == [True, True, True]
+    assert answer["detection"]["vibration"]["amplitude"][2][0] == pytest.approx(2.5e-3, rel=0.03)
+    assert answer["restoration"]["axes"] == ["x", "y", "roll"]
+    assert (tmp_path / "page" / "offsets_roll.png").exists()
+    assert "Roll vibrates by" in (tmp_path / "page" / "report.html").read_text()
+    assert rsvib("detect", tmp_path / "frames.tif", "--out", tmp_path / "windows", *config, "--window", 3) == 0
+    assert "roll" in capsys.readouterr().out
+    head, *lines = (tmp_path / "windows" / "tones.csv").read_text().splitlines()
+    found = [dict(zip(head.split(","), line.split(","), strict=True)) for line in lines]
+    reliable = [float(row["amplitude_rad"]) for row in found if (row["axis"], row["reliable"]) == ("roll", "True")]
+    assert reliable == pytest.approx([2.5e-3] * 2, rel=0.05)

@@ -85,32 +85,6 @@ def test_intervals_contain_the_truth_where_a_second_tone_is_not_resolved(num_fra
     np.testing.assert_allclose(allowing.fit.coefficients, fit.coefficients)
 
 
-def test_only_a_hidden_tone_adds_to_the_uncertainty_of_fast_tones():
-    generator = np.random.default_rng(5)
-    truth = mean_sine([2.0], [37.0], [0.4], starts_of(TIMING, 3), TIMING.exposure_time)
-    measurements = measured(truth, TIMING, generator)
-    fit = fitted(measurements, [37.0])
-    known = with_further_tones(measurements, fit, row_starts(3), number_is_known=True)
-    free = with_further_tones(measurements, fit, row_starts(3))
-    fits = [fit, *(stated.fit for stated in (*known, *free))]
-    own, *std = [float(vibration_of_fit(found)[1].amplitude[0, 0, 0]) for found in fits]
-    assert std[:3] == pytest.approx([own] * 3)
-    assert std[3] > 2 * own
-
-
-def test_slow_errors_count_for_slow_tones():
-    generator = np.random.default_rng(6)
-    stds = []
-    for frequency in (4.0, 37.0):
-        truth = mean_sine([2.0], [frequency], [0.4], starts_of(TIMING, 4), TIMING.exposure_time)
-        fit = fitted(measurements := measured(truth, TIMING, generator, noise=1e-4), [frequency])
-        stated, _ = with_further_tones(measurements, fit, row_starts(4))
-        own, total = (float(vibration_of_fit(found)[1].amplitude[0, 0, 0]) for found in (fit, stated.fit))
-        stds.append(total / own)
-    assert stds[0] > 5
-    assert stds[1] == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize("num_frames", [2, 4])
 def test_bias_by_aliasing_is_removed_and_allowed_for(num_frames):
     """Bias b sin(2 pi (d_p - d_q)), mean over the frames q, and c cos(2 pi d_p): known if it moves by a pixel."""
@@ -154,21 +128,6 @@ def test_errors_that_a_part_of_the_scene_has_in_all_frames_are_contained():
 
     assert rms_in_std(raw) > 1.7
     assert 0.8 < rms_in_std(with_errors_of_blocks(measurements, raw)) < 1.2
-
-
-def test_stacks_of_a_batch_do_not_affect_each_other():
-    generator = np.random.default_rng(6)
-    frequency = np.array([33.0, 150.0])
-    truth = mean_sine([1.0, 0.2], frequency, [0.3, 2.0], starts_of(TIMING, 3), TIMING.exposure_time)
-    measurements = measured(truth, TIMING, generator)
-    fit = fitted(measurements, frequency)
-    _, together = with_further_tones(measurements, fit, row_starts(3))
-    for index in range(2):
-        own = measured(np.zeros((1, ROWS, 3)), TIMING)
-        own = replace(own, displacements=measurements.displacements[index : index + 1])
-        _, alone = with_further_tones(own, fitted(own, frequency[index : index + 1]), row_starts(3))
-        np.testing.assert_allclose(alone.fit.covariance[0], together.fit.covariance[index], rtol=1e-6, atol=1e-12)
-        np.testing.assert_allclose(alone.displacement_std[0], together.displacement_std[index], rtol=1e-6)
 
 
 def test_exact_displacements_have_finite_standard_deviations():

@@ -33,7 +33,13 @@ def test_frames_that_do_not_determine_a_motion(function, name):
     assert not reliable.any()
 
 
-@pytest.mark.parametrize(("count", "size", "seed"), [(4, 256, 0), (7, 192, 1)])
+@pytest.mark.parametrize("function", [rsv.detect_motion, rsv.detect_swept_tone])
+def test_one_frame_is_refused(function):
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        function(torch.rand(1, SIZE, SIZE), TIMING)
+
+
+@pytest.mark.parametrize(("count", "size", "seed"), [(4, 256, 0)])
 def test_independent_noise_at_a_low_frame_rate_has_no_vibration(count, size, seed):
     """Few rows agree by chance, and slow tones of many pixels explain them; without the verdict they are reliable."""
     noise = 0.5 + 0.1 * torch.randn(count, size, size, generator=torch.Generator().manual_seed(seed))

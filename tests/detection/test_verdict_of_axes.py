@@ -118,27 +118,6 @@ def test_a_blind_tone_at_a_multiple_of_the_frame_rate_may_be_caused_by_frame_row
     assert ("check that frame_rows" in str(blind)) == (multiple is not None)
 
 
-def test_stacks_of_a_batch_are_judged_independently():
-    both = [rows_of(unexplained=0.3), rows_of(blur=(0.5, 0.1, 0.05))]
-    values = [np.concatenate(of) for of in zip(*(vars(one).values() for one in both), strict=True)]
-    tones = Vibration([[[3.0], [2.0]]] * 2, [[[30.0], [50.0]]] * 2)
-    small = torch.full((2, 2, 1), 0.01)
-    std = VibrationStd(small, small, small, small, torch.zeros(2, 2), torch.zeros(2, 2), torch.full((2, 2), 0.01))
-    findings = judged(
-        tones,
-        std,
-        OtherMotion(*values),
-        intervals=np.array([0.04096]),
-        displacement=np.full((2, 2), 1.5),
-        known_std=np.full((2, 2), 0.01),
-        timing=TIMING.in_row_order(),
-    )
-    assert [codes(one) for one in findings] == [
-        [["rows_unexplained"], []],
-        [["blur_contradicts_exposure"], ["blur_contradicts_exposure"]],
-    ]
-
-
 def rows_of(unexplained=0.0, correlated=0.0, differential=0.0, measured=1.0, blur=(1.2, 0.1, 0.05), size=1.0):
     """Residual motion along x only, beside tones with offsets of ``size`` px along both axes."""
     axes = (np.array([[value, 0.0]]) for value in (unexplained, correlated, differential))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from edge_truth import draw_edge, gaussian, mtf50_of
+from refusals import refuses
 from scipy.ndimage import rotate
 
 import rsvib_torch as rsv
@@ -75,7 +76,5 @@ def test_bad_input():
         rsv.find_slanted_edges(np.zeros((100, 100), dtype=np.complex64))
     with pytest.raises(ValueError, match=r"finite grey image \(H, W\), got shape \(3, 100, 100\)"):
         rsv.find_slanted_edges(torch.zeros(3, 100, 100))
-    with pytest.raises(ValueError, match="min_length must be at least 16"):
-        rsv.find_slanted_edges(torch.zeros(100, 100), min_length=4)
-    with pytest.raises(ValueError, match="min_contrast must be larger than 0"):
-        rsv.find_slanted_edges(torch.zeros(100, 100), min_contrast=0)
+    refuses(lambda: rsv.find_slanted_edges(torch.zeros(100, 100), min_length=4), "min_length must be at least 16")
+    refuses(lambda: rsv.find_slanted_edges(torch.zeros(100, 100), min_contrast=0), "min_contrast must be larger than 0")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from edge_truth import OPTICS, diffraction, draw_edge, draw_edge_of, gaussian, mtf50_of, through_pixels
+from refusals import refuses
 from scipy.integrate import dblquad
 from scipy.special import ndtr
 
@@ -221,15 +222,11 @@ def test_tensors_and_arrays_of_numbers():
     mirrored = rsv.slanted_edge_mtf(counts)
     numbers = rsv.slanted_edge_mtf(torch.from_numpy(counts.astype(np.int32)))
     torch.testing.assert_close(mirrored.mtf50, numbers.mtf50, rtol=1e-9, atol=0)
-    with pytest.raises(TypeError, match="roi must be a tensor or array of numbers, got str"):
-        rsv.slanted_edge_mtf("edge.png")
-    with pytest.raises(TypeError, match=r"real numbers, got torch\.bool"):
-        measure(draw_edge(5.0, 0.5) > 0.5)
+    refuses(lambda: rsv.slanted_edge_mtf("edge.png"), "roi must be a tensor or array of numbers, got str", TypeError)
+    refuses(lambda: measure(draw_edge(5.0, 0.5) > 0.5), r"real numbers, got torch\.bool", TypeError)
     curve = measure(draw_edge(5.0, 0.5))
-    with pytest.raises(ValueError, match="frequency must be at most 1"):
-        curve.at(1.2)
-    with pytest.raises(ValueError, match=r"within 0 \.\.\. 1 cycles/px"):
-        curve.at(torch.tensor([0.2, -0.1]))
+    refuses(lambda: curve.at(1.2), "frequency must be at most 1")
+    refuses(lambda: curve.at(torch.tensor([0.2, -0.1])), r"within 0 \.\.\. 1 cycles/px")
 
 
 def test_edge_that_a_vibration_has_torn_apart_is_refused():

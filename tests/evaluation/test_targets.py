@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from scipy.ndimage import gaussian_filter
 
 from rsvib_torch.evaluation.scenes import city_and_fields, resolution_chart
-from rsvib_torch.evaluation.scenes.drawing import bars, disc, rectangle, rotated, sectors
+from rsvib_torch.evaluation.scenes.drawing import bars, rectangle, rotated
 
 SCENES = {
     "chart": resolution_chart,
@@ -50,17 +51,6 @@ def test_bars_keep_their_contrast_up_to_nyquist(frequency):
     hard = (cycles % 1.0 < 0.5) & (cycles >= 0) & (cycles < 4.5)
     expected = gaussian_filter(hard.astype(np.float64), 0.6 * fine, truncate=7)[fine // 2 :: fine]
     np.testing.assert_allclose(drawn, expected, atol=0.003)
-
-
-def test_star_and_disc_against_supersampling():
-    x, y = pixel_grid(61)
-    drawn = sectors(x, y, 16, 0.6).numpy()
-    expected = blurred_shape(lambda x, y: (np.arctan2(y, x) * 8 / math.pi) % 1.0 < 0.5, 61, 0.6, fine=21)
-    radius = np.hypot(*(t.numpy() for t in (x, y)))
-    ring = (radius > 16 / math.pi + 2) & (radius < 27)
-    assert np.abs(drawn - expected)[ring].max() < 0.02
-    expected = blurred_shape(lambda x, y: np.hypot(x, y) <= 12.4, 61, 0.6, fine=21)
-    np.testing.assert_allclose(disc(x, y, 12.4, 0.6).numpy(), expected, atol=0.02)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -112,20 +102,8 @@ def test_equal_seeds_give_equal_scenes():
     assert torch.equal(random_state, torch.random.get_rng_state())
 
 
-def test_wider_optics_blur_the_chart():
-    sharp, wide = (resolution_chart(256, 256, sigma=sigma).double().numpy() for sigma in (0.6, 1.2))
-    expected = gaussian_filter(sharp, math.sqrt(1.2**2 - 0.6**2))
-    inner = np.s_[70:-70, 70:-70]  # star and wedges
-    error = np.sqrt(np.mean((wide - expected)[inner] ** 2))
-    assert error < 0.02
-    assert error < 0.2 * np.sqrt(np.mean((wide - sharp)[inner] ** 2))
-
-
 @pytest.mark.parametrize("draw", [resolution_chart, lambda h, w, **k: city_and_fields(h, w, 0, **k)])
 def test_sizes_and_optics_are_checked(draw):
-    with pytest.raises(ValueError, match="height must be at least 64"):
-        draw(63, 100)
-    with pytest.raises(TypeError, match="width must be a whole number"):
-        draw(100, 100.0)
-    with pytest.raises(ValueError, match=r"sigma must be at least 0\.4"):
-        draw(100, 100, sigma=0.1)
+    refuses(lambda: draw(63, 100), "height must be at least 64")
+    refuses(lambda: draw(100, 100.0), "width must be a whole number", TypeError)
+    refuses(lambda: draw(100, 100, sigma=0.1), r"sigma must be at least 0\.4")

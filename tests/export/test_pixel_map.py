@@ -7,6 +7,7 @@ import tifffile
 import torch
 from camera_truth import TrueCamera
 from field_truth import FieldMotion, take_field_frames
+from refusals import refuses
 from truth import draw_scene
 
 import rsvib_torch as rsv
@@ -115,14 +116,10 @@ def test_uniform_image_motion_keeps_the_shift_of_restoration():
 
 def test_errors(tmp_path):
     timing, motion = rsv.SensorTiming(2e-5, 10, 100), rsv.Vibration((1.0, 1.0), (10.0, 10.0))
-    with pytest.raises(ValueError, match="is a batch"):
-        rsv.sampling_map(motion.expanded(2), timing, (80, 60), 1)
-    with pytest.raises(ValueError, match="frame_rows=100 is less than"):
-        rsv.sampling_map(motion, timing, (120, 60), 1)
-    with pytest.raises(ValueError, match=r"size\[1\] must be at least 1"):
-        rsv.sampling_map(motion, timing, (80, 0), 1)
-    with pytest.raises(ValueError, match="num_frames must be at least 1"):
-        rsv.write_stmap(tmp_path / "maps", motion, timing, (80, 60), 0)
+    refuses(lambda: rsv.sampling_map(motion.expanded(2), timing, (80, 60), 1), "is a batch")
+    refuses(lambda: rsv.sampling_map(motion, timing, (120, 60), 1), "frame_rows=100 is less than")
+    refuses(lambda: rsv.sampling_map(motion, timing, (80, 0), 1), r"size\[1\] must be at least 1")
+    refuses(lambda: rsv.write_stmap(tmp_path / "maps", motion, timing, (80, 60), 0), "num_frames must be at least 1")
     with pytest.raises(ValueError, match="convention must be one of 'nuke', 'opencv'"):
         rsv.write_stmap(tmp_path / "maps", motion, timing, (80, 60), 1, convention="fusion")
     with pytest.raises(ValueError, match="more than its size"):

@@ -66,6 +66,10 @@ def test_masks_follow_the_frames():
     ]
     assert prepare_frames(counts.float(), sensor(), saturation="auto").saturated is None
     assert prepare_frames(counts, sensor()).saturated is None
+    deep = counts.to(torch.int32)
+    for options in ({"saturation": "auto", "full_scale": 255}, {"saturation": 255, "full_scale": 255}):
+        assert prepare_frames(deep, sensor(), **options).saturated.flatten().tolist() == [False, True, False, False]
+    assert prepare_frames(deep, sensor(), saturation="auto", full_scale=300).saturated is None
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (2, 4, 6), (2, 1, 6), (2, 3, 4, 6)])

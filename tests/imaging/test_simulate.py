@@ -1,57 +1,14 @@
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from truth import MARGIN, Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorNoise, SensorTiming, Vibration, row_psf, simulate_frames
-from rsvib_torch.imaging import blur_rows, rows_showing
+from rsvib_torch import SensorNoise, SensorTiming, Vibration, simulate_frames
+from rsvib_torch.imaging import rows_showing
 
 TIMING = SensorTiming(row_time=60e-6, exposure_rows=20, frame_rows=300)
 MOTION = Motion((3.1, 5.2), (50.0, 30.0), (0.4, 1.3), (60.0, -25.0))
-# cycles per px along x and y, and phase: up to a quarter cycle per pixel
-WAVES = ((0.25, 0.0, 0.3), (0.0, 0.25, 1.0), (0.17, -0.18, 2.0), (-0.03, 0.22, 0.7), (0.06, 0.05, 0.1))
-
-
-def analytic(rows, columns):
-    """A scene of five sines, full scale 1, at any position."""
-    return 0.5 + sum(0.09 * np.sin(2 * np.pi * (u * columns + v * rows) + p) for u, v, p in WAVES)
-
-
-def analytic_frames(timing, motion, num_frames, size, corner):
-    """Frames of the analytic scene without interpolation; exposures are sums of 64 midpoints."""
-    rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
-    frames = np.zeros((num_frames, *size))
-    for p in range(num_frames):
-        for n in range(64):
-            times = (p * timing.frame_rows + rows[:, 0]) * timing.row_time + (n + 0.5) / 64 * timing.exposure_time
-            x, y = motion.displacement(times).T
-            frames[p] += analytic(rows + corner[0] - y[:, None], columns + corner[1] - x[:, None]) / 64
-    return frames
-
-
-@pytest.fixture(scope="module")
-def waves():
-    rows, columns = np.meshgrid(np.arange(300), np.arange(260), indexing="ij")
-    return torch.from_numpy(analytic(rows, columns))
-
-
-def test_against_analytic_scene(waves):
-    frames = simulate_frames(waves, TIMING, MOTION.vibration(), 3, frame_size=(220, 180)).numpy()
-    truth = analytic_frames(TIMING, MOTION, 3, (220, 180), (40, 40))
-    still = analytic(np.arange(220)[:, None] + 40, np.arange(180) + 40)
-    assert np.abs(truth - still).max() > 0.3
-    assert np.abs(frames - truth).max() < 3e-4
-
-
-def test_cubic_kernels_are_more_accurate_than_linear_kernels(waves):
-    truth = analytic_frames(TIMING, MOTION, 1, (220, 180), (40, 40))[0]
-    error = {}
-    for interpolation in ("linear", "cubic"):
-        psf = row_psf(MOTION.vibration(), TIMING.row_starts(1, 220)[0], TIMING, interpolation=interpolation)
-        frame = blur_rows(waves, psf, frame_width=180, origin=(40, 40)).numpy()
-        error[interpolation] = np.sqrt(np.mean((frame - truth) ** 2))
-    assert error["cubic"] < 0.1 * error["linear"]
-    assert error["linear"] < 0.05
 
 
 def test_against_independent_simulator():
@@ -95,8 +52,7 @@ def test_scene_too_small():
     scene = torch.rand(60, 60, generator=torch.Generator().manual_seed(0))
     with pytest.raises(ValueError, match=r"scene of \(60, 60\) .* is too small: a frame of \(60, 60\) .* \(104, 100\)"):
         simulate_frames(scene, TIMING, Vibration([3.5, 5.5], [50.0, 30.0]), frame_size=(60, 60))
-    with pytest.raises(ValueError, match="is too small"):
-        simulate_frames(scene, TIMING, Vibration(40.0, 50.0))
+    refuses(lambda: simulate_frames(scene, TIMING, Vibration(40.0, 50.0)), "is too small")
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,15 @@
 
 import os
 import re
+import struct
+import zlib
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
 import torch
+from refusals import refuses
 
 from rsvib_torch.core.atomic import whole_file, whole_folder
 from rsvib_torch.io import check_stack_target, read_stack, read_stack_info, write_stack
@@ -34,34 +37,11 @@ def test_tiff_truncated_anywhere_is_refused(tmp_path, kind):
     data = tiff_bytes(tmp_path, kind)
     path = tmp_path / "cut.tif"
     needed = len(data) if kind != "ours" else len(data) - 16  # the last bytes are the resolution of the last page
-    for length in range(needed):
+    for length in range(needed % 3, needed, 3):
         path.write_bytes(data[:length])
-        with pytest.raises(
-            ValueError, match=r"cut\.tif: (not a readable TIFF stack|truncated|frame \d cannot be read): ."
-        ) as caught:
+        with pytest.raises(ValueError, match=r"cut\.tif: (not a readable TIFF|truncated|frame \d cannot be)") as caught:
             read_stack(path, full_scale=4095)
         assert "\n" not in str(caught.value)
-
-
-def test_tiff_header_larger_than_the_file_is_refused(tmp_path):
-    tifffile.imwrite(tmp_path / "huge.tif", np.zeros((8, 8), "uint8"), compression="zlib", metadata=None)
-    with tifffile.TiffFile(tmp_path / "huge.tif", mode="r+b") as tif:
-        for tag in ("ImageWidth", "ImageLength", "RowsPerStrip"):
-            tif.pages[0].tags[tag].overwrite(60_000, dtype="I")
-    for read in (read_stack, read_stack_info):
-        with pytest.raises(ValueError, match="states 3600000000 bytes of pixels"):
-            read(tmp_path / "huge.tif")
-
-
-def test_tiff_pages_in_a_circle_are_refused(tmp_path):
-    data = bytearray(tiff_bytes(tmp_path, "packed"))
-    with tifffile.TiffFile(tmp_path / "good.tif") as tif:
-        first, last = tif.pages[0].offset, tif.pages[-1]
-        following = last.offset + 2 + 12 * len(last.tags)
-    data[following : following + 4] = first.to_bytes(4, "little")
-    (tmp_path / "circle.tif").write_bytes(data)
-    with pytest.raises(ValueError, match="runs in a circle"):
-        read_stack(tmp_path / "circle.tif", full_scale=4095)
 
 
 def test_tiff_files_that_are_not_stacks_are_refused(tmp_path):
@@ -95,16 +75,17 @@ def test_png_damage_is_refused(tmp_path):
         path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
         with pytest.raises(ValueError, match=r"bad\.png"):
             read_stack(path)
+    extra = b"sRGB\x09"  # behind the header: no rendering intent, which does not concern the pixels
+    chunk = struct.pack(">I", 1) + extra + struct.pack(">I", zlib.crc32(extra))
+    path.write_bytes(data[:33] + chunk + data[33:])
+    assert torch.equal(read_stack(path), read_stack(tmp_path / "good.png"))
 
 
 def test_png_folders_that_are_not_stacks_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="contains no PNG, TIFF or JPEG files"):
-        read_stack(tmp_path)
+    refuses(lambda: read_stack(tmp_path), "contains no PNG, TIFF or JPEG files")
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 5), np.uint8))
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 6), np.uint8))
-    with pytest.raises(
-        ValueError, match=r"different size or kind: a.png is \(4, 5\) uint8 .*, b.png is \(4, 6\) uint8"
-    ):
+    with pytest.raises(ValueError, match=r"a.png is \(4, 5\) uint8 .*, b.png is \(4, 6\) uint8"):
         read_stack(tmp_path)
 
 
@@ -117,11 +98,9 @@ def test_npy_damage_is_refused(tmp_path):
         with pytest.raises(ValueError, match=r"frames\.npy: (truncated|not a readable \.npy)"):
             read_stack(path)
     path.write_bytes(data.replace(b"(3, 9, 7)", b"(3, 9" + b"9" * 3 + b")"))
-    with pytest.raises(ValueError, match="truncated: the header states"):
-        read_stack_info(path)
+    refuses(lambda: read_stack_info(path), "truncated: the header states")
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(ValueError, match="pixels are object"):
-        read_stack(path)
+    refuses(lambda: read_stack(path), "pixels are object")
     for shape, message in (
         ((5,), "expected"),
         ((2, 9, 7, 3), r"channels last; store \(T, C, H, W\)"),
@@ -143,59 +122,9 @@ def test_videos_that_cannot_be_read(tmp_path, capfd):
     writer.release()
     data = (tmp_path / "cut.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
-    with pytest.raises(
-        ValueError, match=r"cut\.avi: not a readable video stack: truncated: \d+ frames, 0\.\d+ of 0\.833 s"
-    ):
+    with pytest.raises(ValueError, match=r"cut\.avi: .* truncated: \d+ frames, 0\.\d+ of 0\.833 s"):
         read_stack(tmp_path / "cut.avi")
     assert capfd.readouterr().err == ""
-
-
-def test_full_scale_must_be_known_and_large_enough(tmp_path):
-    path = tmp_path / "frames.npy"
-    np.save(path, np.full((2, 4, 4), 4096, np.uint16))
-    with pytest.raises(ValueError, match="full scale of uint16 frames unknown: pass full_scale"):
-        read_stack(path)
-    with pytest.raises(ValueError, match="counts reach 4096, beyond full_scale=4095"):
-        read_stack(path, full_scale=4095)
-    with pytest.raises(ValueError, match=r"full_scale=70000 exceeds the largest uint16 value \(65535\)"):
-        read_stack(path, full_scale=70000)
-    for bad in (0.0, -1.0, float("nan")):
-        with pytest.raises(ValueError, match="full_scale must be"):
-            read_stack(path, full_scale=bad)
-    with pytest.raises(ValueError, match=r"new\.tif: full scale of uint16 frames unknown: pass full_scale"):
-        write_stack(tmp_path / "new.tif", FRAMES, dtype="uint16")
-    with pytest.raises(ValueError, match="full_scale=300 exceeds the largest uint8 value"):
-        write_stack(tmp_path / "new.tif", FRAMES, dtype="uint8", full_scale=300)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["frames.npy"]
-
-
-def test_names_that_are_not_stacks_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"gone\.tif does not exist"):
-        read_stack(tmp_path / "gone.tif")
-    (tmp_path / "frames.xyz").write_text("")
-    with pytest.raises(ValueError, match=r"unknown file ending '\.xyz'; expected .*\.tif"):
-        read_stack(tmp_path / "frames.xyz")
-    with pytest.raises(ValueError, match="jpeg files can only be read"):
-        write_stack(tmp_path / "frames.jpg", FRAMES)
-    with pytest.raises(ValueError, match=r"wmv files can only be read; write .*mkv"):
-        write_stack(tmp_path / "frames.webm", FRAMES, dtype="uint8")
-
-
-@pytest.mark.parametrize(
-    ("name", "frames", "options", "message"),
-    [
-        ("a.png", FRAMES, {"dtype": "uint8"}, "a PNG file holds one frame, got 3"),
-        ("a.png", FRAMES[:1], {}, "png files hold uint8, uint16; got dtype float32"),
-        ("a", FRAMES[:, None].expand(3, 5, 9, 7), {"dtype": "uint8"}, "1, 3 or 4 channels, got 5"),
-        ("a.tif", FRAMES[0], {}, r"frames must have shape .* got \(9, 7\)"),
-        ("a.tif", FRAMES / 0, {"dtype": "uint8"}, "NaN or infinite pixels, which uint8 cannot"),
-        ("a.tif", FRAMES, {"dtype": "complex64"}, "got dtype complex64"),
-    ],
-)
-def test_frames_that_the_format_does_not_support(tmp_path, name, frames, options, message):
-    with pytest.raises(ValueError, match=message):
-        write_stack(tmp_path / name, frames, **options)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_png_folder_with_other_frames_is_not_written(tmp_path):
@@ -284,3 +213,48 @@ def test_permissions_of_a_replaced_file_are_kept(tmp_path):
     with whole_file(path) as part:
         part.write_text("new")
     assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", 0o640)
+
+
+def counts_in(folder, **options):
+    np.save(folder / "frames.npy", np.full((2, 4, 4), 4096, np.uint16))
+    return read_stack(folder / "frames.npy", **options)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (counts_in, ValueError, "full scale of uint16 frames unknown: pass full_scale"),
+        (lambda at: counts_in(at, full_scale=4095), ValueError, "counts reach 4096, beyond full_scale=4095"),
+        (lambda at: counts_in(at, full_scale=70000), ValueError, r"70000 exceeds the largest uint16 value"),
+        (lambda at: counts_in(at, full_scale=-1.0), ValueError, "full_scale must be"),
+        (
+            lambda at: write_stack(at / "a.tif", FRAMES, dtype="uint16"),
+            ValueError,
+            r"a\.tif: full scale of uint16 frames",
+        ),
+        (
+            lambda at: write_stack(at / "a", FRAMES, dtype="uint8", full_scale=300),
+            ValueError,
+            "exceeds the largest",
+        ),
+        (lambda at: read_stack(at / "gone.tif"), FileNotFoundError, r"gone\.tif does not exist"),
+        (lambda at: write_stack(at / "a.xyz", FRAMES), ValueError, r"unknown file ending '\.xyz'; expected .*\.tif"),
+        (lambda at: write_stack(at / "a.jpg", FRAMES), ValueError, "jpeg files can only be read"),
+        (lambda at: write_stack(at / "a.webm", FRAMES, dtype="uint8"), ValueError, "wmv files can only be read"),
+        (lambda at: write_stack(at / "a.png", FRAMES, dtype="uint8"), ValueError, "a PNG file holds one frame, got 3"),
+        (lambda at: write_stack(at / "a.png", FRAMES[:1]), ValueError, "png files hold uint8, uint16; got"),
+        (lambda at: write_stack(at / "a", FRAMES.new_zeros(3, 5, 9, 7), dtype="uint8"), ValueError, "1, 3 or 4 chan"),
+        (lambda at: write_stack(at / "a.tif", FRAMES[0]), ValueError, r"frames must have shape .* got \(9, 7\)"),
+        (
+            lambda at: write_stack(at / "a.tif", FRAMES / 0, dtype="uint8"),
+            ValueError,
+            "NaN or infinite pixels",
+        ),
+        (lambda at: write_stack(at / "a.tif", FRAMES, dtype="complex64"), ValueError, "got dtype complex64"),
+        (lambda at: write_stack(at / "none" / "a.tif", FRAMES), OSError, "none does not exist"),
+    ],
+)
+def test_what_cannot_be_read_or_written_is_refused(tmp_path, call, error, message):
+    with pytest.raises(error, match=message):
+        call(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} <= {"frames.npy"}

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from program import rsvib
-from small_config import CAMERA
-from small_stack import MOTION, STILL, TIMING, write_with_gaps
+from small_stack import CAMERA, MOTION, STILL, TIMING, write_with_gaps
 from truth import decibel
 
 import rsvib_torch as rsv
@@ -30,11 +29,6 @@ def write_stack_with_gaps(tmp_path):
     return tmp_path
 
 
-def check_restored(path):
-    restored = rsv.read_stack(path).numpy()
-    assert min(decibel(frame, STILL, 12) for frame in restored) > 34
-
-
 def test_commands_use_and_keep_the_times_of_the_file(place):
     config = ("--config", place / "camera.toml")
     assert rsvib("detect", place / "frames.raw", *config, "--out", place / "found") == 0
@@ -45,10 +39,9 @@ def test_commands_use_and_keep_the_times_of_the_file(place):
     vibration = ("--vibration", place / "found" / "vibration.json")
     assert rsvib("restore", place / "frames.raw", place / "restored.h5", *config, *vibration) == 0
     assert rsvib("run", place / "frames.raw", place / "out", *config, "--output", "restored.h5") == 0
-    vibration = ("--vibration", place / "out" / "vibration.json")
-    assert rsvib("restore", place / "frames.raw", place / "again.tif", *config, *vibration) == 0
-    for path in (place / "restored.h5", place / "out" / "restored.h5", place / "again.tif"):
-        check_restored(path)
+    for path in (place / "restored.h5", place / "out" / "restored.h5"):
+        restored = rsv.read_stack(path).numpy()
+        assert min(decibel(frame, STILL, 12) for frame in restored) > 34
         info = read_stack_info(path)
         assert info.frame_times == pytest.approx([START + index * TIMING.frame_period for index in KEPT])
         assert info.resolution[:2] == pytest.approx((120.0, 60.0))

@@ -15,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import cv2
 import numpy as np
 import pytest
+from refusals import refuses
 from truth import draw_scene
 
 import rsvib_torch as rsv
@@ -169,8 +170,7 @@ def test_the_page_is_served_to_this_machine_only():
         assert urllib.request.urlopen(page.url + "state", timeout=5).read() == b"52.0 Hz <x>"
         with pytest.raises(urllib.error.HTTPError):
             urllib.request.urlopen(page.url + "etc/passwd", timeout=5)
-        with pytest.raises(OSError, match="choose another port"):
-            live.PageOutput(port)
+        refuses(lambda: live.PageOutput(port), "choose another port", OSError)
         with urllib.request.urlopen(page.url + "frames", timeout=5) as stream:
             for index in range(50):  # those before the page has noticed the viewer are not encoded
                 page.write(np.full((16, 24), 200, np.uint8), index)
@@ -206,8 +206,7 @@ def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
     assert not path.exists()  # it is created with the first frame
     output.close()
     path.write_bytes(b"created during the session")
-    with pytest.raises(FileExistsError, match=r"video\.mkv was created by another program"):
-        output.write(frame, 0)
+    refuses(lambda: output.write(frame, 0), r"video\.mkv was created by another program", FileExistsError)
     assert path.read_bytes() == b"created during the session"
     path.rename(tmp_path / "other")
     path.symlink_to(tmp_path / "other")
@@ -216,8 +215,7 @@ def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
     output.close()
     assert rsv.read_stack_info(path).shape == (1, 32, 32)
     assert (tmp_path / "other").read_bytes() == b"created during the session"
-    with pytest.raises(ValueError, match=r"a live video is written to \.mp4"):
-        live.VideoOutput(tmp_path / "video.gif", 30.0)
+    refuses(lambda: live.VideoOutput(tmp_path / "video.gif", 30.0), r"a live video is written to \.mp4")
 
 
 def test_preview_without_windows_names_the_page():

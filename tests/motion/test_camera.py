@@ -102,21 +102,6 @@ def test_simulated_frames_equal_a_scene_sampled_through_the_lens():
         assert np.sqrt(np.square(frames[frame, row] - still).mean()) > 0.03
 
 
-def test_restoration_with_the_camera_restores_the_corners():
-    camera = rsv.Camera(200.0, distortion=(-0.1, 0.02, 0.0, 0.0, 0.0))
-    timing = rsv.SensorTiming(row_time=4e-5, exposure_rows=8, frame_rows=260)
-    motion = rsv.Vibration((2.0, 2.5), (90.0, 61.0), (0.3, 1.0), camera=camera)
-    scene = city_and_fields(300, 320, seed=7)
-    frames = rsv.simulate_frames(scene, timing, motion, 1, frame_size=(200, 240))
-    still = rsv.simulate_frames(scene, timing, rsv.Vibration.still(), 1, frame_size=(200, 240))
-    inner = (..., slice(12, -12), slice(12, -12))
-    found = {}
-    for name, used in (("with", motion), ("without", rsv.Vibration((2.0, 2.5), (90.0, 61.0), (0.3, 1.0)))):
-        restored = rsv.restore(frames, timing, used, method="dewarp")
-        found[name] = float(rsv.psnr(restored[inner], still[inner], 1.0).mean())
-    assert found["with"] > found["without"] + 5.0  # dB
-
-
 def test_files_keep_the_camera(tmp_path):
     vibration = rsv.Vibration((3.0, 5.0), (90.0, 61.0), camera=LENS)
     free = rsv.FreeMotion(torch.zeros(3, 8), 0.0, 0.01, camera=LENS)

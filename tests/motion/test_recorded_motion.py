@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 
 from rsvib_torch import read_motion
 
@@ -80,8 +81,6 @@ def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(ValueError, match="column 'y' is missing; the first line has time, x"):
         read_motion(write(tmp_path / "a.csv", (CLOCK, CLOCK), "time,x"), unit="px")
     (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00 picture")
-    with pytest.raises(ValueError, match=r"b\.csv"):
-        read_motion(tmp_path / "b.csv", unit="px")
+    refuses(lambda: read_motion(tmp_path / "b.csv", unit="px"), r"b\.csv")
     (tmp_path / "c.csv").write_text("")
-    with pytest.raises(ValueError, match="first line has nothing"):
-        read_motion(tmp_path / "c.csv", unit="px")
+    refuses(lambda: read_motion(tmp_path / "c.csv", unit="px"), "first line has nothing")

@@ -7,6 +7,7 @@ import torch
 from rsvib_torch import SensorTiming
 from rsvib_torch.motion.timing import RowTiming
 
+SECONDS = {"row_time": 20e-6, "exposure_time": 1 / 500, "frame_rate": 30}
 GOOD = {"row_time": 20.52e-6, "exposure_rows": 20, "frame_rows": 2048}
 
 
@@ -38,12 +39,6 @@ def test_scan_axis_names(given, kept):
     in_rows = timing.in_row_order()
     assert (in_rows.scan_axis, in_rows.readout_direction) == (-2, "forward")
     assert in_rows.frame_period == timing.frame_period
-
-
-def test_rows_of_a_frame():
-    SensorTiming(**GOOD).check_rows(2048)
-    with pytest.raises(ValueError, match="frame_rows=2048 is less than the 2049 rows of the frames"):
-        SensorTiming(**GOOD).check_rows(2049)
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -96,16 +91,22 @@ def test_row_timing_is_in_row_order():
 
 
 def test_timing_in_seconds_is_that_in_rows():
-    seconds = SensorTiming.from_seconds(row_time=20e-6, exposure_time=1 / 500, frame_rate=30, scan_axis="x")
+    seconds = SensorTiming.from_seconds(**SECONDS, scan_axis="x")
     assert (seconds.exposure_rows, seconds.frame_rows, seconds.scan_axis) == (100, pytest.approx(5000 / 3), -1)
-    with pytest.raises(ValueError, match="exposure_time must be larger than 0, got 0"):
-        SensorTiming.from_seconds(row_time=20e-6, exposure_time=0, frame_rate=30)
 
 
-def test_times_in_another_unit_are_refused_with_the_right_one():
-    with pytest.raises(ValueError, match=r"exposure_rows=0.002 .* \(0.002 s are exposure_rows=100\)"):
-        SensorTiming(row_time=20e-6, exposure_rows=0.002, frame_rows=1700)
-    with pytest.raises(
-        ValueError, match=r"exposure 410 s, frame period 0.03333 s; 410 us is 410us on the command line"
-    ):
-        SensorTiming.from_seconds(row_time=20e-6, exposure_time=410, frame_rate=30)
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: SensorTiming(**GOOD).check_rows(2049), "frame_rows=2048 is less than the 2049 rows of the frames"),
+        (lambda: SensorTiming(20e-6, 0.002, 1700), r"exposure_rows=0.002 .* \(0.002 s are exposure_rows=100\)"),
+        (lambda: SensorTiming.from_seconds(**SECONDS | {"exposure_time": 0}), "exposure_time must be larger than 0"),
+        (lambda: SensorTiming.from_seconds(**SECONDS | {"exposure_time": 410}), "exposure 410 s, .*; 410 us is 410us"),
+        (lambda: SensorTiming.line_sensors(1e-4, [0.0], 900), r"delays must have at least two entries, got \[0.0\]"),
+        (lambda: SensorTiming.line_sensors(1e-4, [0.0, 0.0], 900), "strictly increasing"),
+        (lambda: SensorTiming.line_sensors(0.1, [0.0, 1.0], 900), "longer than 10 ms"),
+    ],
+)
+def test_times_that_contradict_each_other_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

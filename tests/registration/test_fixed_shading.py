@@ -53,14 +53,3 @@ def test_offsets_are_those_of_the_tissue_not_of_the_vignette(recording, pair):
     error = offsets - truth
     assert np.isfinite(error).all(1).mean() > 0.8
     assert np.nanmedian(np.abs(error), axis=0).max() < 0.15
-
-
-def test_offsets_add_up(recording):
-    frames, _ = recording
-    rows, first = offsets_between(frames, 0, 1)
-    _, second = offsets_between(frames, 1, 2)
-    _, both = offsets_between(frames, 0, 2)
-    good = np.isfinite(second).all(1)
-    met = np.stack([np.interp(rows + first[:, 1], rows[good], second[good, axis]) for axis in range(2)], axis=-1)
-    assert np.nanmedian(np.abs(first + met - both), axis=0).max() < 0.15
-    assert np.nanmedian(np.abs(first)) > 0.3

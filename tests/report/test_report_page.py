@@ -28,7 +28,7 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.html.page import Report, frames_in_turn, measure_edges, whole_frame, write_report_page
 from rsvib_torch.report.html.template import before_after, write_page
-from rsvib_torch.report.html.words import TERMS, about_rows, overall_result, verdict_sentences
+from rsvib_torch.report.html.words import TERMS, overall_result, verdict_sentences
 from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
 from rsvib_torch.restoration import RestorationVerdict
 
@@ -256,26 +256,6 @@ def test_sentences_match_the_verdict(reliable, verdict, restored, mood, first):
     assert any("blurred by up to" in line for line in words)
 
 
-def test_sentences_name_a_blind_frequency():
-    near = Vibration([1.0, 1.0], [1 / TIMING.frame_period + 1.5, 75.0])
-    words = verdict_sentences(result_of(near), near, TIMING, 256, restored=True, left_alone=(), verdict=None)
-    (line,) = [line for line in words if "blind frequency" in line]
-    assert "along x is 1.5 Hz from the blind frequency 48.8 Hz" in line
-
-
-def test_page_without_vibration(tmp_path):
-    still = Vibration([0.0, 0.0], [0.0, 0.0])
-    reasons = (("no significant tone",),) * 2
-    report = report_of(detection=result_of(still, (False, False), reasons), verdict=None, was_restored=False)
-    files = write_report_page(tmp_path, replace(report, restored=report.frames), [(0, 0, 30, 30)])
-    text = "".join(read(tmp_path / "report.html").text)
-    assert "No vibration was detected that can be removed" in text
-    assert "No vibration was detected." in text
-    assert "No two frames" not in text
-    assert "restored with" not in text
-    assert "psf.png" not in files
-
-
 def test_large_images_keep_a_part_at_full_resolution():
     frame = torch.rand(2250, 2100, generator=torch.Generator().manual_seed(1))
     pair = before_after(frame, 1 - frame, names=("a", "b"), caption="", longest=750, exact=True, full_at=(2200, 30))
@@ -344,10 +324,6 @@ def test_page_states_how_it_was_made(page):
     for part in ("2031-05-07 11:30:05+00:00", "rsvib_torch 1.2.3", COMMAND):
         assert part in text
     assert "x" not in [attributes.get("src") for _, attributes in page[2].tags]
-    assert about_rows(datetime(2031, 5, 7, 11, 30, 5, tzinfo=UTC), "2", None, {}) == [
-        ["created", "2031-05-07 11:30:05+00:00"],
-        ["program", "rsvib_torch 2"],
-    ]
 
 
 def colours(block):
@@ -463,12 +439,6 @@ def test_command_without_vibration_names_no_written_frames(place, capsys):
     assert "written" not in printed.err
     assert printed.out.count("no significant tone") == 2
     assert "displacement of the rows is uncertain" not in printed.out  # there is none
-    frames, out = place / "chart & <co>.tif", place / "run"
-    assert rsvib("run", frames, out, "--config", place / "camera.toml") == 0
-    capsys.readouterr()
-    assert rsvib(*arguments, "--overwrite", "--manifest", out / "manifest.json") == 0
-    assert f"Restoration according to {out / 'manifest.json'}\n  1 of 1 window restored\n" in capsys.readouterr().out
-    assert "Windows of the stack were restored before" in "".join(read(place / "still" / "report.html").text)
 
 
 @pytest.mark.parametrize(

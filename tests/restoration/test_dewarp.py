@@ -41,12 +41,3 @@ def test_sinusoids_are_interpolated_exactly():
     restored = dewarp(frame[None], timing, motion.vibration())[0].numpy()
     assert abs(restored - scene(rows, columns))[16:-16, 24:-24].max() < 2e-3
     assert abs(frame.numpy() - scene(rows, columns))[16:-16, 24:-24].max() > 1
-
-
-def test_blur_of_long_exposures_is_not_removed():
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=400, frame_rows=2048)
-    motion = Motion()
-    scene = draw_scene(336, 288, seed=15)
-    frames = torch.from_numpy(take_frames(scene, timing, motion, 1, 0.005))
-    exact = decibel(restore(frames, timing, motion.vibration(), method="exact"), crop(scene))
-    assert exact > decibel(dewarp(frames, timing, motion.vibration()), crop(scene)) + 4

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from truth import draw_scene
 
 import rsvib_torch as rsv
@@ -83,7 +84,5 @@ def test_arguments_that_restore_refuses_are_refused(change, message):
 def test_frames_of_another_size_are_refused():
     timing, frames = recording()
     dewarp = rsv.FixedDewarp(timing, VIBRATION, (72, 90), num_frames=2)
-    with pytest.raises(ValueError, match=r"frames must be stacks of .* = \(2, 72, 90\)"):
-        dewarp(frames[:1])
-    with pytest.raises(TypeError, match=r"frames must be torch\.float32"):
-        dewarp(frames.double())
+    refuses(lambda: dewarp(frames[:1]), r"frames must be stacks of .* = \(2, 72, 90\)")
+    refuses(lambda: dewarp(frames.double()), r"frames must be torch\.float32", TypeError)

@@ -2,46 +2,12 @@
 
 from itertools import pairwise
 
-import numpy as np
 import pytest
 import torch
-from scipy.linalg import solveh_banded
 
-from rsvib_torch.core.banded_solver import from_both_ends, skew_band, solve_halves
 from rsvib_torch.restoration.exact.scene_solver import Partition, SceneSolver, join_windows, row_windows
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
-
-
-def solved_in_windows(windows, band, right_side):
-    width = band.shape[1] - 1
-    parts = torch.stack([skew_band(band)[window] for window in windows], dim=-2).flatten(-2)
-    full = torch.cat([parts, parts.new_zeros(width, *parts.shape[1:])])
-    right = torch.stack([right_side[window] for window in windows], dim=-2).flatten(-2)
-    return join_windows(
-        solve_halves(from_both_ends(full).flatten(2), right).unflatten(-1, (-1, band.shape[-1])), windows
-    )
-
-
-@pytest.mark.parametrize("count", [2, 3, 7])
-def test_overlapping_windows_agree_with_scipy(count):
-    rows, width = 211, 3
-    generator = torch.Generator().manual_seed(0)
-    band = torch.randn(rows, width + 1, 3, dtype=torch.complex128, generator=generator)
-    band[:, 0] = band[:, 0].abs() + 2.5 * (width + 1)
-    right_side = torch.randn(rows, 2, 3, dtype=torch.complex128, generator=generator)
-    windows = row_windows(rows, count, overlap=24)
-    assert len(windows) == count
-    found = solved_in_windows(windows, band, right_side)
-    for index in range(3):
-        expected = solveh_banded(band[..., index].numpy().T.copy(), right_side[..., index].numpy(), lower=True)
-        np.testing.assert_allclose(found[..., index].numpy(), expected, rtol=0, atol=1e-8)
-    wrong = solved_in_windows(row_windows(rows, count, overlap=1), band, right_side)
-    assert (wrong - found).abs().max() > 1e-6
-
-
-def test_windows_that_overlap_everywhere_are_merged():
-    assert row_windows(100, 1) == row_windows(100, 4, 96) == [slice(0, 100)]
 
 
 @pytest.mark.parametrize(("rows", "count", "overlap"), [(211, 3, 24), (97, 2, 8), (1000, 7, 60), (101, 4, 0)])

@@ -11,8 +11,7 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.restoration import restore as restore_by_any_method
-from rsvib_torch.restoration.exact import exact
-from rsvib_torch.restoration.frame_motion import frame_motion, joint_groups
+from rsvib_torch.restoration.frame_motion import frame_motion
 from rsvib_torch.restoration.scene_model.scene_prior import fit_prior
 
 restore = partial(restore_by_any_method, method="exact", check=False)
@@ -75,21 +74,6 @@ def test_interpolation_error_depends_on_the_blur_of_each_frame():
     assert prior.interpolation_power[0, 0].mean() > 3 * prior.interpolation_power[0, 1].mean()
     later = prior.of(torch.tensor([0]), torch.tensor([[1]]))
     torch.testing.assert_close(later.interpolation_power[0, 0], prior.interpolation_power[0, 1])
-
-
-@pytest.mark.parametrize(
-    ("name", "rows", "noise", "choices"), [("buildings", 20, 0.005, 1), ("dense texture", 100, 0.001, 2)]
-)
-def test_frames_of_the_same_noise_share_a_strength(name, rows, noise, choices, monkeypatch):
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
-    clean = take_frames(SCENES[name](), timing, MOTION, 2)
-    frames = torch.from_numpy(clean + noise * np.random.default_rng(3).standard_normal(clean.shape)).float()
-    model = model_of(frames, timing, MOTION.vibration())
-    numbers = []
-    monkeypatch.setattr(exact, "prior_strengths", lambda images, *_, **__: numbers.append(len(images)) or 1.0)
-    for joint, expected in ((False, choices), (True, 1)):
-        model.strengths(model.scenes(joint_groups(2, joint)))
-        assert numbers[-1] == expected
 
 
 @pytest.mark.parametrize("count", [1, 2])

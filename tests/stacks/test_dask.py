@@ -7,6 +7,7 @@ import distributed
 import numpy as np
 import pytest
 import tifffile
+from refusals import refuses
 from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, write_small
 from truth import decibel
 
@@ -75,9 +76,7 @@ def test_missing_scheduler_and_missing_package(place, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no Dask scheduler answers at nonsense://x"):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="nonsense://x")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(
-        ModuleNotFoundError, match=r"needs the package distributed: pip install rsvib_torch\[distributed\]"
-    ):
+    with pytest.raises(ModuleNotFoundError, match=r"the package distributed: pip install .*\[distributed\]"):
         process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local")
     assert list(tmp_path.iterdir()) == []
 
@@ -112,7 +111,5 @@ def test_blocks_that_cannot_be_restored_are_returned_or_refused(place):
     with pytest.raises(ValueError, match="joint=True makes one image of a block"):
         rsv.restore_block(counts, TIMING, full_scale=4095, restoration={"joint": True})
     uneven = rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0, 0.1, 0.3])
-    with pytest.raises(ValueError, match="must not have frame_start_times"):
-        rsv.restore_block(counts, uneven, full_scale=4095)
-    with pytest.raises(ValueError, match="full scale of uint16 frames unknown"):
-        rsv.restore_block(counts, TIMING)
+    refuses(lambda: rsv.restore_block(counts, uneven, full_scale=4095), "must not have frame_start_times")
+    refuses(lambda: rsv.restore_block(counts, TIMING), "full scale of uint16 frames unknown")

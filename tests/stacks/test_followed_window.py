@@ -51,9 +51,8 @@ def test_every_frame_is_restored_whose_motion_is_known(place):
     assert manifest.settings["follow"]
 
 
-@pytest.mark.parametrize("window", [8, 4])
-def test_each_window_states_the_vibration_at_its_middle_frame(place, tmp_path, window):
-    detect_stack(place / "frames.npy", tmp_path / "manifest.json", TIMING, follow=True, window=window)
+def test_each_window_states_the_vibration_at_its_middle_frame(place, tmp_path):
+    detect_stack(place / "frames.npy", tmp_path / "manifest.json", TIMING, follow=True, window=4)
     manifest = read_manifest(tmp_path / "manifest.json")
     errors = []
     for record in manifest.windows:

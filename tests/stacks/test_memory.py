@@ -8,8 +8,8 @@ import psutil
 import pytest
 import zarr
 from program import refused, rsvib
-from small_config import CAMERA
-from small_stack import TIMING
+from refusals import refuses
+from small_stack import CAMERA, TIMING
 
 import rsvib_torch as rsv
 from rsvib_torch.io import StackInfo
@@ -19,26 +19,15 @@ LARGE = StackInfo((100, 4096, 4096), "uint16", 4095.0)
 GB = 10**9
 
 
-@pytest.fixture(name="free")
-def _free(monkeypatch):
-    """Sets the free memory of the machine."""
-
-    def set_free(size):
-        memory = psutil.virtual_memory()._replace(available=size)
-        monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
-
-    return set_free
-
-
-def test_default_limit_is_three_quarters_of_what_the_process_has_and_can_get(free):
-    free(4 * GB)
+def test_default_limit_is_three_quarters_of_what_the_process_has_and_can_get(set_free):
+    set_free(4 * GB)
     used = psutil.Process().memory_info().rss
     assert memory_limit(None) == pytest.approx(0.75 * (4 * GB + used), abs=5e6)
     assert memory_limit("2GB") == 2 * GB
 
 
-def test_window_that_does_not_fit_the_free_memory_is_refused(free):
-    free(5 * GB)
+def test_window_that_does_not_fit_the_free_memory_is_refused(set_free):
+    set_free(5 * GB)
     with pytest.raises(ValueError, match="three quarters of the memory that is free") as caught:
         windows_at_once(LARGE, 8, memory=None, most=4, restoration={})
     message = str(caught.value)
@@ -51,20 +40,20 @@ def test_window_that_does_not_fit_the_free_memory_is_refused(free):
     assert windows_at_once(LARGE, 8, memory="20GB", most=4, restoration={}) == 1
 
 
-def test_frames_that_are_stored_together_count(free):
-    free(100 * GB)
+def test_frames_that_are_stored_together_count(set_free):
+    set_free(100 * GB)
     info = StackInfo((100, 512, 512), "uint16", 4095.0, decoding_bytes=3 * GB)
     with pytest.raises(ValueError, match=r"store each frame separately: 3 GB are needed to decode frames"):
         windows_at_once(info, 2, memory="2GB", most=1, restoration={})
     assert windows_at_once(info, 2, memory="4GB", most=1, restoration={}) == 1
 
 
-def test_gpu_needs_less_memory_of_the_machine(free):
-    free(5 * GB)
+def test_gpu_needs_less_memory_of_the_machine(set_free):
+    set_free(5 * GB)
     assert windows_at_once(LARGE, 8, memory=None, most=1, restoration={}, on_gpu=True) == 1
 
 
-def test_zarr_that_expands_is_refused_by_every_command(tmp_path, free, capsys):
+def test_zarr_that_expands_is_refused_by_every_command(tmp_path, set_free, capsys):
     """96 KB that state 6.3 GB; no pixel is decoded."""
     array = zarr.create_array(tmp_path / "a.zarr", shape=(4, 16, 16), chunks=(1, 16, 16), dtype="u2")
     array[:] = 1
@@ -74,7 +63,7 @@ def test_zarr_that_expands_is_refused_by_every_command(tmp_path, free, capsys):
     (tmp_path / "a.zarr" / "more").write_bytes(bytes(96_000))
     (tmp_path / "camera.toml").write_text(CAMERA.replace("frame_rows = 104", "frame_rows = 7000"))
     (tmp_path / "motion.csv").write_text("time,x,y\n" + "".join(f"{n / 100},0,0\n" for n in range(100)))
-    free(GB)
+    set_free(GB)
     camera = ("--config", tmp_path / "camera.toml")
     stack, out = tmp_path / "a.zarr", tmp_path / "out"
     for arguments in (
@@ -91,28 +80,23 @@ def test_zarr_that_expands_is_refused_by_every_command(tmp_path, free, capsys):
     for arguments in (("calibrate", stack, "--frequency", "100"), ("simulate", stack, f"{out}.tif", *camera)):
         assert rsvib(*arguments, "--full-scale", 4095) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "camera.toml", "motion.csv"]
-    with pytest.raises(
-        ValueError, match=r"96 frames of 6000 x 5500 px need 13.\d GB of memory, of which 1 GB are free"
-    ):
+    with pytest.raises(ValueError, match=r"96 frames of 6000 x 5500 px need 13.\d GB of memory, of which 1 GB"):
         rsv.read_stack(tmp_path / "a.zarr", full_scale=4095)
 
 
-def test_simulation_of_many_frames_is_refused(free):
-    free(2 * GB)
+def test_simulation_of_many_frames_is_refused(set_free):
+    set_free(2 * GB)
     scene = np.random.default_rng(0).random((96, 96), np.float32)
     vibration = rsv.Vibration(2.0, 50.0)
     with pytest.raises(ValueError, match=r"num_frames=1000000000 frames of 64 x 64 px need .* GB of memory"):
         rsv.simulate_frames(scene, TIMING, vibration, 10**9, frame_size=(64, 64))
-    with pytest.raises(ValueError, match="too small"):
-        rsv.simulate_frames(scene, TIMING, vibration, 2, frame_size=(10**9, 10**9))
+    refuses(lambda: rsv.simulate_frames(scene, TIMING, vibration, 2, frame_size=(10**9, 10**9)), "too small")
 
 
 @pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
 def test_motion_beyond_the_frame_is_refused(method):
     frames = np.random.default_rng(0).random((2, 64, 48), np.float32)
-    with pytest.raises(
-        ValueError, match=r"the motion along the rows reaches 1e\+05 px within a frame, .* size of 48 px"
-    ):
+    with pytest.raises(ValueError, match=r"the motion along the rows reaches 1e\+05 px .* size of 48 px"):
         rsv.restore(frames, TIMING, rsv.Vibration([1e5, 0.0], [50.0, 0.0]), method=method)
     with pytest.raises(ValueError, match=r"the motion across the rows reaches 65 px .* size of 64 px"):
         rsv.restore(frames, TIMING, rsv.Vibration([0.0, 65.0], [0.0, 50.0]), method=method)

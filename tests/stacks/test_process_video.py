@@ -7,6 +7,7 @@ import av
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from skimage.registration import phase_cross_correlation
 from small_video import sound_of, write_video
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
@@ -146,19 +147,6 @@ def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
         assert not (found.reliable & ~right).any()
 
 
-def test_held_pixels_change_less_from_frame_to_frame(clip, tmp_path):
-    rims = {}
-    for border in ("mirror", "hold"):
-        process_video(clip, tmp_path / f"{border}.mp4", TIMING, border=border, **OPTIONS)
-        frames = pixels(tmp_path / f"{border}.mp4").mean(1)
-        assert np.array_equal(frames.shape[-2:], (HEIGHT, WIDTH))
-        changes = np.abs(np.diff(frames[6:], axis=0))
-        rims[border] = changes[:, 20:-20, :2].mean()
-        inner = changes[:, 20:-20, 20:-20].mean()
-    assert rims["hold"] < 0.7 * rims["mirror"]
-    assert inner < 0.02
-
-
 class _StoppedError(KeyboardInterrupt):
     """Ctrl-C at a chosen frame."""
 
@@ -239,10 +227,8 @@ def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
     for options, message in cases:
         with pytest.raises((ValueError, TypeError), match=message):
             process_video(clip, tmp_path / "still.mp4", TIMING, **options)
-    with pytest.raises(ValueError, match="videos are written to"):
-        process_video(clip, tmp_path / "still.tif", TIMING)
-    with pytest.raises(ValueError, match="same file as the input"):
-        process_video(clip, clip, TIMING)
+    refuses(lambda: process_video(clip, tmp_path / "still.tif", TIMING), "videos are written to")
+    refuses(lambda: process_video(clip, clip, TIMING), "same file as the input")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -2,28 +2,10 @@
 
 import pytest
 import torch
-from detections import detection_of
 from truth import Motion, draw_scene, take_frames
 
-from rsvib_torch import SensorTiming, Vibration, judge_restoration, restore
+from rsvib_torch import SensorTiming, Vibration
 from rsvib_torch.stacks import restore_trusted
-
-
-@pytest.mark.parametrize("scan_axis", [-2, -1])
-def test_trusted_restoration_equals_the_public_functions(scan_axis):
-    timing = SensorTiming(2e-5, 20, 256, scan_axis=scan_axis)
-    motion = Motion(amplitude=(2.0, 3.0), frequency=(120.0, 90.0))
-    upright = SensorTiming(2e-5, 20, 256)
-    frames = torch.from_numpy(take_frames(draw_scene(208, 208, 3), upright, motion, 2)).float()
-    vibration = motion.vibration()
-    if scan_axis == -1:
-        frames, vibration = frames.transpose(-2, -1), vibration.from_row_order(timing)
-    expected = restore(frames, timing, vibration, check=False, saturation=0.99)
-    verdict = judge_restoration(frames, expected, timing, vibration)
-    found = restore_trusted(frames, timing, detection_of(vibration), {"saturation": 0.99}, force=True)
-    assert torch.equal(found.frames, expected)
-    assert found.verdict.outcome == verdict.outcome
-    torch.testing.assert_close(found.verdict.predicted_gain, verdict.predicted_gain)
 
 
 @pytest.mark.parametrize("joint", [False, 3, True])
