@@ -4,9 +4,7 @@ Operations that a GPU refuses raise an error: tensors of two devices in one oper
 NumPy arrays, random numbers from a CPU generator. Tests for mixed devices can therefore run without a GPU.
 """
 
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,21 +29,17 @@ class SimulatedGpuTensor(Tensor):
     """A tensor whose device is the simulated GPU."""
 
 
-def _name(function: Callable[..., Any]) -> str:
+def _name(function):
     return getattr(function, "__name__", None) or str(resolve_name(function))
 
 
-def _is_gpu(device: object) -> bool:
-    return device is not None and torch.device(device).type == SIMULATED_GPU.type  # type: ignore[call-overload]
+def _is_gpu(device):
+    return device is not None and torch.device(device).type == SIMULATED_GPU.type
 
 
-def _to_gpu(values: Any) -> Any:
-    """Move all tensors of a nested structure to the simulated GPU."""
-    return pytree.tree_map_only(Tensor, lambda value: value.as_subclass(SimulatedGpuTensor), values)
-
-
-def _to_cpu(value: Tensor) -> Tensor:
-    return value.as_subclass(Tensor)
+def _to_device(values, kind=SimulatedGpuTensor):
+    """Move all tensors of a nested structure to the simulated GPU, or to the CPU."""
+    return pytree.tree_map_only(Tensor, lambda value: value.as_subclass(kind), values)
 
 
 class _SimulatedDevice(TorchFunctionMode):
@@ -55,18 +49,16 @@ class _SimulatedDevice(TorchFunctionMode):
         synchronisations: Number of calls that wait for the device, for each function.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
-        self.synchronisations: dict[str, int] = {}
+        self.synchronisations = {}
 
-    def __torch_function__(
-        self, function: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_function__(self, function, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
         with torch._C.DisableTorchFunctionSubclass():
             return self._call(function, args, kwargs)
 
-    def _call(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _call(self, function, args, kwargs):
         name = _name(function)
         tensors = [value for value in pytree.tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
         on_gpu = [value for value in tensors if isinstance(value, SimulatedGpuTensor)]
@@ -78,7 +70,7 @@ class _SimulatedDevice(TorchFunctionMode):
             return self._move(name, function, args, kwargs)
         if on_gpu and name in _TO_HOST | _DATA_DEPENDENT_SIZE:
             self.synchronisations[name] = self.synchronisations.get(name, 0) + 1
-        self._check(name, args, kwargs, tensors, on_gpu)
+        self._check(name, args, tensors, on_gpu)
         device = kwargs.get("device")
         if device is not None:
             generator = kwargs.get("generator")
@@ -87,21 +79,21 @@ class _SimulatedDevice(TorchFunctionMode):
             if _is_gpu(device):
                 kwargs["device"] = torch.device("cpu")
             result = function(*args, **kwargs)
-            return _to_gpu(result) if _is_gpu(device) else pytree.tree_map_only(Tensor, _to_cpu, result)
+            return _to_device(result, SimulatedGpuTensor if _is_gpu(device) else Tensor)
         result = function(*args, **kwargs)
-        return _to_gpu(result) if on_gpu and name not in _TO_HOST else result
+        return _to_device(result) if on_gpu and name not in _TO_HOST else result
 
-    def _get_attribute(self, function: Callable[..., Any], args: tuple[Any, ...], on_gpu: list[Tensor]) -> Any:
+    def _get_attribute(self, function, args, on_gpu):
         result = function(*args)
         if not on_gpu:
             return result
         if isinstance(result, torch.device):
             return SIMULATED_GPU
-        if function is Tensor.is_cuda.__get__:  # type: ignore[attr-defined]
+        if function is Tensor.is_cuda.__get__:
             return True
-        return _to_gpu(result) if isinstance(result, Tensor) else result
+        return _to_device(result) if isinstance(result, Tensor) else result
 
-    def _move(self, name: str, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def _move(self, name, function, args, kwargs):
         source, *rest = args
         target_is_gpu = isinstance(source, SimulatedGpuTensor)
         rest = list(rest)
@@ -119,9 +111,7 @@ class _SimulatedDevice(TorchFunctionMode):
             result = function(source, *rest, **kwargs)
         return result.as_subclass(SimulatedGpuTensor if target_is_gpu else Tensor)
 
-    def _check(
-        self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], tensors: list[Tensor], on_gpu: list[Tensor]
-    ) -> None:
+    def _check(self, name, args, tensors, on_gpu):
         """Raise for tensors of two devices in one operation."""
         if not on_gpu or len(on_gpu) == len(tensors) or name in _ACCEPT_TWO_DEVICES:
             return
@@ -135,12 +125,12 @@ class _SimulatedDevice(TorchFunctionMode):
         raise DeviceError(f"{name}: tensors on two devices: {shapes}")
 
 
-def _is_cpu_array(value: Any) -> bool:
+def _is_cpu_array(value):
     return isinstance(value, Tensor) and not isinstance(value, SimulatedGpuTensor) and value.ndim > 0
 
 
 @contextmanager
-def simulated_gpu() -> Iterator[_SimulatedDevice]:
+def simulated_gpu():
     """Simulate a GPU: ``tensor.to(SIMULATED_GPU)`` moves a tensor to it."""
     with _SimulatedDevice() as device:
         yield device

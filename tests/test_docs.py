@@ -42,10 +42,6 @@ def test_pages_are_plain_markdown():
     assert [path.name for path in pages if special.search(path.read_text(encoding="utf-8"))] == []
 
 
-def test_names_in_a_given_order_come_first(docs):
-    assert docs["ordered"](["new", "b", "a"], ("b", "a")) == ["b", "a", "new"]
-
-
 def test_every_public_name_is_in_the_reference(docs):
     paths = [path for package in docs["public_names"]().values() for path in package]
     assert sorted(path.rsplit(".", 1)[1] for path in paths) == sorted(rsv.__all__)
@@ -90,11 +86,8 @@ def test_every_command_and_key_is_in_the_reference():
     assert commands.count("| `--config PATH` |") == commands.count("| `--row-time TIME` |") - 2 == 8
     assert "| `--unit px\\|rad\\|" in commands
     keys = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
-    assert "| `row_time` | a number | required | Time between the exposure starts" in keys
-    assert "| `exposure_time` |" in keys
-    assert "| `search` | a whole number | `16` |" in keys
-    assert keys.count("| `joint` |") == 2
-    assert "| `bits` |" in keys
+    for row in ("`row_time` | a number | required |", "`search` | a whole number | `16` |", "`bits` |"):
+        assert f"| {row}" in keys
 
 
 def test_drawing_of_the_architecture_has_the_layers_of_the_import_test():

@@ -76,13 +76,6 @@ def test_corrector_restores_a_batch_and_states_its_options(frames, scene):
         rsv.VibrationCorrector(TIMING, restoration={"blur": 1})
 
 
-def test_warnings_point_at_the_caller(frames):
-    wrong = rsv.Vibration([2.0, 3.0], [40.0, 250.0], [2.0, 0.0])
-    with pytest.warns(rsv.RestorationWarning) as given:
-        rsv.restore(frames[0], TIMING, wrong, method="dewarp")
-    assert {warning.filename for warning in given} == {__file__}
-
-
 def test_copies_and_state(blur, vibration):
     for name, module, arguments in modules(blur, vibration):
         expected = module(*arguments)
@@ -113,20 +106,11 @@ def test_only_deterministic_algorithms_are_used(blur, vibration):
         torch.use_deterministic_algorithms(False)
 
 
-def test_half_precision_and_autocast(frames, vibration, blur):
-    """Autocast changes nothing; half-precision frames are restored in float32 and rounded once."""
+def test_autocast_changes_nothing(frames, vibration, blur):
     for _, module, arguments in modules(blur, vibration):
         expected = module(*arguments)
         with torch.autocast("cpu", dtype=torch.bfloat16):
             assert torch.equal(module(*arguments), expected)
-    for method in METHODS:
-        restorer = rsv.VibrationRestorer(TIMING, method=method, check=False)
-        for dtype, step in ((torch.bfloat16, 2.0**-8), (torch.float16, 2.0**-11)):
-            rounded = frames[:1, :, :, :64].to(dtype)
-            restored = restorer(rounded, vibration[0])
-            assert restored.dtype == dtype
-            torch.testing.assert_close(restored.float(), restorer(rounded.float(), vibration[0]), rtol=step, atol=1e-6)
-        assert restorer(frames[:1, :, :, :64].double(), vibration[0]).dtype == torch.float64
     detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
     expected = detector(frames[0]).vibration
     with torch.autocast("cpu", dtype=torch.bfloat16):

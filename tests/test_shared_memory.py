@@ -63,17 +63,9 @@ def offset_curve(pairs, rows, times, offsets):
 # The function, and its arguments that are arrays.
 CASES = {
     "AngularRates": (rsv.AngularRates, TIMES, TIMES[:, None].repeat(1, 3)),
-    "AngularRates.rotation": (
-        lambda t, r, a, b: rsv.AngularRates(t, r).rotation(a, b),
-        TIMES,
-        TIMES[:, None].repeat(1, 3),
-        TIMES[:2],
-        TIMES[2:4],
-    ),
     "FixedDewarp": (rsv.FixedDewarp(TIMING, STILL, (ROWS, COLUMNS), 4), FRAMES),
     "FreeMotion": (lambda values: rsv.FreeMotion(values, 0.0, 0.1), torch.zeros(2, 5, dtype=torch.float64)),
     "FreeMotion.through": (rsv.FreeMotion.through, TIMES, TIMES[:, None].repeat(1, 2)),
-    "FreeMotion.from_samples": (rsv.FreeMotion.from_samples, TIMES, TIMES[:, None].repeat(1, 2)),
     "FreeMotion.displacement": (MOTION.displacement, TIMES),
     "OffsetCurve": (
         offset_curve,
@@ -87,7 +79,6 @@ CASES = {
     "RollingShutterVibration, still": (rsv.RollingShutterVibration(TIMING, amplitude=(0.0, 0.0)), FRAMES[:, None]),
     "SensorTiming": (lambda times: rsv.SensorTiming(1e-4, 4, 100, frame_start_times=times), TIMES),
     "Vibration": (rsv.Vibration, TONES, TONES, TONES, TWO, TWO, TWO),
-    "Vibration, one value": (rsv.Vibration, torch.tensor(1.0).double(), torch.tensor(2.0).double()),
     "Vibration.displacement": (STILL.displacement, TIMES),
     "Vibration.mean_displacement": (lambda times: STILL.mean_displacement(times, 0.0), TIMES),
     "Vibration.scaled": (VIBRATION.scaled, TWO),
@@ -95,7 +86,6 @@ CASES = {
     "VibrationDetector": (rsv.VibrationDetector(TIMING), FRAMES),
     "VibrationRestorer": (lambda frames: rsv.VibrationRestorer(TIMING, method="dewarp")(frames, STILL), FRAMES),
     "VibrationTracker": (lambda *frames: tracked(*frames, window=3), *FRAMES),
-    "VibrationTracker, columns": (lambda *frames: tracked(*frames, window=3, columns=64), *FRAMES),
     "VibrationTracker, steady": (lambda *frames: tracked(*frames, window=3, steady=1.0), *FRAMES),
     "calibrate_row_time": (
         lambda frames: rsv.calibrate_row_time(frames, 1000.0),
@@ -126,10 +116,6 @@ CASES = {
     "simulate_frames": (lambda scene: rsv.simulate_frames(scene, TIMING, VIBRATION), FRAMES[0]),
     "simulate_frames, still": (lambda scene: rsv.simulate_frames(scene, TIMING, STILL), FRAMES[0]),
     "restore_block": (lambda frames: rsv.restore_block(np.asarray(frames), TIMING), FRAMES),
-    "restore_block, constant": (
-        lambda frames: rsv.restore_block(np.asarray(frames), TIMING),
-        torch.ones(4, ROWS, COLUMNS),
-    ),
     "restore, no axis": (lambda frames: rsv.restore(frames, TIMING, REFUSED), FRAMES),
     "restore, no axis, last": (
         lambda frames: rsv.restore(frames, TIMING, REFUSED, channels="last"),
@@ -144,7 +130,7 @@ CASES = {
 
 
 ONLY_TENSORS = (
-    "AngularRates", "AngularRates.rotation", "FixedDewarp", "FreeMotion.displacement", "OffsetCurve",
+    "AngularRates", "FixedDewarp", "FreeMotion.displacement", "OffsetCurve",
     "RollingShutterVibration", "RollingShutterVibration, p=0", "RollingShutterVibration, still",
     "Vibration.displacement", "Vibration.mean_displacement", "Vibration.scaled", "VibrationStd",
     "offset_endpoint_error", "row_psf", "blur_rows", "blur_rows_adjoint", "RowVaryingBlur",

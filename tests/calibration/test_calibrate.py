@@ -107,14 +107,6 @@ def test_periodic_texture_is_not_detected_as_flicker():
     assert found.row_time == pytest.approx(row_time, rel=2e-3)
 
 
-def test_flicker_in_a_photograph():
-    scene = np.stack([0.5 * draw_scene(HEIGHT, WIDTH, seed) for seed in (5, 6, 7)])
-    grey = torch.stack([record_frames(sine, scene=channel)[0] for channel in scene])
-    found = calibrate_row_time(grey[None], 1000.0)
-    assert found.row_time == pytest.approx(ROW_TIME, rel=0.02)
-    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
-
-
 @pytest.mark.parametrize(("light", "reverse"), [(sine, False), (blink, True)])
 def test_readout_direction(light, reverse):
     frames = record_frames(light, frames=3, scene=shaded(), reverse=reverse)

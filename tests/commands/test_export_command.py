@@ -113,9 +113,7 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
         (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
         (("vibration.json", "frame.json"), "give --isd FILE"),
         (("vibration.json", "clip.gcsv", "--size", "300", "--num-frames", "2"), "--size must be HEIGHTxWIDTH"),
-        (("camera.json", "clip.gcsv"), "camera.json"),
         (("vibration.json", "no/clip.gcsv"), "does not exist"),
-        (("vibration.json", "frame.json", "--isd", "camera.json", "--frame", "-1"), "at least"),
     ],
 )
 def test_errors_are_one_line(place, monkeypatch, capsys, arguments, message):

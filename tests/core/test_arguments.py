@@ -21,6 +21,7 @@ BANDS = {"band_rows": 16, "band_step": 8, "search": 6}
 CURVES = (torch.zeros(1), torch.zeros(1, 2), torch.zeros(1, 2))  # times, offsets, residual of a MotionCheck
 FRAMES = torch.rand(2, 96, 64, generator=torch.Generator().manual_seed(0))
 VIBRATION = rsv.Vibration([1.0, 0.5], [130.0, 170.0])
+STARTS = TIMING.row_starts(1, 96)[0]
 ROLL = rsv.Vibration([1.0, 0.5, 1e-3], [130.0, 170.0, 26.0])
 STRIPES = (0.5 + 0.3 * torch.sin(0.5 * torch.arange(64.0)))[None, :, None].expand(1, 64, 32)
 PAIR, NO_TONE = torch.zeros(1, 3), torch.zeros(2, 1)
@@ -39,7 +40,7 @@ SWEPT = rsv.SweptTone(
 
 
 def blur():
-    return rsv.RowVaryingBlur(rsv.row_psf(VIBRATION, TIMING.row_starts(1, 96)[0], TIMING))
+    return rsv.RowVaryingBlur(rsv.row_psf(VIBRATION, STARTS, TIMING))
 
 
 def nested():
@@ -108,7 +109,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=1e-40), "flicker_frequency=1000 Hz is ambiguous"),
         (lambda: rsv.calibrate_row_time(STRIPES, 1000.0, frame_rate=5e-324), "flicker_frequency=1000 Hz is ambiguous"),
         (
-            lambda: rsv.row_psf(rsv.Vibration(1e6, 50.0), TIMING.row_starts(1, 96)[0], TIMING),
+            lambda: rsv.row_psf(rsv.Vibration(1e6, 50.0), STARTS, TIMING),
             r"point spread functions of 96 rows, .* GB .* free; check amplitude",
         ),
         (lambda: rsv.psf_figure(rsv.Vibration(1e6, 50.0), TIMING, 96), "point spread functions of 24 rows"),
@@ -140,6 +141,11 @@ def test_pixels_beyond_all_scales(value):
         (lambda: blur().A_adjoint(torch.tensor(1.0)), r"y must have shape \(..., R, W\)"),
         (lambda: blur()(FRAMES[0].to(torch.uint16)), "scene must be a floating-point tensor, got torch.uint16"),
         (lambda: blur()((100 * FRAMES[0]).to(torch.int64)), "scene must be a floating-point tensor, got torch.int64"),
+        (
+            lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, interpolation="nearest"),
+            "interpolation must be one of 'linear'",
+        ),
+        (lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, quadrature="simpson"), "quadrature must be one of 'midpoint'"),
         (lambda: rsv.row_psf(ROLL, TIMING.row_starts(1, 8), TIMING), "not defined with roll, zoom or a camera"),
         (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration"),
         (lambda: rsv.MotionCheck("x", torch.zeros(2), True, (), *CURVES), "before must be a tensor"),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
+from rsvib_torch.core.fourier import extend_rows, extended_length
 
 
 @pytest.mark.parametrize("hold", [0.0, 0.25])
@@ -34,15 +34,3 @@ def test_held_share_of_the_gap_contains_one_end_only():
     assert torch.equal(held[:, 64 : 64 + quarter], changed[:, 64 : 64 + quarter])
     assert not torch.equal(held[:, 64 + 2 * quarter :], changed[:, 64 + 2 * quarter :])
     assert extend_rows(rows, 64) is rows
-
-
-@pytest.mark.parametrize("minimum", [1, 8, 97, 1104, 2049])
-def test_fast_lengths(minimum):
-    length = fast_length(minimum)
-    assert minimum <= length <= minimum + 8 + minimum // 8
-    rest = length // 8
-    assert rest * 8 == length
-    for prime in (2, 3, 5, 7, 11):
-        while rest % prime == 0:
-            rest //= prime
-    assert rest == 1

@@ -35,19 +35,6 @@ def test_items_are_processed_in_parallel(two_threads):
     assert started == [2]
 
 
-def test_one_thread_is_a_loop():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        assert in_parallel(lambda _: threading.current_thread(), range(2), CPU) == [threading.main_thread()] * 2
-    finally:
-        torch.set_num_threads(before)
-    assert (
-        in_parallel(lambda _: threading.current_thread(), range(2), torch.device("meta"))
-        == [threading.main_thread()] * 2
-    )
-
-
 def test_errors_are_raised_and_no_further_item_begins(two_threads):
     both, begun = threading.Barrier(2, timeout=20), []
 

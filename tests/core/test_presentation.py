@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import pytest
@@ -12,7 +12,6 @@ from refusals import refuses
 from truth import Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.core.presentation import Result
 from rsvib_torch.core.text import measured_text, text_table
 
 TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=300)
@@ -130,11 +129,7 @@ def test_batches_print_as_a_compact_table(windows):
     assert [line.split()[:2] for line in lines[1:]] == [[str(i), axis] for i in range(3) for axis in "xy"]
     assert all(line.endswith("reliable") for line in lines[1:])
     assert len(windows.vibration.summary().splitlines()) == 7
-    long = text_table(("n",), [[str(i)] for i in range(1000)])
-    assert len(long.splitlines()) == 22
-    assert "… 980 more" in long
-    stacks = rsv.Vibration(torch.ones(2, 3, 2, 1), 50.0 * torch.ones(2, 3, 2, 1))
-    assert "1, 2" in str(stacks)
+    assert len(text_table(("n",), [[str(i)] for i in range(1000)]).splitlines()) == 22
 
 
 def test_no_result_prints_tensors(results, monkeypatch):
@@ -252,22 +247,3 @@ def test_a_saved_detection_is_a_vibration_json(detection, windows, frames, tmp_p
     refuses(lambda: rsv.read_vibration(path), r"a batch of detections; read it with DetectionResult\.load")
     refuses(lambda: rsv.write_vibration(path, windows), r"result is a batch of shape \(3,\): pass one")
     refuses(lambda: rsv.write_vibration(path, replace(detection, timing=None)), "timing unknown: pass timing=")
-
-
-def test_the_description_of_a_stack_is_one_line():
-    info = rsv.StackInfo(
-        (900, 3, 448, 256), "uint16", 4095.0, tuple(0.1 * i for i in range(900)), (300.0, 300.0, "inch")
-    )
-    assert repr(info) == (
-        "900 frames of 448 x 256 px, uint16, 3 channels, full scale 4095, frame times 0 … 89.9 s, 300 x 300 px per inch"
-    )
-    assert str(rsv.StackInfo((2, 8, 9), "float32", None)) == "2 frames of 8 x 9 px, float32"
-
-
-def test_other_result_types_print_their_shapes():
-    @dataclass(frozen=True, eq=False, repr=False)
-    class Other(Result):
-        values: torch.Tensor
-        name: str
-
-    assert str(Other(torch.zeros(2, 3), "one")) == "Other\n  values: tensor (2, 3)\n  name: one"

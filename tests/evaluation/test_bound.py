@@ -210,18 +210,12 @@ def test_random_scene_with_a_flat_spectrum():
     np.testing.assert_allclose((bounds[1] / bounds[0]).numpy(), expected, rtol=0.02)
 
 
-def test_bound_follows_noise_and_orientation():
+def test_bound_is_proportional_to_the_noise():
     scene = torch.from_numpy(smooth_scene(332, 80))
     motion = rsv.Vibration([1.3, 2.1], [50.0, 30.0], [0.4, 1.3], [20.0, -30.0])
     bound = cramer_rao_bound(scene, TIMING, motion, noise=0.01, frame_size=(280, 32))
     double = cramer_rao_bound(scene, TIMING, motion, noise=0.02, frame_size=(280, 32))
     torch.testing.assert_close(values_of(double), 2 * values_of(bound))
-    turned = replace(TIMING, scan_axis="x", readout_direction="reverse")
-    # the same camera, transposed and read in reverse
-    swapped = rsv.Vibration([2.1, 1.3], [30.0, 50.0], [1.3 + np.pi, 0.4], [30.0, 20.0])
-    aside = cramer_rao_bound(scene.flip(0).T.contiguous(), turned, swapped, noise=0.01, frame_size=(32, 280))
-    for name in FIELDS:
-        torch.testing.assert_close(getattr(aside, name).flip(0), getattr(bound, name), rtol=1e-6, atol=0)
 
 
 def test_unknown_acceleration_increases_the_bound():

@@ -218,11 +218,6 @@ def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
     refuses(lambda: live.VideoOutput(tmp_path / "video.gif", 30.0), r"a live video is written to \.mp4")
 
 
-def test_preview_without_windows_names_the_page():
-    with pytest.raises(ValueError, match="has no windows; use --page 8080"):
-        live.PreviewOutput()
-
-
 class Tracked:
     """Offsets of rows by a known displacement, as a tracked frame."""
 

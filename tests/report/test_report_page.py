@@ -146,6 +146,9 @@ def test_page_has_all_sections(page):
         "Point spread functions",
         "Sharpness: MTF of slanted edges",
         "40 µs",
+        "2031-05-07 11:30:05+00:00",
+        "rsvib_torch 1.2.3",
+        COMMAND,
     ):
         assert part in text
     ranges = [attributes for _, attributes in page[2].tags if attributes.get("type") == "range"]
@@ -317,13 +320,6 @@ def test_page_without_restoration_has_no_pairs_but_what_was_tried(tmp_path):
     sources = [attributes["src"] for tag, attributes in reader.tags if tag == "img"]
     assert len(sources) == len(set(sources))  # no image twice
     assert len(sources) == 1 + 2 + sum(name.endswith(".png") for name in files)  # frame, frames in turn, figures
-
-
-def test_page_states_how_it_was_made(page):
-    text = "".join(page[2].text).split("This report")[1]
-    for part in ("2031-05-07 11:30:05+00:00", "rsvib_torch 1.2.3", COMMAND):
-        assert part in text
-    assert "x" not in [attributes.get("src") for _, attributes in page[2].tags]
 
 
 def colours(block):

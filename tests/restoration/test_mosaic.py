@@ -188,9 +188,8 @@ def test_gradient_of_the_least_squares_solution():
     )
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_gradients_reach_the_measured_pixels(frames, count):
-    values = frames[:count, :32, :32].double().requires_grad_()
+def test_gradients_reach_the_measured_pixels(frames):
+    values = frames[:2, :32, :32].double().requires_grad_()
     (gradient,) = torch.autograd.grad(restored(values, noise=0.01).sum(), values)
     assert torch.isfinite(gradient).all()
     # pixels that are all brighter by one make the image brighter by one

@@ -246,7 +246,7 @@ def test_saturated_pixels_do_not_lower_the_noise_level(share):
 @pytest.mark.parametrize("method", ["dewarp", "banded"])
 def test_methods_without_saturation_use_the_saturated_values(lamps, method):
     counts = lamps[1]
-    kept = restore(counts, TIMING, MOTION.vibration(), method=method, full_scale=4095)
+    kept = VibrationRestorer(TIMING, method=method, full_scale=4095)(counts, MOTION.vibration())
     floats = restore(counts / 4095, TIMING, MOTION.vibration(), method=method)
     torch.testing.assert_close(kept, floats, rtol=0, atol=1e-6)
     back = (kept * 4095).round()
@@ -365,3 +365,32 @@ def test_transforms_that_are_not_supported_are_refused_in_one_line(method):
         torch.func.vmap(restored)(frames[None])
     with suppress(TypeError):  # some methods have it
         assert torch.func.jvp(restored, (frames,), (frames,))[1].shape == frames.shape
+
+
+@pytest.mark.parametrize("method", ["exact", "banded", "richardson-lucy"])
+def test_blur_of_long_exposures_is_removed(method):
+    timing, scene = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048), draw_scene(272, 240, 21)
+    frames = torch.from_numpy(take_frames(scene, timing, Motion(), 1, 0.002)).float()
+    sharp, warped = (
+        decibel(restore(frames, timing, Motion().vibration(), method=name, check=False), crop(scene))
+        for name in (method, "dewarp")
+    )
+    assert sharp > warped + 4
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "error"),
+    [
+        ("exact", {"noise": 0.05}, 5e-3),
+        ("banded", {"noise_to_signal": 0.1}, 1e-9),
+        ("richardson-lucy", {"iterations": 5}, 1e-9),
+    ],
+)
+def test_flux_is_conserved(method, options, error):
+    lamp = torch.zeros(1, 128, 128, dtype=torch.float64)
+    lamp[0, 60:70, 60:66] = torch.rand(10, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    still = restore(lamp, TIMING, Vibration.still(), method=method, check=False, **options)
+    assert still.sum().item() == pytest.approx(lamp.sum().item(), rel=error)
+    assert (still - lamp).abs().max() > 1e-3
+    flat = torch.full((1, 96, 80), 0.37, dtype=torch.float64)
+    assert (restore(flat, TIMING, MOTION.vibration(), method=method, check=False, **options) - 0.37).abs().max() < 1e-6

@@ -75,23 +75,3 @@ def test_fast_path_agrees_with_the_plain_path(reach):
     repeated = SceneSolver(observation, precision, Partition(chunk=100), keep=True)
     for _ in range(2):
         torch.testing.assert_close(repeated.fit(data), plain.detach())
-
-
-def test_gradient_of_the_data_through_interpolated_factors():
-    """The solution is linear in the data: its gradient is the adjoint of the solution operator."""
-    rows, length = 40, 800
-    taps = torch.full((1, rows, 6, 1), 1 / 6, dtype=torch.float64)
-    zeros = torch.zeros(1, rows, dtype=torch.float64)
-    kernels = RowKernels(torch.arange(rows)[None] - 2, taps, zeros, zeros[..., None], zeros + 1)
-    observation = Observation(kernels, rows, length, torch.float64)
-    u = torch.fft.rfftfreq(length, dtype=torch.float64)[None]
-    precision = smooth_prior(u).precision(torch.full_like(u, 0.01))
-    solver = SceneSolver(observation, precision, Partition(chunk=90))
-    generator = torch.Generator().manual_seed(5)
-    data, other = torch.randn(2, 1, 1, 1, rows, length, dtype=torch.float64, generator=generator)
-    data.requires_grad_()
-    solution = solver.fit(data)
-    weights = torch.randn(solution.shape, dtype=torch.complex128, generator=generator)
-    (gradient,) = torch.autograd.grad((weights * solution).real.sum(), data)
-    expected = (weights * solver.fit(other)).real.sum()
-    torch.testing.assert_close((gradient * other).sum(), expected)

@@ -152,7 +152,7 @@ def test_run_stops_if_the_input_is_removed_and_can_be_resumed(whole, tmp_path):
     assert read_manifest(report.manifest).bad_frames == {}
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS])
 def test_file_systems_without_locks_are_written_to_with_a_warning(whole, tmp_path, monkeypatch, number):
     def refuse(file, operation):
         raise OSError(number, os.strerror(number))

@@ -119,14 +119,6 @@ def test_iterator_yields_windows_in_order(place):
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
 
 
-def test_one_image_from_every_window(place, tmp_path):
-    report = process_small(place / "frames.tif", tmp_path / "joint.npy", restoration={"joint": True}, window=5)
-    assert report.frames == report.windows == 4
-    joint = np.load(tmp_path / "joint.npy") / 4095
-    assert joint.shape == (4, HEIGHT, WIDTH)
-    assert min(decibel(image, STILL, 12) for image in joint) > 28
-
-
 def test_stack_is_restored_with_detections_of_an_earlier_run(place, tmp_path):
     shared = {name: OPTIONS[name] for name in ("window", "detection", "workers")}
     detect_stack(place / "frames.tif", tmp_path / "manifest.json", TIMING, full_scale=4095, **shared)

@@ -292,11 +292,6 @@ def test_missing_pixels_and_channels(steady):
     assert torch.isfinite(tracked.restored).all()
 
 
-def test_options_of_another_method_are_refused():
-    with pytest.raises(TypeError, match="has no option 'prior'"):
-        rsv.VibrationTracker(TIMING, prior="edges")
-
-
 def test_wrong_frames_and_times_are_refused(steady):
     frames, _ = steady
     with pytest.raises(ValueError, match="must not have frame_start_times: pass the time of each frame to update"):
