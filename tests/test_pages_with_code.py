@@ -27,21 +27,14 @@ def run_page(name, least_blocks):
     return names
 
 
-@pytest.fixture(scope="module")
-def pipeline():
-    return run_page("ml_pipeline.md", 8)
-
-
-def test_shapes_on_the_machine_learning_page(pipeline):
+def test_machine_learning_page():
+    """Its detector measures the vibration, and its restorer recovers the scene."""
+    pipeline = run_page("ml_pipeline.md", 8)
     assert pipeline["features"].shape == (2, 8, *pipeline["frames"].shape[-2:])
     assert pipeline["vibration"].amplitude.shape == (4, 2, 1)
     assert pipeline["moved_points"].shape == (4, 2, 2)
     assert not torch.equal(pipeline["moved_boxes"], pipeline["boxes"])
     assert pipeline["taken"].shape == (4, 2, 3, 96, 64)
-
-
-def test_model_on_the_machine_learning_page_restores(pipeline):
-    """Its detector measures the vibration, and its restorer recovers the scene."""
     frames, truth = pipeline["frames"], pipeline["truth"]
     found = pipeline["model"].corrector.detector(frames).vibration[0]
     torch.testing.assert_close(found.amplitude, truth.amplitude, rtol=0, atol=0.2)

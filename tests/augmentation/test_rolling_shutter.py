@@ -1,8 +1,6 @@
 """The augmentation compared with the independent simulator, and in containers of Kornia."""
 
-import copy
 import math
-import pickle
 
 import kornia.augmentation as kornia_augmentation
 import numpy as np
@@ -340,17 +338,6 @@ def test_workers_sample_independently_and_reproducibly():
     assert len(amplitudes[:, 0, 0].unique()) == 8
     again, _ = run(2)
     assert torch.equal(images, again)
-
-
-def test_copies_sample_the_same_parameters():
-    augmentation = RollingShutterVibration(TIMING, tones=2)
-    images = torch.rand(2, 1, 40, 32)
-    expected = augmentation(images)
-    for other in (copy.deepcopy(augmentation), pickle.loads(pickle.dumps(augmentation))):
-        assert torch.equal(other(images, params=augmentation._params), expected)
-        other.load_state_dict(augmentation.state_dict())
-    assert "RollingShutterVibration(" in repr(augmentation)
-    assert "frequency=((20.0, 200.0)" in repr(augmentation)
 
 
 def test_in_a_chain_with_other_augmentations():

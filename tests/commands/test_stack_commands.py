@@ -108,9 +108,6 @@ def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypa
         assert rsvib(*command(place, out)) == 130
     assert "--resume continues" in capsys.readouterr().err
     assert "a run was interrupted here after 4 windows; resume it (--resume)" in refused(capsys, *command(place, out))
-    assert "cannot resume: settings.window was 4, now it is 5" in refused(
-        capsys, *command(place, out, "--resume", "--window", 5)
-    )
     for _ in range(2):  # the second time it is complete
         assert rsvib(*command(place, out, "--resume")) == 0
         assert "windows complete before this run: 4" in capsys.readouterr().out

@@ -83,11 +83,6 @@ def test_without_roll_the_result_is_the_same():
     assert torch.equal(found.std.frequency, without.std.frequency)
 
 
-def test_windows_have_the_same_axes(rolling):
-    found = detect_vibration(rolling[1], TIMING, window=3, window_step=1, tones=1)
-    assert found.vibration.amplitude.shape[:2] == (2, 3)
-
-
 def test_selected_columns_are_measured_without_roll(rolling):
     assert detect_vibration(rolling[1], TIMING, columns=128).vibration.num_axes == 2
 

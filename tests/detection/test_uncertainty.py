@@ -138,24 +138,6 @@ def test_exact_displacements_have_finite_standard_deviations():
     assert 0 < float(stated.displacement_std[0, 0]) < 0.01
 
 
-@pytest.mark.parametrize("frequency", [17.0, 31.0, 55.0])
-def test_sensitivity_of_one_tone_in_two_frames(frequency):
-    """A sin(pi f T) is what two frames determine, so that d ln A / d ln T = -pi f T cot(pi f T)."""
-    truth = mean_sine([2.0], [frequency], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
-    fit = fitted(measured(truth, TIMING), [frequency])
-    found = timing_sensitivity(fit, TIMING, 2, ROWS)
-    angle = math.pi * frequency * TIMING.frame_period
-    assert float(found.amplitude_by_frame_rows[0, 0, 0]) == pytest.approx(-angle / math.tan(angle), rel=1e-3)
-    assert float(found.frequency_by_frame_rows[0, 0, 0]) == pytest.approx(0.0, abs=1e-6)
-    assert float(found.frequency_by_row_time[0, 0, 0]) == pytest.approx(-1.0, rel=1e-5)
-    assert float(found.amplitude_by_row_time[0, 0, 0]) == pytest.approx(0.0, abs=1e-5)
-    x = math.pi * frequency * TIMING.exposure_time  # A sinc(f T_e) is what the rows determine
-    assert float(found.amplitude_by_exposure_rows[0, 0, 0]) == pytest.approx(1 - x / math.tan(x), rel=1e-3)
-    for values in vars(found).values():
-        assert values.shape == (1, 2, 1)
-        assert float(values[0, 1, 0]) == 0.0  # no tone along y
-
-
 @pytest.mark.parametrize("name", ["row_time", "frame_rows", "exposure_rows"])
 @pytest.mark.parametrize("times", [None, (0.0, 1 / 24, 3 / 24, 4 / 24)])
 def test_sensitivity_agrees_with_fits_of_other_timings(name, times):

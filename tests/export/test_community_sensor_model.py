@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from camera_truth import TrueCamera
 from refusals import refuses
 from usgscsm_formulas import FrameModel, LineScanModel
@@ -233,13 +232,3 @@ def test_uniform_image_motion_and_zoom(tmp_path):
     zoom = rsv.Vibration((0.0, 0.0, 0.0, 1e-3), (1.0, 1.0, 1.0, 40.0))
     with pytest.raises(ValueError, match="no sensor model represents"):
         rsv.write_isd(tmp_path / "zoom.json", zoom, TIMING, still_isd(SLOW))
-
-
-def test_files_are_the_same_for_a_free_motion(tmp_path):
-    """A free motion through samples of the vibration gives the same model."""
-    times = torch.linspace(-1e-3, 8e-3, 400, dtype=torch.float64)
-    free = rsv.FreeMotion.through(times, SLOW.vibration().displacement(times)[:, :2])
-    still = still_isd(SLOW)
-    model, sensor, _ = written(tmp_path / "frame.json", free, TIMING, still)
-    assert model == "frame"
-    assert max(errors(sensor, FrameModel(still), SLOW)[:2]) < LIMIT

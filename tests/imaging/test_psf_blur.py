@@ -158,19 +158,6 @@ def test_gradients(interpolation):
     assert torch.autograd.gradcheck(lambda g: blur_rows_adjoint(g, psf, (9, 8)), frame)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_module(dtype):
-    psf = small_psf("cubic")
-    blur = RowVaryingBlur(psf, frame_width=18, origin=(3, 4))
-    scene = noise(24, 28, dtype=dtype)
-    frame = blur(scene)
-    assert frame.dtype == dtype
-    assert torch.equal(frame, blur_rows(scene, psf, frame_width=18, origin=(3, 4)))
-    assert torch.equal(blur.adjoint(frame, (24, 28)), blur_rows_adjoint(frame, psf, (24, 28), origin=(3, 4)))
-    assert {name for name, _ in blur.named_buffers()} == {"first_tap", "weights"}
-    torch.testing.assert_close(frame.double(), blur(scene.double()), rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_gradients_to_the_vibration(interpolation):
     timing = SensorTiming(row_time=1e-3, exposure_rows=3, frame_rows=12)

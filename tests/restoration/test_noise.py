@@ -149,16 +149,6 @@ def test_floor_is_below_texture(steepness, level, texture_adds):
     assert 0.6 * level < floor_of(image) < 0.5 * (level + estimate_noise(image).item())
 
 
-def test_floor_excludes_squares_with_ignored_pixels():
-    image = with_noise(fractal(1.5, 0.5), 0.01)
-    hidden = torch.zeros(image.shape, dtype=torch.bool)
-    hidden[:, 200:] = True
-    filled = image.masked_fill(hidden, 0.5)
-    assert noise_floor(filled, hidden).sqrt().item() == pytest.approx(0.01, rel=0.1)
-    assert noise_floor(filled).sqrt().item() < 0.85 * 0.01
-    assert noise_floor(filled, torch.ones_like(hidden)).isnan()
-
-
 def test_floor_of_small_and_empty_images():
     assert noise_floor(torch.rand(2, 63, 200)).isnan().all()
     assert noise_floor(torch.zeros(64, 64)) == 0

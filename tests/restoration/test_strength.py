@@ -60,22 +60,6 @@ def test_estimated_strength_is_close_to_the_best(name, rows, noise, given, joint
     assert max(by_hand.values()) - min(by_hand.values()) > 0.5
 
 
-def test_interpolation_error_depends_on_the_blur_of_each_frame():
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2048)
-    frames = torch.from_numpy(take_frames(texture(0.7), timing, MOTION, 2, 0.001)).float()[:, None]
-    height = frames.shape[-2]
-    motion = frame_motion(MOTION.vibration().expanded(1), timing, 2, height)
-    prior = fit_prior(frames[None], motion, torch.full((1, 2), 0.001), 256)
-    assert prior.interpolation_power.shape == (1, 2, 129)
-    times = (2048 * np.arange(2)[:, None, None] + np.arange(height)[:, None] + np.arange(0, 200, 5)) * timing.row_time
-    across = MOTION.displacement(times)[..., 1]
-    path = (across.max(-1) - across.min(-1)).mean(-1)  # px, length of the blur of the rows in each frame
-    assert path[0] < 0.8 * path[1]
-    assert prior.interpolation_power[0, 0].mean() > 3 * prior.interpolation_power[0, 1].mean()
-    later = prior.of(torch.tensor([0]), torch.tensor([[1]]))
-    torch.testing.assert_close(later.interpolation_power[0, 0], prior.interpolation_power[0, 1])
-
-
 @pytest.mark.parametrize("count", [1, 2])
 def test_power_of_pure_noise_is_close_to_zero(count):
     noise = torch.randn(count, 1, 512, 512, generator=torch.Generator().manual_seed(0))

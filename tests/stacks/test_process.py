@@ -130,13 +130,6 @@ def test_stack_is_restored_with_detections_of_an_earlier_run(place, tmp_path):
         process_small(place / "frames.tif", tmp_path / "other.tif", given=manifest.detections(), window=4)
 
 
-def test_unknown_options_are_refused(place, tmp_path):
-    with pytest.raises(TypeError, match="unknown option 'windows'; the options are full_scale, memory, workers"):
-        next(rsv.iterate_stack(place / "frames.tif", TIMING, windows=3))
-    with pytest.raises(TypeError, match="unknown option 'force'"):
-        detect_stack(place / "frames.tif", tmp_path / "manifest.json", TIMING, force=True)
-
-
 @pytest.mark.parametrize("choice", ["pass", "skip"])
 def test_bad_frames_are_listed_and_the_others_restored(place, tmp_path, choice):
     counts = tifffile.imread(place / "frames.tif").astype(np.float32) / 4095
