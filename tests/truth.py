@@ -6,6 +6,7 @@ with the prefilter of SciPy, and the exposure a sum over Gauss-Legendre nodes.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -105,19 +106,10 @@ def take_frames(
     return frames + noise * np.random.default_rng(seed).standard_normal(frames.shape)
 
 
-def recorded(
-    size: tuple[int, int],
-    timing: SensorTiming,
-    motion: Motion,
-    num_frames: int = 2,
-    noise: float = 0.0,
-    *,
-    seed: int = 0,
-    margin: int = MARGIN,
-) -> Tensor:
-    """Frames (T, H, W), float32, of a scene that is drawn from the seed, which is that of the noise as well."""
+def recorded(size: tuple[int, int], *camera: Any, seed: int = 0, margin: int = MARGIN) -> Tensor:
+    """``take_frames``, float32, of a scene that is drawn from the seed, which is that of the noise as well."""
     scene = draw_scene(size[0] + 2 * margin, size[1] + 2 * margin, seed)
-    return torch.from_numpy(take_frames(scene, timing, motion, num_frames, noise, seed=seed, margin=margin)).float()
+    return torch.from_numpy(take_frames(scene, *camera, seed=seed, margin=margin)).float()
 
 
 def crop(scene: Array, margin: int = MARGIN) -> Array:

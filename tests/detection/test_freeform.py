@@ -200,13 +200,6 @@ def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     assert (found.std_seen.numpy() < 0.01).all()
     assert (found.unseen > 5 * found.std_seen).all()
     assert found.reliable.all()
-    best, here = (
-        decibel(
-            rsv.restore(frames, TIMING, FreeMotion.from_samples(times.ravel(), d.reshape(-1, 2))).numpy(), crop(scene)
-        )
-        for d in (truth, truth + observable_error)
-    )
-    assert here > best - 0.2
 
 
 @pytest.mark.parametrize(("size", "seed"), [(128, 4), (256, 3)])

@@ -1,5 +1,6 @@
 """Verdict on restorations of frames of an independent camera, with correct, wrong and spurious vibrations."""
 
+import functools
 import math
 import warnings
 
@@ -41,14 +42,7 @@ def scaled_motion(scale=1.0, frequency=FREQUENCY):
 
 @pytest.fixture(scope="module", name="scene")
 def make_scene():
-    drawn = {}
-
-    def draw(name):
-        if name not in drawn:
-            drawn[name] = SCENES[name]()
-        return drawn[name]
-
-    return draw
+    return functools.cache(lambda name: SCENES[name]())
 
 
 TAKEN = {}
