@@ -14,6 +14,7 @@ from rsvib_torch.core.reason import Reason
 from rsvib_torch.evaluation import city_and_fields, resolution_chart
 from rsvib_torch.restoration import RestorationWarning, judge_restoration, predict_noise_gain, restore
 from rsvib_torch.restoration.verdict.judge import outcome_of_pair
+from rsvib_torch.restoration.verdict.pairs import pairs_to_judge
 
 HEIGHT, WIDTH, MARGIN = 512, 192, 40
 FREQUENCY = (71.0, 113.0)
@@ -369,6 +370,11 @@ def test_reasons_name_the_axes_of_the_outcome():
     ]
     assert {one.code for one in outcome((0.0, 0.0), (0.0, 0.0), offset=(0.0, 0.0))[1]} == {"displaced_alike"}
     assert {one.code for one in outcome((0.0, 0.0), (0.0, 0.0), resolution=(math.inf, math.inf))[1]} == {"no_contrast"}
+
+
+def test_pairs_to_judge():
+    assert pairs_to_judge(4, True) == [(2, 0), (2, 1), (2, 3)]
+    assert pairs_to_judge(9, False, 3) == [(0, 1), (4, 5), (7, 8)]
 
 
 @pytest.mark.parametrize(
