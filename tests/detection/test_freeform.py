@@ -110,23 +110,18 @@ def test_two_frames_are_enough_for_a_slow_motion(scene):
     assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.02).all()
 
 
-@pytest.fixture(scope="module", name="first_frames")
-def make_first_frames(frames):
-    return frames[:3]
-
-
 @pytest.fixture(scope="module", name="first_found")
-def make_first_found(first_frames):
-    return rsv.detect_motion(first_frames, TIMING)
+def make_first_found(frames):
+    return rsv.detect_motion(frames[:3], TIMING)
 
 
-def test_missing_pixels_do_not_change_the_result(first_frames, first_found):
+def test_missing_pixels_do_not_change_the_result(frames, first_found):
     """Bright spots of dirt on the sensor do not move with the scene."""
     hole = np.zeros((HEIGHT, WIDTH), dtype=bool)
     for top, left in np.random.default_rng(1).integers(0, (HEIGHT - 12, WIDTH - 12), (40, 2)):
         hole[top : top + 12, left : left + 12] = True
     assert 0.08 < hole.mean() < 0.3
-    dirty = torch.where(torch.from_numpy(hole), 0.9 + 0.1 * torch.rand(HEIGHT, WIDTH), first_frames)
+    dirty = torch.where(torch.from_numpy(hole), 0.9 + 0.1 * torch.rand(HEIGHT, WIDTH), frames[:3])
     truth = Jitter().displacement(first_found.times.numpy())
 
     def error(result):
@@ -139,9 +134,9 @@ def test_missing_pixels_do_not_change_the_result(first_frames, first_found):
     assert torch.equal(holes.displacement, masked.displacement)
 
 
-def test_batches_and_arrays_equal_single_tensors(first_frames, first_found):
-    other = first_frames.flip(-1).contiguous()
-    both = rsv.detect_motion(torch.stack([first_frames, other])[:, :, None].numpy(), TIMING)
+def test_batches_and_arrays_equal_single_tensors(frames, first_found):
+    other = frames[:3].flip(-1).contiguous()
+    both = rsv.detect_motion(torch.stack([frames[:3], other])[:, :, None].numpy(), TIMING)
     for index, single in enumerate((first_found, rsv.detect_vibration(other, TIMING, model="free"))):
         one = both[index]
         for name in ("times", "displacement", "std", "std_seen", "unseen", "unexplained", "reliable"):
@@ -153,10 +148,10 @@ def test_batches_and_arrays_equal_single_tensors(first_frames, first_found):
     assert both.motion.displacement(both.times[None]).shape == (2, 3, 32, 2)
 
 
-def test_options_of_tones_are_refused_by_other_models(first_frames):
+def test_options_of_tones_are_refused_by_other_models(frames):
     with pytest.raises(TypeError, match="model='free' has no option 'tones'; its options are"):
-        rsv.detect_vibration(first_frames, TIMING, model="free", tones=2)
-    refuses(lambda: rsv.detect_vibration(first_frames, TIMING, model="spline"), "model must be one of")
+        rsv.detect_vibration(frames[:3], TIMING, model="free", tones=2)
+    refuses(lambda: rsv.detect_vibration(frames[:3], TIMING, model="spline"), "model must be one of")
     refuses(lambda: rsv.VibrationDetector(TIMING, model="free"), "model must be one of 'tones'; got 'free'")
 
 
