@@ -308,15 +308,12 @@ def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
 def test_image_motion_of_almost_half_a_frame():
     """Only the area visible in both frames is used; the blur by the image motion is small in short exposures."""
     camera = SensorTiming(20.52e-6, 10, 1100)
-    period = camera.frame_period
-    for move in ((0.45 * 700 / period, 0.0), (-0.2 * 700 / period, -0.45 * 1000 / period)):
-        motion = Motion((1.2, 0.9), (330.0, 260.0), (0.4, -1.0), move)
-        margin = 640
-        scene = draw_scene(1000 + 2 * margin, 700 + 2 * margin, 53)
-        frames = torch.from_numpy(take_frames(scene, camera, motion, 2, 0.003, seed=3, margin=margin))
-        result = detect_vibration(frames.float(), camera)
-        check(result, motion, 0.1, 2.0, 0.01)
-        torch.testing.assert_close(result.vibration.image_motion, torch.tensor(move).double(), rtol=0, atol=0.5)
+    move, margin = (-0.2 * 700 / camera.frame_period, -0.45 * 1000 / camera.frame_period), 640
+    motion = Motion((1.2, 0.9), (330.0, 260.0), (0.4, -1.0), move)
+    frames = recorded((1000, 700), camera, motion, 2, 0.003, seed=53, margin=margin)
+    result = detect_vibration(frames, camera)
+    check(result, motion, 0.1, 2.0, 0.01)
+    torch.testing.assert_close(result.vibration.image_motion, torch.tensor(move).double(), rtol=0, atol=0.5)
 
 
 def test_uneven_frame_times_measure_a_blind_frequency(paper_camera):

@@ -15,10 +15,10 @@ from attacks.trial import FAILURES
 ATTACKS = {
     "concurrent": (4, 1.0),
     "damaged_parts": (7, 1.0),
-    "inputs": (20, 0.0),
-    "journals": (16, 0.0),
+    "inputs": (12, 0.0),
+    "journals": (10, 0.0),
     "kills": (9, 1.0),
-    "links": (16, 0.0),
+    "links": (8, 0.0),
     "live_sessions": (2, 0.0),
     "power_losses": (9, 1.0),
 }
