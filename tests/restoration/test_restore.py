@@ -25,7 +25,7 @@ from rsvib_torch.restoration import (
 )
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=448)
-MOTION = Motion((2.1, 3.2), (71.0, 113.0), (0.4, 1.3))
+MOTION = Motion((2.1, 3.2), (71.0, 105.0), (0.4, 1.3))
 NOISE = 0.005
 
 
