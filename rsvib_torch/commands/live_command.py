@@ -114,7 +114,10 @@ def live_session(given: LiveOptions) -> Answer:
     inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
     check_new([*files, *saved], given.overwrite, inputs)
     for path in [*files, *saved]:
-        check_writable(path)
+        is_store = path.suffix == ".zarr"
+        if is_store and path.is_dir() and not (path / "zarr.json").is_file():  # it would be replaced with all its files
+            raise FileExistsError(f"cannot write {path}: it exists and is not a Zarr group; choose another name")
+        check_writable(path, folder=is_store)
     method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
     restoration = {
         name: value

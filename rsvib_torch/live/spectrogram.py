@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.atomic import whole_folder
+from rsvib_torch.core.atomic import whole
 from rsvib_torch.core.checks import check_number, needed_package
 from rsvib_torch.core.tables import Array
 from rsvib_torch.detection.spectrum import BLIND_GAIN, Offsets
@@ -125,7 +125,7 @@ def save_spectrogram(path: Path, spectrogram: Spectrogram) -> list[Path]:
     figure.colorbar(image, ax=panels, label="amplitude (px)")
     picture, folder = path.with_name(path.name + ".png"), path.with_name(path.name + ".zarr")
     save_figure(figure, picture)
-    with whole_folder(folder) as part:
+    with whole(folder, "tree") as part:
         group = zarr.open_group(store=str(part), mode="w", zarr_format=3)
         units = {"amplitude": "px", "time": "s", "frequency": "Hz"}
         arrays = {"amplitude": amplitude, "time": times, "frequency": frequencies}

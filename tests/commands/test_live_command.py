@@ -1,6 +1,7 @@
 """rsvib live: from a file or a pipe to a video, a pipe, and a spectrogram."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -42,6 +43,10 @@ def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
     assert restored.shape == raw.shape
     assert min(decibel(frame, still) for frame in restored[4:]) > max(decibel(frame, still) for frame in raw[4:]) + 6
     assert "results exist already" in refused(capsys, *arguments)
+    assert rsvib(*arguments, "--overwrite") == 0  # the spectrogram is replaced
+    shutil.rmtree(tmp_path / "spectrum.zarr")
+    (tmp_path / "spectrum.zarr").mkdir()
+    assert "is not a Zarr group" in refused(capsys, *arguments, "--overwrite")
 
 
 def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):
