@@ -298,15 +298,20 @@ class Result(Summarised):
         return frame
 
     def to_xarray(self) -> "xarray.Dataset":
-        """The tensors as an ``xarray.Dataset`` with names of dimensions, units, and the coordinate ``axis``.
+        """The tensors as an ``xarray.Dataset`` with names of dimensions, and units.
 
-        Tensors of a result within this one have the name of its field in front (``std_amplitude``); those of a motion
-        have their own. ``index`` counts the results of a batch.
+        The coordinates are ``axis`` and, from 1 on as in tables, ``tone``. Tensors of a result within this one have the
+        name of its field in front (``std_amplitude``); those of a motion have their own. ``index`` counts the results
+        of a batch.
         """
         package = needed_package("xarray", "to_xarray", "tables")
         variables = dict(self._variables(()))
-        axes = [values.shape[names.index("axis")] for names, values, _ in variables.values() if "axis" in names]
-        coordinates = {"axis": np.array(AXIS_NAMES[: axes[0]], object)} if axes else {}
+        sizes: dict[str, int] = {}
+        for names, values, _ in variables.values():
+            sizes |= zip(names, values.shape, strict=True)
+        coordinates = {"axis": np.array(AXIS_NAMES[: sizes["axis"]], object)} if "axis" in sizes else {}
+        if "tone" in sizes:
+            coordinates["tone"] = np.arange(1, sizes["tone"] + 1)
         dataset: xarray.Dataset = package.Dataset(variables, coordinates)
         return dataset
 

@@ -120,8 +120,8 @@ def test_dataset_has_names_units_and_reads_back_from_zarr(tmp_path):
     dataset = rsv.DetectionResult.stacked([found, found]).to_xarray()
     assert dataset.amplitude.dims == ("index", "axis", "tone")
     assert dataset.amplitude.attrs["units"].startswith("px")
-    assert float(dataset.frequency.sel(axis="x", tone=1)[0]) == 145.0
-    assert float(dataset.std_amplitude.sel(axis="y", tone=0)[1]) == 0.01
+    assert float(dataset.frequency.sel(axis="x", tone=2)[0]) == 145.0
+    assert float(dataset.std_amplitude.sel(axis="y", tone=1)[1]) == 0.01
     assert dataset.offsets.dims == ("index", "pair", "row", "axis")
     assert dataset.reasons.sel(axis="y").values.tolist() == ["unspecified"] * 2
     with warnings.catch_warnings():
