@@ -19,7 +19,7 @@ from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
-from rsvib_torch.core.atomic import check_writable
+from rsvib_torch.core.atomic import check_tree, check_writable
 from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import number_of
 from rsvib_torch.core.validation import Count, NotNegative, options
@@ -114,10 +114,9 @@ def live_session(given: LiveOptions) -> Answer:
     inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
     check_new([*files, *saved], given.overwrite, inputs)
     for path in [*files, *saved]:
-        is_store = path.suffix == ".zarr"
-        if is_store and path.is_dir() and not (path / "zarr.json").is_file():  # it would be replaced with all its files
-            raise FileExistsError(f"cannot write {path}: it exists and is not a Zarr group; choose another name")
-        check_writable(path, folder=is_store)
+        if path.suffix == ".zarr":
+            check_tree(path, "zarr.json", "Zarr group")
+        check_writable(path, folder=path.suffix == ".zarr")
     method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
     restoration = {
         name: value

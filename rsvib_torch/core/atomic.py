@@ -152,6 +152,12 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
+def check_tree(path: Path, marker: str, what: str) -> None:
+    """Raise a ``FileExistsError`` unless ``path``, which is replaced with all its files, has the file ``marker``."""
+    if path.exists() and not (path / marker).is_file():
+        raise FileExistsError(f"cannot write {path}: it exists and is not a {what}; choose another name")
+
+
 def check_writable(path: Path, *, folder: bool = False) -> None:
     """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing."""
     check_target(path, "folder" if folder else "file")

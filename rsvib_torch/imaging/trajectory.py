@@ -156,11 +156,9 @@ def shown_by_tones(
     Returns:
         Frame rows (B, G, S) and displacements along x (B, G, S) in px, float64.
     """
-    drifts = torch.stack([vibration.image_shift, vibration.image_motion, vibration.image_acceleration], -1)
-    parameters = torch.cat([vibration.amplitude, vibration.frequency, vibration.phase, drifts], -1)  # one transfer
-    values, scene, start = tables(parameters, scene_rows, frame_start)
+    values, scene, start = tables(vibration.parameters, scene_rows, frame_start)
     amplitude, frequency, phase = np.split(values[..., :-3], 3, -1)
-    shift, speed, acceleration = np.moveaxis(values[..., -3:], -1, 0)
+    speed, acceleration, shift = np.moveaxis(values[..., -3:], -1, 0)
     amplitude = amplitude * np.sinc(frequency * timing.exposure_time)
 
     def moved(middle: Array, axis: int) -> tuple[Array, Array]:

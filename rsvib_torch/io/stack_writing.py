@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.core.atomic import check_target, check_writable, whole
+from rsvib_torch.core.atomic import check_target, check_tree, check_writable, whole
 from rsvib_torch.core.checks import check_choice
 from rsvib_torch.core.outputs import check_outputs
 from rsvib_torch.core.progress import steps
@@ -54,8 +54,8 @@ def check_info_target(
         check_choice("compression", compression, form.compressions)
     if form.check is not None:
         form.check(path, info)
-    if form.kind == "tree" and path.exists() and not (path / form.marker).is_file():
-        raise FileExistsError(f"cannot write {path}: it exists and is not a {form.name} stack; choose another name")
+    if form.kind == "tree":
+        check_tree(path, form.marker, f"{form.name} stack")
     if check_folder:
         check_writable(path, folder=form.kind != "file")
     return form

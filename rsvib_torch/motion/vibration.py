@@ -227,6 +227,12 @@ class Vibration(
         object.__setattr__(vibration, "camera", None)
         return vibration
 
+    @property
+    def parameters(self) -> Tensor:
+        """All values as one tensor (..., A, 3 K + 3), as in ``from_parameters``."""
+        polynomial = torch.stack([getattr(self, name) for name in _POLYNOMIAL], -1)
+        return torch.cat([self.amplitude, self.frequency, self.phase, polynomial], -1)
+
     def _changed(self, **values: Tensor | Camera | None) -> Self:
         """The vibration with some values replaced, without checks."""
         changed = copy(self)

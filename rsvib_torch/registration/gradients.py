@@ -57,8 +57,6 @@ class _WarpedRows(Protocol):
     @property
     def frequencies(self) -> Tensor: ...  # (U,) cycles/px
 
-    def runs(self, count: int, arrays: int) -> list[slice]: ...
-
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None: ...
 
 
@@ -98,6 +96,7 @@ class RowGradients:
 def row_gradients(
     spectra: _WarpedRows,
     warp: Callable[[slice], Tensor],
+    runs: list[slice],
     rows: Tensor,
     shift: Tensor,
     visible: Tensor,
@@ -110,6 +109,7 @@ def row_gradients(
         spectra: The frames of a group.
         warp: Function from a slice of the S rows of the scene to the frames warped to them, (B, G, s, U), as
             ``RowSpectra.warped``. Threads call it.
+        runs: Slices of the rows that are warped at a time.
         rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
@@ -120,7 +120,7 @@ def row_gradients(
         The gradients.
     """
     length, width = spectra.length, spectra.width
-    compared = FrameComparison.of(warp, spectra.runs(rows.shape[-1], 2), visible)
+    compared = FrameComparison.of(warp, runs, visible)
     detail, across, aliasing = scene_detail(compared, spectra.frequencies)
     along = (2j * math.pi * spectra.frequencies).to(detail.dtype)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
@@ -186,7 +186,7 @@ def residual_products(
 
     Args:
         warp: As in ``row_gradients``.
-        runs: Slices of the rows to process at a time.
+        runs: As in ``row_gradients``.
         gradients: Gradients of the scene, from a similar motion.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
     """
@@ -393,7 +393,7 @@ class FrameComparison:
 
         Args:
             warp: As in ``row_gradients``.
-            runs: Slices of the S rows, each processed while in the cache.
+            runs: As in ``row_gradients``.
             visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
         """
 

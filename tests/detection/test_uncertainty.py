@@ -172,3 +172,5 @@ def test_assumptions_state_what_the_frames_cannot_contradict():
     four = assumptions(vibration, sensitivity, replace(TIMING, frame_start_times=(0.0, 0.05, 0.1, 0.15)), 4, ROWS)
     assert not any("row_time" in text or "two frames" in text for text in four)
     assert assumptions(replace(vibration, amplitude=0 * vibration.amplitude), sensitivity, TIMING, 2, ROWS) == ()
+    still = replace(vibration, frequency=0 * vibration.frequency)  # of a fit without meaning
+    assert any("two frames" in text for text in assumptions(still, sensitivity, TIMING, 2, ROWS, (1.0, 0.5)))

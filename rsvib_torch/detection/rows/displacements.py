@@ -236,11 +236,12 @@ def measure_group(
     positions = _Positions.of(group.starts_of_groups, spectra.height, timing, motion)
     visible = positions.visible(spectra.height, BLOCK_ROWS)
     warp = _warp_to_scene(spectra, positions, timing, motion)
+    runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     if gradients is None:
-        gradients = row_gradients(spectra, warp, positions.rows, positions.shift, visible)
+        gradients = row_gradients(spectra, warp, runs_of_rows, positions.rows, positions.shift, visible)
         products = gradients.residual_products
     else:
-        products = residual_products(warp, spectra.runs(positions.rows.shape[-1], 2), gradients, visible)
+        products = residual_products(warp, runs_of_rows, gradients, visible)
     return _measured(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
 
 
@@ -253,14 +254,12 @@ class _JoinedRows:
         length: Of the transforms along the rows.
         frequencies: (U,) cycles/px.
         valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
-        runs: That of the spectra of the strips.
     """
 
     width: int
     length: int
     frequencies: Tensor
     valid: Tensor | None
-    runs: Callable[[int, int], list[slice]]
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """``valid``: the strips have been warped."""
@@ -301,6 +300,7 @@ def measure_strips(
 
     visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
     warp = _warp_to_scene(spectra, positions, timing, of_strips)
+    runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     length = fast_length(strips.frame_width + 64)
 
     def joined(run: slice) -> Tensor:
@@ -312,13 +312,14 @@ def measure_strips(
         valid = spectra.warped_valid(positions.rows, positions.shift)
         whole = None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999
         frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=positions.rows.device)
-        shape = _JoinedRows(strips.frame_width, length, frequencies, whole, spectra.runs)
+        shape = _JoinedRows(strips.frame_width, length, frequencies, whole)
         x = torch.arange(length, device=frequencies.device) - 0.5 * (strips.frame_width - 1)
         x = x - over_strips(positions.columns)[:, 0]  # (B, 1, L)
         y = over_strips(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
         gradients = row_gradients(
             shape,
             joined,
+            runs_of_rows,
             over_strips(positions.rows)[:, 0],
             over_strips(positions.shift).abs().amax(1)
             * (visible > 0),  # a lens may displace invisible rows by any amount
@@ -327,7 +328,7 @@ def measure_strips(
         )
         products = gradients.residual_products
     else:
-        products = residual_products(joined, spectra.runs(positions.rows.shape[-1], 2), gradients, visible)
+        products = residual_products(joined, runs_of_rows, gradients, visible)
     starts = over_strips(positions.exposure_starts).mean(1)
     return _measured(group, timing, motion, starts, visible, gradients, products), gradients
 
