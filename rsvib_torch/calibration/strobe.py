@@ -35,12 +35,9 @@ def fit_strobe(
 ) -> StrobeFit:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row.
 
-    Args:
-        brightness: (T, H), in proportion to light.
-        period: Period of the bands in rows, to start with.
-        phases: (T,) phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``, to start with.
-        exposures: (T,) exposure of each frame, in any unit.
-        on_fraction: Fraction of the period that the light is on; None to estimate it, from different exposures.
+    ``brightness`` (T, H) is in proportion to light; ``period`` in rows, and ``phases`` (T,) of the fundamental, ``cos(2
+    pi i / P - phase)``, are start values. ``exposures`` (T,) have any unit. The fraction of the period that the light
+    is on is estimated from different exposures unless it is given.
     """
     values = brightness / brightness.mean(1, keepdims=True)
     count, height = values.shape

@@ -52,17 +52,12 @@ def judged(
 ) -> tuple[Findings, ...]:
     """Reasons against the vibrations of B stacks, for each of their A axes in row order.
 
-    Args:
-        vibration: The detected vibrations.
-        std: Their standard deviations.
-        measured: The measurements that they were fitted to: the motion of the rows that they do not explain, or the
-            offsets of row bands.
-        intervals: Times between the frames of the largest groups, s; fast motion and unequal blur permit smaller ones.
-        displacement: (B, A) px, displacement of the rows by the tones without its mean, rms over the rows.
-        known_std: (B, A) px, standard deviation of the displacement if the number of tones is right.
-        timing: The sensor, in row order.
-        max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
-        radius: Distance from the centre, in px, at which roll and zoom are displacements in px.
+    ``measured`` is the motion of the rows that they do not explain, or the offsets of row bands. ``intervals`` in s are
+    those between the frames of the largest groups; fast motion and unequal blur permit smaller ones. ``displacement``
+    and ``known_std`` (B, A) in px are the displacement of the rows by the tones without its mean, rms over the rows,
+    and its standard deviation if the number of tones is right. An axis with ``max_tones``, the largest number that was
+    tried, may have more. ``radius`` is the distance from the centre, in px, at which roll and zoom are displacements in
+    px.
     """
     # 1. The compared quantities of all stacks and axes.
     frequency = table(vibration.frequency)

@@ -190,14 +190,10 @@ def form_rows(
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    Args:
-        spectra: (..., S, U) of the B-spline coefficients, of ``degree`` across the rows, of S scene rows.
-        places: (..., R, N) scene rows at the nodes of the exposures of R rows, with ``node_weights`` (N,).
-        along: (..., R, N) displacement along the rows in px.
-        node_weights: They sum to 1.
-        frequencies: (U,) in cycles per px.
-        degree: Degree of the B-spline.
-        num_scenes: B scenes, whose rows follow each other in ``spectra``; places and displacements are then (B, R, N).
+    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
+    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
+    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px. The rows of several scenes follow each
+    other in ``spectra``; places and displacements are then (B, R, N).
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)

@@ -142,19 +142,11 @@ def rows_showing(
 def shown_by_tones(
     scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Vibration
 ) -> tuple[Tensor, Tensor]:
-    """``rows_showing`` of a batch of vibrations, with the mean displacement along these rows; without gradients.
+    """``rows_showing`` for vibrations, with displacements along x: rows and px (B, G, S) of scene rows (B, 1, S).
 
-    The displacement of few rows is computed in NumPy, because each step of Newton's method takes 60 operations of
-    PyTorch. Its slope is that of the mean displacement.
-
-    Args:
-        scene_rows: (B, 1, S) scene rows.
-        frame_start: (B, G, 1) s, exposure starts of the first rows of the frames.
-        timing: The sensor.
-        vibration: The motions (B), in row order.
-
-    Returns:
-        Frame rows (B, G, S) and displacements along x (B, G, S) in px, float64.
+    The displacement of few rows by vibrations (B) in row order is computed in NumPy, because each step of Newton's
+    method takes 60 operations of PyTorch; without gradients. Its slope is that of the mean displacement.
+    ``frame_start`` (B, G, 1) are the exposure starts in s of the first rows of the frames.
     """
     values, scene, start = tables(vibration.parameters, scene_rows, frame_start)
     amplitude, frequency, phase = np.split(values[..., :-3], 3, -1)

@@ -243,11 +243,9 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
 
 @contextmanager
 def readable_stack(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception of a decoder into a one-line ``ValueError``: a damaged file can raise every type.
+    """Convert any exception of a decoder of a ``kind`` of files, which may have every type, into a ``ValueError``.
 
-    Args:
-        path: The file or folder that is opened. A file without read permission remains an ``OSError``.
-        kind: Name of the format for the message.
+    A file without read permission remains an ``OSError``.
     """
     if not path.is_dir():
         with path.open("rb"):

@@ -388,10 +388,6 @@ class RowTiming(SensorTiming):
 
     ``SensorTiming.in_row_order`` returns it. Functions that work on frames, offsets or motions in row order take it
     instead of a ``SensorTiming``, so that a type checker refuses a timing whose frames have not been turned.
-
-    Raises:
-        ValueError: If ``scan_axis`` is not -2 or ``readout_direction`` is not ``"forward"``, in addition to the errors
-            of ``SensorTiming``.
     """
 
     def __post_init__(self) -> None:

@@ -34,18 +34,14 @@ from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 @dataclass(frozen=True)
 class RestorationMethod:
-    """An entry of ``METHODS``.
+    """An entry of ``METHODS``."""
 
-    Attributes:
-        function: The method, see the contract above ``METHODS``.
-        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
-        strips: Whether it takes ``strips``, and estimates once what strips of the same frames have in common.
-        mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
-    """
-
-    function: Callable[..., Tensor]
+    function: Callable[..., Tensor]  # the method, see the contract above ``METHODS``
+    # masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels)
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
+    # whether it takes ``strips``, and estimates once what strips of the same frames have in common
     strips: bool = False
+    # the method for colour mosaics, which has the same options and takes ``colours``; None for none
     mosaic: "RestorationMethod | None" = None
 
 

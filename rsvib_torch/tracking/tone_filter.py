@@ -31,21 +31,13 @@ _STAY = 0.95  # probability that the process noise of the next frame is the same
 
 @dataclass(frozen=True, eq=False)
 class ToneFilter:
-    """State of the filters of both axes (A), for M values of the process noise and K tones, in row order.
+    """State of the filters of both axes (A), for M values of the process noise and K tones, in row order."""
 
-    Attributes:
-        time: Reference time in s.
-        values: (A, M, P) float64, the P = 4 K + 2 parameters [Re C, Im C, g, 2 pi f of each tone, v, a].
-        covariance: (A, M, P, P) float64 of the parameters.
-        probability: (A, M) float64 of each process noise.
-        exposure_time: T_e in s.
-    """
-
-    time: float
-    values: Array
-    covariance: Array
-    probability: Array
-    exposure_time: float
+    time: float  # reference time in s
+    values: Array  # (A, M, P) float64, the P = 4 K + 2 parameters [Re C, Im C, g, 2 pi f of each tone, v, a]
+    covariance: Array  # (A, M, P, P) float64 of the parameters
+    probability: Array  # (A, M) float64 of each process noise
+    exposure_time: float  # T_e in s
 
     @classmethod
     def started(

@@ -46,12 +46,7 @@ class CornerTracks:
 
 
 def corner_tracks(frames: Tensor, valid: Tensor | None, timing: SensorTiming) -> CornerTracks:
-    """Follow the corners of every frame to the next one.
-
-    Args:
-        frames: Grey frames (T, H, W) in image axes.
-        valid: (T, H, W) bool, False at missing pixels; None if there are none.
-        timing: The sensor.
+    """Follow the corners of every frame to the next one, in grey frames (T, H, W) in image axes.
 
     Raises:
         ValueError: If fewer than half of the pairs of frames have enough corners.

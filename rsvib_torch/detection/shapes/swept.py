@@ -397,13 +397,7 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
 def _settle(
     measured: Measurements, axis: int, record: tuple[float, float], fits: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Levenberg-Marquardt from several starts side by side.
-
-    Args:
-        measured: Displacements of one stack.
-        axis: Axis to fit.
-        record: Start and end of the record in seconds.
-        fits: (S, 6) start parameters.
+    """Levenberg-Marquardt from several starts (S, 6) side by side, for one axis of one stack.
 
     Returns:
         Best fit first: parameters (S, 6), their covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the
