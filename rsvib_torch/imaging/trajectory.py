@@ -71,17 +71,9 @@ def exposure_trajectory(
     quadrature: Quadrature = "midpoint",
     num_nodes: int | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Displacement at the nodes of exposures that begin at ``starts``.
+    """Displacement (S, N, 2) in px at the nodes of exposures from ``starts`` S in s on, and weights (N,) of the nodes.
 
-    Args:
-        vibration: The motion.
-        starts: Exposure starts in seconds, any shape S (batch dimensions of the vibration lead).
-        timing: The sensor.
-        quadrature: ``"midpoint"`` (Eq. 25) or ``"gauss"``.
-        num_nodes: Number of nodes; by default N_e, or ``gauss_node_count``.
-
-    Returns:
-        Displacement (S, N, 2) in px, axes (x, y), and weights (N,), both float64.
+    Batch dimensions of the vibration lead. There are N_e midpoints (Eq. 25) by default, or ``gauss_node_count`` nodes.
 
     Raises:
         ValueError: If the motion has roll or zoom, see ``motion.field``.
@@ -102,21 +94,12 @@ def rows_showing(
     *,
     exposure_time: float | Tensor | None = None,
 ) -> Tensor:
-    """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
+    """Frame rows r(s) that show scene rows s of shape S: the solution of ``r = s + Y(t(r))``, float64.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
     Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
-    scan as fast as the rows is never passed.
-
-    Args:
-        scene_rows: Scene rows s, float64, shape S (batch dimensions of the vibration lead).
-        frame_start: Exposure start of the frame's first row in seconds, broadcastable to S.
-        timing: The sensor.
-        vibration: The motion, in row order.
-        exposure_time: Exposure time in seconds, broadcastable to S; by default that of the sensor.
-
-    Returns:
-        Frame rows, float64, broadcast shape of S and ``frame_start``.
+    scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
+    and ``exposure_time`` (by default that of the sensor) in s broadcast to S.
     """
     check_two_axes(vibration, "the displacement of a row")
     exposure_time = timing.exposure_time if exposure_time is None else exposure_time

@@ -41,17 +41,7 @@ class DetectedVibration(
 ):
     """A detection without its offset curve: everything that restoration needs. A batch leads all tensors.
 
-    Attributes:
-        vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
-        std: Standard deviations of its parameters, given the tones that were found; infinite where unknown.
-        std_if_hidden_tone: The same if the record may contain a further tone, which few frames cannot exclude; None:
-            not larger.
-        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames.
-        residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
-        reliable: (..., 2) bool, verdict for each axis (x, y).
-        findings: Each ``Reason`` against each axis that is not reliable; a tuple of those for a batch. ``reasons`` has
-            their texts.
-        assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
+    The fields are those of ``DetectionResult``.
     """
 
     _MADE_BY: ClassVar[str] = "from detect_vibration; of other results, pass .motion"  # for errors about arguments

@@ -100,10 +100,7 @@ class Motion(Result, ABC):
         return self.num_axes == 2 and self.camera is None
 
     def attitude(self, times: Tensor) -> Tensor:
-        """Rotation of the camera in rad, see ``Camera``; times as in ``displacement``.
-
-        Returns:
-            (S, 3) float64: pitch, yaw and roll, right-handed about x (right), y (down) and z (forward).
+        """Rotation (S, 3) of the camera in rad at times S: pitch, yaw and roll, see ``Camera``.
 
         Raises:
             ValueError: If the motion has no camera.

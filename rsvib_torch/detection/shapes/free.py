@@ -224,7 +224,7 @@ def _measure_field(
 ) -> tuple[MeasuredRows, FreeMotion]:
     """``measure_freely`` with roll and zoom, from a motion without them; all components in px."""
     still = torch.zeros_like(start.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
-    drift = torch.cat([start.image_motion, start.image_motion.new_zeros(1, scale.axes - 2)], -1)
+    drift = torch.cat([start.tones.image_motion, start.tones.image_motion.new_zeros(1, scale.axes - 2)], -1)
     tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
     motion = FreeMotion(torch.cat([start.coefficients, still], 1), start.start, start.spacing, tones)
 
