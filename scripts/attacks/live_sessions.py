@@ -195,21 +195,13 @@ def _judged(
 
 @dataclass(frozen=True)
 class _Ending:
-    """How a session ends while it records.
+    """How a session ends while it records."""
 
-    Attributes:
-        act: What ends it.
-        expected: Its outcome.
-        message: Part of what it prints; {out} is the recording.
-        output: See ``_start``.
-        spectrogram: Whether one is saved.
-    """
-
-    act: Callable[[_Session], None]
-    expected: Outcome = "completed"
-    message: str = ""
-    output: str = "file"
-    spectrogram: bool = False
+    act: Callable[[_Session], None]  # what ends it
+    expected: Outcome = "completed"  # its outcome
+    message: str = ""  # part of what it prints; {out} is the recording
+    output: str = "file"  # see ``_start``
+    spectrogram: bool = False  # whether one is saved
 
     def __call__(self, name: str, out: Path, frames: int) -> Trial:
         """A trial."""

@@ -90,17 +90,11 @@ _TOKENS = (
 
 @dataclass(frozen=True)
 class Original:
-    """A file to damage.
+    """A file to damage."""
 
-    Attributes:
-        target: What is read, the file or the folder it belongs to.
-        read: How it is read.
-        text: Whether it is text.
-    """
-
-    target: str
-    read: Callable[[Path], Any]
-    text: bool = False
+    target: str  # what is read, the file or the folder it belongs to
+    read: Callable[[Path], Any]  # how it is read
+    text: bool = False  # whether it is text
 
 
 def _read_stack(path: Path, most: int = 50) -> None:

@@ -19,21 +19,16 @@ FAILURES = OUTCOMES[2:]
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial.
+    """One trial."""
 
-    Attributes:
-        name: What was tried, precise enough to repeat it.
-        outcome: ``completed``: correct result. ``refused``: a one-line error, and nothing was changed. ``lost``: a file
-            of the user, or a finished part of the result, is damaged or missing. ``wrong``: success was reported, but
-            the result is wrong or incomplete. ``traceback``: an exception that is neither ValueError, TypeError nor
-            OSError in Python, or a traceback or another exit code than 0 and 2 on the command line. ``hang``: the time
-            limit passed. ``memory``: more memory than permitted was used.
-        detail: Message or difference, for the list of failures.
-    """
-
-    name: str
+    name: str  # what was tried, precise enough to repeat it
+    # ``completed``: correct result. ``refused``: a one-line error, and nothing was changed. ``lost``: a file of the
+    # user, or a finished part of the result, is damaged or missing. ``wrong``: success was reported, but the result is
+    # wrong or incomplete. ``traceback``: an exception that is neither ValueError, TypeError nor OSError in Python, or a
+    # traceback or another exit code than 0 and 2 on the command line. ``hang``: the time limit passed. ``memory``: more
+    # memory than permitted was used.
     outcome: Outcome
-    detail: str = ""
+    detail: str = ""  # message or difference, for the list of failures
 
 
 @dataclass(frozen=True)

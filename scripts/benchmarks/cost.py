@@ -58,19 +58,12 @@ OF_CLASSES = {  # recordings (class, number) of honesty_cases
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """Frames with the stated timing, and a plain recording of as many pixels.
+    """Frames with the stated timing, and a plain recording of as many pixels."""
 
-    Attributes:
-        frames: (T, H, W).
-        timing: The stated timing.
-        plain_frames: Of the same number of pixels.
-        plain_timing: Their timing.
-    """
-
-    frames: torch.Tensor
-    timing: rsv.SensorTiming
-    plain_frames: torch.Tensor
-    plain_timing: rsv.SensorTiming
+    frames: torch.Tensor  # (T, H, W)
+    timing: rsv.SensorTiming  # the stated timing
+    plain_frames: torch.Tensor  # of the same number of pixels
+    plain_timing: rsv.SensorTiming  # their timing
 
 
 def _frames(values: Any) -> torch.Tensor:

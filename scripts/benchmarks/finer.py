@@ -62,19 +62,12 @@ def joint(frames: torch.Tensor, timing: rsv.SensorTiming, motion: Any, scale: in
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames without noise, and the scene after optics and pixel on half pixels and on pixels.
+    """Frames without noise, and the scene after optics and pixel on half pixels and on pixels."""
 
-    Attributes:
-        frames: (T, H, W).
-        half: (2 H, 2 W).
-        timing: The sensor.
-        vibration: The true motion.
-    """
-
-    frames: Array
-    half: Array
-    timing: rsv.SensorTiming
-    vibration: rsv.Vibration
+    frames: Array  # (T, H, W)
+    half: Array  # (2 H, 2 W)
+    timing: rsv.SensorTiming  # the sensor
+    vibration: rsv.Vibration  # the true motion
 
     @property
     def pixels(self) -> Array:
