@@ -199,6 +199,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     return [*(f"| {' | '.join(map(str, line))} |" for line in lines), ""]
 
 
+def table_of(rows: Iterable[Mapping[str, Any]], *columns: tuple[str, str | Callable[[Any], object]]) -> list[str]:
+    """A table with a line for each row. A column is a head, and a format of the values of a row or a function of it."""
+    cells = [[cell.format(**row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
+    return table([head for head, _ in columns], cells)
+
+
 # The machine
 
 
