@@ -10,10 +10,10 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.calibration.flicker import MIN_PERIODS, Array, BandFit, Profiles, find_bands, row_profiles
+from rsvib_torch.calibration.flicker import MIN_PERIODS, BandFit, Profiles, find_bands, row_profiles
 from rsvib_torch.calibration.strobe import exposure_from_contrast, fit_strobe
 from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Channels
+from rsvib_torch.core.arrays import Array, Channels
 from rsvib_torch.core.checks import check_number
 from rsvib_torch.core.presentation import JudgedResult
 from rsvib_torch.core.reason import Reason

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq, least_squares
 
-from rsvib_torch.calibration.flicker import Array, deviations, unexplained
+from rsvib_torch.calibration.flicker import deviations, unexplained
+from rsvib_torch.core.arrays import Array
 
 _MAX_MISFIT = 0.3  # largest root mean square of the residuals over the brightness
 

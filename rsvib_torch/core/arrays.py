@@ -12,7 +12,8 @@ from torch import Tensor
 from rsvib_torch.core.arguments import check_tensor
 from rsvib_torch.core.checks import check_choice
 
-ArrayLike = Tensor | NDArray[Any]
+Array = NDArray[Any]
+ArrayLike = Tensor | Array
 FramesLike = ArrayLike | Sequence[ArrayLike]
 Channels = Literal["first", "last"] | None
 

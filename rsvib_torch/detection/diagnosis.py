@@ -80,7 +80,6 @@ def diagnose_timing(frames: FramesOrFiles, timing: SensorTiming, options: Offset
         agree with no other one.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If frames are a batch, or too small, see ``detect_vibration``.
 
     Example:

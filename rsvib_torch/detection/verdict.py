@@ -6,11 +6,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from rsvib_torch.core.presentation import AXIS_NAMES
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.reason import Reason
 from rsvib_torch.core.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.detection.measurements import OtherMotion
@@ -113,9 +113,7 @@ def _compared_bands(bands: BandOffsets) -> dict[str, Array]:
     }
 
 
-def _reasons_against_stack(
-    stack: dict[str, Any], timing: RowTiming, max_tones: float, least_gain: float
-) -> list[list[Reason]]:
+def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, least_gain: float) -> list[list[Reason]]:
     """Reasons against each axis of one stack, from the numbers of its compared quantities."""
     by_rows, axes = "bands" not in stack, len(stack["amplitude"])
     of_all = _measurement_reasons(stack)
@@ -162,7 +160,7 @@ def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
     )
 
 
-def _measurement_reasons(stack: dict[str, Any]) -> list[Reason]:
+def _measurement_reasons(stack: Table) -> list[Reason]:
     """Reasons from the fraction of the visible rows or bands that were measured."""
     if stack["measured"] >= _MIN_MEASURED:
         return []
@@ -178,7 +176,7 @@ _MIN_GAIN_OF_TWO = 0.3
 
 
 def _tone_reasons(
-    axis: str, numbers: dict[str, Any], tone: int, num_tones: int, timing: RowTiming, least_gain: float
+    axis: str, numbers: Table, tone: int, num_tones: int, timing: RowTiming, least_gain: float
 ) -> list[Reason]:
     """Reasons against one tone."""
     names = ("amplitude", "amplitude_std", "frequency", "frequency_std", "gain")
@@ -207,7 +205,7 @@ def _tone_reasons(
     return reasons
 
 
-def _displacement_reasons(axis: str, numbers: dict[str, Any], num_tones: int) -> list[Reason]:
+def _displacement_reasons(axis: str, numbers: Table, num_tones: int) -> list[Reason]:
     """Reasons from the displacement of the rows by all tones and its standard deviations, rms over the rows.
 
     ``known_std`` holds if the number of tones is right, ``std`` allows for a further tone. The limits and their effect
@@ -222,7 +220,7 @@ def _displacement_reasons(axis: str, numbers: dict[str, Any], num_tones: int) ->
     return []
 
 
-def _band_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
+def _band_reasons(axis: str, numbers: Table) -> list[Reason]:
     """Reasons from the residual of the bands, and from condition (24)."""
     reasons = []
     residual, size, within = numbers["residual"], numbers["size"], numbers["within_row_time"]
@@ -234,7 +232,7 @@ def _band_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
     return reasons
 
 
-def residual_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
+def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
     """Reasons from motion of the rows along an axis that no vibration explains; ``numbers`` of ``OtherMotion`` in px.
 
     docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.

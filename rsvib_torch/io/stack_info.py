@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.core.arguments import check_fields, checked_methods
+from rsvib_torch.core.arrays import Array
 from rsvib_torch.core.presentation import Summarised
 from rsvib_torch.core.text import one_line
 
@@ -196,13 +196,13 @@ class StackInfo(Summarised):
             invalid.add("image")
         return {name: None if tag is None or tag.scope in invalid else tag for name, tag in self.metadata.items()}
 
-    def from_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
+    def from_stored(self, frame: Array) -> Array:
         """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""
         if self.stored_axes == "THWC":
             frame = np.moveaxis(frame, -1, 0)
         return frame.astype(frame.dtype.newbyteorder("="), copy=False)
 
-    def to_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
+    def to_stored(self, frame: Array) -> Array:
         """Convert a frame (H, W) or (C, H, W) to the axis order and data type of the file."""
         if self.stored_axes == "THWC":
             frame = np.moveaxis(frame, 0, -1)
@@ -214,7 +214,7 @@ class FrameReader(Protocol):
 
     info: StackInfo
 
-    def frame(self, index: int) -> NDArray[Any]:
+    def frame(self, index: int) -> Array:
         """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
 
     def close(self) -> None:

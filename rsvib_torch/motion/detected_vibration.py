@@ -17,6 +17,7 @@ from rsvib_torch.core.presentation import (
     plain_values,
     verdict_table,
 )
+from rsvib_torch.core.reading import Table
 from rsvib_torch.core.text import measured_text, text_table, wrapped
 from rsvib_torch.motion.vibration import (
     Vibration,
@@ -113,15 +114,15 @@ class DetectedVibration(
         """
         return joined_columns(self.tone_lines(pixel_size))
 
-    def tone_lines(self, pixel_size: float | None = None) -> list[dict[str, Any]]:
+    def tone_lines(self, pixel_size: float | None = None) -> list[Table]:
         """Lines of ``table``."""
         pixel_size = check_pixel_size(pixel_size)
         vibration, hidden = self.vibration, self.std_if_hidden_tone or self.std
-        lines: list[dict[str, Any]] = []
+        lines: list[Table] = []
         for at, _ in tone_places(vibration):
             *batch, axis, tone = at
             found, unit = float(vibration.amplitude[at]) > 0, _UNITS_OF_AXES[axis]
-            line: dict[str, Any] = {"index": ", ".join(map(str, batch))} if batch else {}
+            line: Table = {"index": ", ".join(map(str, batch))} if batch else {}
             middle = self._middle_time(tuple(batch))
             line |= {} if middle is None else {"middle_time_s": middle}
             line |= {"axis": AXIS_NAMES[axis], "tone": found * (tone + 1)}

@@ -42,7 +42,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     Raises:
         ValueError: If shapes do not fit or a value is not finite.
-        TypeError: If ``start`` or ``spacing`` is not a number.
 
     Example:
         >>> times = torch.linspace(0, 0.1, 41, dtype=torch.float64)

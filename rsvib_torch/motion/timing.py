@@ -59,7 +59,6 @@ class SensorTiming:
     Raises:
         ValueError: If a value is out of range, or indicates another unit (a row time over 10 ms, a frame period
             over 10 s).
-        TypeError: If a value is not a number.
 
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -157,7 +156,6 @@ class SensorTiming:
         """The timing in the table ``[sensor]`` of a configuration file, as ``rsvib init`` writes it.
 
         Raises:
-            OSError: If the file cannot be opened.
             ValueError: If it is not TOML, or a key of ``[sensor]`` is missing, unknown or has a wrong type or value.
 
         Example:

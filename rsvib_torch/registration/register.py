@@ -124,7 +124,6 @@ def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandReg
         The offset curve, axes (x, y) of the image, rows in readout order.
 
     Raises:
-        TypeError: If an argument has the wrong type.
         ValueError: If there are fewer than two frames, a pixel is NaN or infinite, an option is out of range, or the
             frames are too small for the bands and the search range.
 

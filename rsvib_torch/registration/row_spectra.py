@@ -28,13 +28,10 @@ MARGIN = 8  # px; rows and columns this close to an edge have no weight: they ar
 
 
 class RowSpectra:
-    """Fourier transforms along the rows of frames, of their B-spline coefficients across rows.
+    """Fourier transforms along the rows of frames (B, T, H, W) in row order, of their splines across rows.
 
-    Args:
-        frames: (B, T, H, W) in row order.
-        valid: (B, T, H, W) bool, pixels with weight; None for all.
-        level: (B, T, 1, 1) to subtract from each frame.
-        contrast: (B, T, 1, 1) to divide the difference by.
+    ``valid`` pixels have weight. The level (B, T, 1, 1) is subtracted from each frame, and the difference divided by
+    the contrast.
     """
 
     def __init__(

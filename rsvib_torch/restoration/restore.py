@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from rsvib_torch.core.arrays import ArrayLike
 from rsvib_torch.core.parallel import threads_for
 from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.core.reading import Table
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
@@ -188,7 +189,7 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
     chosen = method if frames.colours is None else method.mosaic
     assert chosen is not None, "methods without mosaic have no option mosaic"
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
-    more: dict[str, Any] = {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    more: Table = {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         more["colours"] = frames.colours
     if chosen.strips:

@@ -242,13 +242,10 @@ class _WindowFit:
 
 
 def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: float) -> WindowPath:
-    """Path and tones of the corners of a window.
+    """Path and tones of the ``corners`` of all pairs of a window of frames, which are an ``interval`` in s apart.
 
-    Args:
-        corners: Corners of all pairs of the window.
-        interval: T in s, between frames.
-        averaged: s; a corner is displaced by the mean of the displacement over these times.
-        readout: s, from the first to the last row.
+    A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
+    first to the last row (s).
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
@@ -321,15 +318,9 @@ class CameraPath:
 
 
 def camera_path(pairs: Iterable[Corners | None], timing: SensorTiming, size: tuple[int, int]) -> CameraPath:
-    """Path of a camera from the corners of all pairs of neighbouring frames.
+    """Path of a camera from the corners of all pairs of neighbouring frames (None where there are too few).
 
-    Args:
-        pairs: Corners of each pair; None where there are too few.
-        timing: The sensor.
-        size: (height, width) of the frames in px.
-
-    Raises:
-        ValueError: If no window of frames has corners in a quarter of its pairs.
+    A ``ValueError`` is raised if no window of frames has corners in a quarter of its pairs.
     """
     readout = timing.row_time * size[0 if timing.scan_axis == -2 else 1]
     averaged = timing.exposure_time, _PATCH_ROWS * reduction(*size) * timing.row_time

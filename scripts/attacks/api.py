@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from attacks.files import BANDS, DETECTION
 from attacks.trial import Trial
-from attacks.warm import in_warm_child, tried
+from attacks.warm import in_warm_child
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -372,15 +372,17 @@ def _name(item: Item) -> str:
     return f"{item[0]}({', '.join(f'{argument}={hostile}' for argument, hostile in item[1])})"
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:
-    """One call with hostile arguments."""
+def prepare(folder: Path) -> None:
+    """Hostile relative paths must not reach the working directory of the program."""
     folder.mkdir(parents=True, exist_ok=True)
-    os.chdir(folder)  # hostile relative paths must not reach the working directory of the program
-    known = calls(folder / "valid")
-    if item is None:
-        return Trial("", "completed")
+    os.chdir(folder)
+    calls(folder / "valid")
+
+
+def attempt(folder: Path, item: Item) -> str:
+    """One call with hostile arguments."""
     name, changes = item
-    call = known[name]
+    call = calls(folder / "valid")[name]
     place = folder / "trial"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
@@ -393,19 +395,15 @@ def attempt(folder: Path, item: Item | None) -> Trial:
     try:
         arguments |= {argument: _hostile(kind, call.arguments[argument]) for argument, kind in changes}
     except Exception as error:  # PyTorch or the package cannot make this value
-        return Trial(_name(item), "refused", f"not made: {error}")
+        raise ValueError(f"not made: {type(error).__name__}") from error
     torch.manual_seed(0)
     before = {key: copy.deepcopy(value) for key, value in arguments.items() if isinstance(value, np.ndarray)}
-
-    def work() -> str:
-        result = call.of(**arguments)
-        str(result) if type(result).__module__.startswith("rsvib_torch") else None
-        if _nan_without_reason(result):
-            return "reliable, but not finite"
-        changed = (key for key, value in before.items() if not _equal(value, arguments[key]))
-        return next((f"{key} was changed" for key in changed), "")
-
-    return tried(_name(item), work)
+    result = call.of(**arguments)
+    str(result) if type(result).__module__.startswith("rsvib_torch") else None
+    if _nan_without_reason(result):
+        return "reliable, but not finite"
+    changed = (key for key, value in before.items() if not _equal(value, arguments[key]))
+    return next((f"{key} was changed" for key in changed), "")
 
 
 def _equal(before: np.ndarray, after: np.ndarray) -> bool:
@@ -439,4 +437,5 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Trials of hostile calls, three quarters of them with one hostile argument."""
     torch.set_num_threads(1)
     chosen = items(calls(folder / "listed" / "valid"), count, seed)
-    yield from in_warm_child(attempt, chosen, _name, folder / "child", limit=SECONDS, memory=MEMORY)
+    named = [(_name(item), item) for item in chosen]
+    yield from in_warm_child(attempt, named, folder / "child", limit=SECONDS, memory=MEMORY, prepare=prepare)

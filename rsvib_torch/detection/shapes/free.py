@@ -141,7 +141,6 @@ def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMoti
         The motion in image axes with its uncertainty over time.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too few valid pixels, the motion is
             beyond the search range, or an option is out of range.
 

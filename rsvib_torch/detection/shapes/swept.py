@@ -150,7 +150,6 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
         Parameters of both axes at the time origin, with standard deviations and verdict.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or three frames
             cover more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 

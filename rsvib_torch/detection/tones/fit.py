@@ -174,12 +174,9 @@ class _Estimate:
 
 
 class _Problem:
-    """Nonlinear least squares ``min sum_n r_n^T W_n r_n``, r the residual and W the information of scene row n.
+    """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` for the ``active`` (B, 2, K) tones of displacements.
 
-    Args:
-        measurements: The displacements.
-        active: (B, 2, K) bool, tones to fit.
-        model: Structure of the motion.
+    r is the residual and W the information of scene row n.
     """
 
     def __init__(self, measurements: Measurements, active: Array, model: MotionModel) -> None:

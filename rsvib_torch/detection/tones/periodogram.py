@@ -73,13 +73,9 @@ def explained_power(
 ) -> Array:
     """Decrease of the weighted sum of squares by a wave and an image motion.
 
-    Args:
-        Q: Weighted sums of the square of the complex wave.
-        R: Those of its squared modulus.
-        with_values: Those of its product with the values.
-        with_drift: Those of its product with the drift by a unit image motion.
-        drift_value: Weighted sum of the products of drift and values.
-        drift_drift: That of the squares of the drift.
+    ``Q`` and ``R`` are weighted sums of the square of the complex wave and of its squared modulus, the others those of
+    products: of the wave ``with_values`` and ``with_drift``, the drift by a unit image motion; of drift and values; and
+    of the drift with itself.
     """
     # Normal equations of cosine and sine after elimination of the image motion, and the decrease by their solution.
     cosine = 0.5 * (R + Q.real) - np.square(with_drift.real) / drift_drift

@@ -37,15 +37,10 @@ def robust_fit(
 ) -> tuple[ToneFit, Measurements]:
     """Fit with the weights of outliers reduced in two steps (Tukey's biweight), and measurements with these weights.
 
-    Args:
-        measurements: The displacements.
-        frequencies: (B, 2, K) Hz to start from. Amplitudes and phases follow from them by linear equations; starts with
-            those of an earlier fit take more steps along the valleys of slow tones.
-        active: (B, 2, K) bool.
-        model: Structure of the motion.
-        residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
-        steps: 1 if the residual is that of a fit with reduced weights.
-        iterations: As in ``fit_tones``.
+    Amplitudes and phases follow by linear equations from the ``frequencies`` (B, 2, K) in Hz to start from, of which
+    some are ``active``; starts with those of an earlier fit take more steps along the valleys of slow tones. With the
+    ``residual`` (B, N, G, 2) px of an earlier fit there is no fit of equal weights first, and with that of a fit with
+    reduced weights one of the ``steps`` suffices.
     """
     if residual is None:
         rough, residual = fit_roughly(measurements, frequencies, active, model)

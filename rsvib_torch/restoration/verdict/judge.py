@@ -334,7 +334,6 @@ def judge_restoration(
         may differ in brightness and contrast.
 
     Raises:
-        TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
 
     Example:
