@@ -52,12 +52,9 @@ def _memory_of_tree(process: psutil.Process) -> int:
 
 
 def run_watched(command: Sequence[str], *, limit: float, folder: Path) -> Process:
-    """Run a command with a time limit and measure the peak resident memory of its process tree.
+    """Run a command in a folder and measure the peak resident memory of its process tree.
 
-    Args:
-        command: Program and arguments.
-        limit: Time limit in s; after it all processes of the tree are ended.
-        folder: Working directory; ``output.txt`` in it receives the output.
+    All processes of the tree are ended after ``limit`` s; ``output.txt`` in the folder receives the output.
     """
     begin = time.perf_counter()
     path = folder / "output.txt"

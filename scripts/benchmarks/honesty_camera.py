@@ -89,15 +89,7 @@ def longest_path(motion: Motion, starts: Array, exposure: float, size: tuple[int
 
 
 def take_frames(layers: Sequence[Layer], motion: Motion, starts: Array, exposure: float, width: int) -> Array:
-    """Frames (T, H, W) without noise.
-
-    Args:
-        layers: The scene, and what is in front of it.
-        motion: The motion of the camera.
-        starts: (T, H) exposure start of every row of every frame in s.
-        exposure: Exposure time in s.
-        width: Columns of a frame.
-    """
+    """Frames (T, H, W) without noise of a scene and what is in front of it, with exposure starts (T, H) in s."""
     size = (starts.shape[1], width)
     fastest = max(float(np.hypot(*part.velocity)) for part in layers)
     least, for_a_px, most = NODES
