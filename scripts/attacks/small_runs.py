@@ -134,8 +134,8 @@ def fork(
 ) -> tuple[Any, Any]:
     """Call a function in a child process; returns its exit code, and its result or message.
 
-    The code is 0 after a success, 2 after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another exception, and
-    None if the process was killed after ``seconds``.
+    The code is 0 after a success, 2 after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another exception,
+    and None if the process was killed after ``seconds``.
     """
     receiving, sending = server().Pipe(duplex=False)
     child = server().Process(target=_call, args=(function, arguments, options, sending))
