@@ -2,7 +2,7 @@
 """Write docs/configuration.md (all keys of the TOML file), docs/commands.md (all commands) and docs/reasons.md.
 
 Types, defaults and descriptions come from the groups of options and the parameters of the commands, reasons from their
-table in core/reason.py. A test fails if the pages are out of date.
+table in results/reason.py. A test fails if the pages are out of date.
 """
 
 import argparse
@@ -15,12 +15,12 @@ import griffe
 import typer
 
 import rsvib_torch as rsv
+from rsvib_torch.checks.validation import expected_text, fields_of
 from rsvib_torch.commands.main import app
 from rsvib_torch.config import simulation_section
-from rsvib_torch.core.reason import GROUPS
-from rsvib_torch.core.validation import expected_text, fields_of
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
+from rsvib_torch.results.reason import GROUPS
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTE = "<!-- Written by scripts/reference_pages.py: change the docstrings and help texts, then run make pages. -->"

@@ -67,7 +67,7 @@ def layer_of(part, layers):
 
 
 # Modules that import what their callers name; the names are read where they are stated (``packaged_format``).
-IMPORT_BY_NAME = {"rsvib_torch.core.checks", "rsvib_torch.io.formats"}
+IMPORT_BY_NAME = {"rsvib_torch.checks.values", "rsvib_torch.io.formats"}
 
 
 def imported_modules(source, module):
@@ -194,7 +194,7 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
         ("module = importlib.import_module('rsvib_torch.config')", "rsvib_torch.evaluation.quality"),
-        ("module = importlib.import_module(NAME)", "rsvib_torch.core.presentation"),
+        ("module = importlib.import_module(NAME)", "rsvib_torch.results.presentation"),
         (
             "FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.run_folder', 'RunFolder')",
             "rsvib_torch.io.formats",

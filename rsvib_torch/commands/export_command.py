@@ -8,14 +8,14 @@ from pathlib import Path
 import rsvib_torch
 from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options, read_json
 from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new, size_of
 from rsvib_torch.commands.terminal import Answer, warn, working
-from rsvib_torch.core.atomic import check_writable
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import AXES
-from rsvib_torch.core.validation import options, read_json
+from rsvib_torch.files.atomic import check_writable
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
+from rsvib_torch.text import AXES
 
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
 

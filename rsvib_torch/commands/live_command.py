@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 from pydantic import Field
 
 from rsvib_torch import io, live, tracking
+from rsvib_torch.checks.validation import Count, NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
-from rsvib_torch.core.atomic import check_tree, check_writable
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import number_of
-from rsvib_torch.core.validation import Count, NotNegative, options
+from rsvib_torch.files.atomic import check_tree, check_writable
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import BorderName, TrackerOptions, method_options
+from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import rsvib_torch
 from rsvib_torch import calibration, detection, io
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import Stack, load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.core.atomic import check_writable, whole_file
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import measured_text
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
+from rsvib_torch.text import measured_text
 
 if TYPE_CHECKING:
-    from rsvib_torch.core.presentation import Result
+    from rsvib_torch.results.presentation import Result
 
 
 @options

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from rsvib_torch import detection, io, stacks, tracking
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, warn, working
-from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import number_of
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessStackOptions, ProcessVideoOptions, WindowOptions
+from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
