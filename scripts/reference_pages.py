@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Write docs/configuration.md (all keys of the TOML file), docs/commands.md (all commands) and docs/reasons.md.
+"""Write configuration.md (keys of the TOML file), commands.md, reasons.md and the packages of architecture.md in docs/.
 
 Types, defaults and descriptions come from the groups of options and the parameters of the commands, reasons from their
 table in results/reason.py. A test fails if the pages are out of date.
@@ -13,6 +13,8 @@ from typing import Any, get_args
 
 import griffe
 import typer
+from architecture import table_of_packages
+from harness import with_generated_part
 
 import rsvib_torch as rsv
 from rsvib_torch.checks.validation import expected_text, fields_of
@@ -168,10 +170,12 @@ def reasons_page() -> str:
 def pages() -> dict[Path, str]:
     """Text of the pages, by path."""
     docs = ROOT / "docs"
+    architecture = docs / "architecture.md"
     return {
         docs / "configuration.md": configuration_page(),
         docs / "commands.md": command_page(),
         docs / "reasons.md": reasons_page(),
+        architecture: with_generated_part(architecture.read_text(encoding="utf-8"), table_of_packages()),
     }
 
 

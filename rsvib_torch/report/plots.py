@@ -17,7 +17,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch import detection
+from rsvib_torch import detection, gyroscope
 from rsvib_torch.checks.arguments import check_shapes, checks_arguments
 from rsvib_torch.checks.arrays import Array
 from rsvib_torch.checks.validation import Count
@@ -698,7 +698,7 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     return figure
 
 
-def _check_figure(result: detection.MotionCheck) -> Figure:
+def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
     figure, panels = _two_panels()
     for axis, name, panel in panels:
@@ -714,7 +714,7 @@ def _check_figure(result: detection.MotionCheck) -> Figure:
     return figure
 
 
-def _accelerometer_figure(result: detection.AccelerometerComparison) -> Figure:
+def _accelerometer_figure(result: gyroscope.AccelerometerComparison) -> Figure:
     """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
     figure, panels = _two_panels()
     times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
@@ -730,7 +730,7 @@ def _accelerometer_figure(result: detection.AccelerometerComparison) -> Figure:
     return figure
 
 
-def _rotation_figure(result: detection.RotationAlignment) -> Figure:
+def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
     times = result.times.cpu()
@@ -755,10 +755,10 @@ FIGURES.update(
         (detection.MotionDetection, 0): free_motion_figure,
         (detection.SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,
-        (detection.ClockAlignment, 0): lambda result: motion_figure(result.motion),
-        (detection.RotationAlignment, 0): _rotation_figure,
-        (detection.MotionCheck, 0): _check_figure,
-        (detection.AccelerometerComparison, 0): _accelerometer_figure,
+        (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
+        (gyroscope.RotationAlignment, 0): _rotation_figure,
+        (gyroscope.MotionCheck, 0): _check_figure,
+        (gyroscope.AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(
