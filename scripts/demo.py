@@ -22,14 +22,14 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
-from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.text import text_table
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.options import DetectionMethod
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import write_offsets, write_vibration
 from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.text import text_table
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)

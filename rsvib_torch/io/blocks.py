@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rsvib_torch.core.arrays import Array
+from rsvib_torch.checks.arrays import Array
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
 
 Read = Callable[[int, int], Array]

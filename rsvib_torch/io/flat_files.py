@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from rsvib_torch.core.arrays import Array, channels_appear_last
-from rsvib_torch.core.validation import Section, read_json, validate
+from rsvib_torch.checks.arrays import Array, channels_appear_last
+from rsvib_torch.checks.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale

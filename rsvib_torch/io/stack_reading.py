@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Array, FramesLike
-from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.progress import steps
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import Array, FramesLike
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts

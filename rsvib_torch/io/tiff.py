@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import tifffile
 
-from rsvib_torch.core.arrays import Array
-from rsvib_torch.core.reading import Table
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.array_attributes import attributes_of
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale

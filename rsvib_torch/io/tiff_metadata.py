@@ -11,7 +11,7 @@ from typing import Any
 
 import tifffile
 
-from rsvib_torch.core.reading import Table
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_info import Scope, StackInfo, Tag
 
 _DESCRIPTION, _IMAGEJ_COUNTS, _IMAGEJ = 270, 50838, 50839  # codes of tags
