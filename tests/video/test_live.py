@@ -19,7 +19,7 @@ from refusals import refuses
 from truth import draw_scene
 
 import rsvib_torch as rsv
-from rsvib_torch import live
+from rsvib_torch import video
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.video.sources import FrameCounter, FrameReader
 
@@ -29,11 +29,11 @@ TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1 / 30 / 1e
 def test_raw_frames_of_a_pipe():
     colours = np.arange(2 * 3 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 3)
     data = colours[..., ::-1].tobytes() + b"end"
-    source = live.PipeSource(io.BytesIO(data), (3, 4), "bgr24", TIMING)
+    source = video.PipeSource(io.BytesIO(data), (3, 4), "bgr24", TIMING)
     frames = list(source.frames())
     assert [np.array_equal(one.pixels, np.moveaxis(truth, -1, 0)) for one, truth in zip(frames, colours, strict=True)]
     assert [one.time for one in frames] == pytest.approx([0.0, 1 / 30])
-    deep = live.PipeSource(io.BytesIO(b"\x01\x02" * 6), (2, 3), "gray16le", TIMING)
+    deep = video.PipeSource(io.BytesIO(b"\x01\x02" * 6), (2, 3), "gray16le", TIMING)
     assert next(deep.frames()).pixels.tolist() == [[513] * 3] * 2
     assert deep.full_scale == 65535
 
@@ -51,7 +51,7 @@ class Numbers:
     def frames(self):
         try:
             for index in range(self.count):
-                yield live.TimedFrame(np.full((1, 1), float(index)), index / 30, time.perf_counter())
+                yield video.TimedFrame(np.full((1, 1), float(index)), index / 30, time.perf_counter())
             if self.error is not None:
                 raise self.error
         finally:
@@ -137,7 +137,7 @@ def test_a_camera_at_an_address():
     server = ThreadingHTTPServer(("127.0.0.1", 0), Stream)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        source = live.CameraSource(f"http://127.0.0.1:{server.server_address[1]}/video.mjpg", TIMING)
+        source = video.CameraSource(f"http://127.0.0.1:{server.server_address[1]}/video.mjpg", TIMING)
         frames = list(source.frames())
     finally:
         server.shutdown()
@@ -151,11 +151,11 @@ def test_a_camera_at_an_address():
     assert numbers[-1] == pytest.approx(len(frames) - 1 + source.lost)
     assert np.diff(numbers).min() > 0.99
     with pytest.raises(OSError, match="cannot be opened; check its number or URL"):
-        next(live.CameraSource("http://127.0.0.1:1/none", TIMING).frames())
+        next(video.CameraSource("http://127.0.0.1:1/none", TIMING).frames())
 
 
 def test_the_page_is_served_to_this_machine_only():
-    page = live.PageOutput(0)
+    page = video.PageOutput(0)
     try:
         assert page.url.startswith("http://127.0.0.1:")
         port = urllib.parse.urlsplit(page.url).port
@@ -170,7 +170,7 @@ def test_the_page_is_served_to_this_machine_only():
         assert urllib.request.urlopen(page.url + "state", timeout=5).read() == b"52.0 Hz <x>"
         with pytest.raises(urllib.error.HTTPError):
             urllib.request.urlopen(page.url + "etc/passwd", timeout=5)
-        refuses(lambda: live.PageOutput(port), "choose another port", OSError)
+        refuses(lambda: video.PageOutput(port), "choose another port", OSError)
         with urllib.request.urlopen(page.url + "frames", timeout=5) as stream:
             for index in range(50):  # those before the page has noticed the viewer are not encoded
                 page.write(np.full((16, 24), 200, np.uint8), index)
@@ -187,7 +187,7 @@ def test_video_files(tmp_path, ending):
     frames = (np.random.default_rng(0).random((5, 32, 48, 3)) * 50 + np.arange(5)[:, None, None, None] * 40).astype(
         "u1"
     )
-    output = live.VideoOutput(tmp_path / f"video{ending}", 30.0)
+    output = video.VideoOutput(tmp_path / f"video{ending}", 30.0)
     for index, frame in zip((0, 1, 2, 5, 6), frames, strict=True):  # two are missing
         output.write(frame, index)
     assert len(rsv.read_stack(tmp_path / f"video{ending}")) >= 3  # it can be read while it is written
@@ -202,7 +202,7 @@ def test_video_files(tmp_path, ending):
 
 def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
     path, frame = tmp_path / "video.mkv", np.zeros((32, 32), np.uint8)
-    output = live.VideoOutput(path, 30.0)
+    output = video.VideoOutput(path, 30.0)
     assert not path.exists()  # it is created with the first frame
     output.close()
     path.write_bytes(b"created during the session")
@@ -210,12 +210,12 @@ def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
     assert path.read_bytes() == b"created during the session"
     path.rename(tmp_path / "other")
     path.symlink_to(tmp_path / "other")
-    output = live.VideoOutput(path, 30.0, overwrite=True)
+    output = video.VideoOutput(path, 30.0, overwrite=True)
     output.write(frame, 0)
     output.close()
     assert rsv.read_stack_info(path).shape == (1, 32, 32)
     assert (tmp_path / "other").read_bytes() == b"created during the session"
-    refuses(lambda: live.VideoOutput(tmp_path / "video.gif", 30.0), r"a live video is written to \.mp4")
+    refuses(lambda: video.VideoOutput(tmp_path / "video.gif", 30.0), r"a live video is written to \.mp4")
 
 
 class Tracked:
@@ -238,7 +238,7 @@ def test_the_spectrogram_has_the_amplitudes_at_their_frequencies_and_times(tmp_p
         x = np.where(t < 2.0, 1.5 * np.sin(2 * np.pi * 52 * t), 0.7 * np.sin(2 * np.pi * 80 * t))
         return np.stack([x, 0.3 * np.sin(2 * np.pi * 112 * t + 1)], -1)
 
-    spectrogram = live.Spectrogram(TIMING, duration=0.5, max_frequency=150.0)
+    spectrogram = video.Spectrogram(TIMING, duration=0.5, max_frequency=150.0)
     for index in range(1, 121):
         spectrogram.add(Tracked(index / 30, displacement))
     times, frequencies, amplitude = spectrogram.result()
@@ -253,7 +253,7 @@ def test_the_spectrogram_has_the_amplitudes_at_their_frequencies_and_times(tmp_p
     assert np.isnan(amplitude[:, :, frequencies == 60]).all()  # blind: twice the frame rate
     ghosts = np.isin(frequencies, (22, 82, 112))  # 52 Hz and multiples of the frame rate: no larger than 1 %
     assert np.nanmax(amplitude[0, 1, ghosts]) < 0.01 * np.nanmax(amplitude[0, 1])
-    files = live.save_spectrogram(tmp_path / "spectrum", spectrogram)
+    files = video.save_spectrogram(tmp_path / "spectrum", spectrogram)
     assert [path.name for path in files] == ["spectrum.png", "spectrum.zarr"]
     import zarr
 
@@ -264,7 +264,7 @@ def test_the_spectrogram_has_the_amplitudes_at_their_frequencies_and_times(tmp_p
 
 
 def test_the_memory_of_the_spectrogram_is_bounded():
-    spectrogram = live.Spectrogram(TIMING, duration=0.1, max_frequency=60.0, max_columns=8)
+    spectrogram = video.Spectrogram(TIMING, duration=0.1, max_frequency=60.0, max_columns=8)
     for index in range(1, 120):
         spectrogram.add(Tracked(index / 30, lambda t: np.stack([np.sin(50 * t), np.sin(300 * t)], -1)))
     assert len(spectrogram.result()[0]) <= 9
@@ -274,7 +274,7 @@ def test_a_full_disk_is_named_and_leaves_the_frames_before(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     frames = list(np.random.default_rng(0).integers(0, 256, (64, 64, 64), np.uint8))  # 5 kB each
     for ending in (".mkv", ".mp4"):
-        output = live.VideoOutput(path := tmp_path / f"video{ending}", 30.0)
+        output = video.VideoOutput(path := tmp_path / f"video{ending}", 30.0)
         resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
         try:
             with pytest.raises(OSError, match=f"video{ending}: File too large; the video has the frames before"):
@@ -287,7 +287,7 @@ def test_a_full_disk_is_named_and_leaves_the_frames_before(tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_a_session(tmp_path, number):
-    output, before = live.VideoOutput(tmp_path / "video.mkv", 30.0), signal.getsignal(number)
+    output, before = video.VideoOutput(tmp_path / "video.mkv", 30.0), signal.getsignal(number)
 
     def end(tracked, report):
         if round(tracked.time * 30) == 5:
@@ -300,7 +300,7 @@ def test_signals_end_a_session(tmp_path, number):
         signal.raise_signal(number)
         saved.append(rsv.read_stack(tmp_path / "video.mkv"))
 
-    report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
+    report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
     assert report.frames == len(saved[0])
     assert 6 <= report.frames <= 8  # at most two frames are tracked ahead of the written one
     assert signal.getsignal(number) == before
@@ -310,7 +310,7 @@ def test_the_end_of_a_reader_ends_a_session():
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb", buffering=0) as stream:
-        report = live.run_live(Numbers(), rsv.VibrationTracker(TIMING), [live.PipeOutput(stream)], drops=False)
+        report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [video.PipeOutput(stream)], drops=False)
     assert report.frames == 0
 
 
@@ -328,9 +328,9 @@ class Broken:
 
 def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
     source = Numbers(3, error=OSError("unplugged"))
-    output = live.VideoOutput(tmp_path / "video.mkv", 30.0)
+    output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
     with pytest.raises(OSError, match="unplugged"):
-        live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+        video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
     assert rsv.read_stack_info(tmp_path / "video.mkv").shape == (3, 1, 1)
     assert source.closed
 
@@ -347,7 +347,7 @@ class Shaking:
         begin = time.perf_counter()
         for index, pixels in enumerate(self.pixels):
             time.sleep(max(0.0, begin + index * TIMING.frame_period - time.perf_counter()))
-            yield live.TimedFrame(pixels, index * TIMING.frame_period, time.perf_counter())
+            yield video.TimedFrame(pixels, index * TIMING.frame_period, time.perf_counter())
 
 
 class SlowTracker(rsv.VibrationTracker):
@@ -364,7 +364,7 @@ class SlowTracker(rsv.VibrationTracker):
 def test_the_motion_of_late_frames_is_predicted(drops):
     vibration = rsv.Vibration([2.1, 1.6], [0.37 / TIMING.frame_period] * 2, [0.5, 1.0])
     frames = rsv.simulate_frames(draw_scene(200, 200, seed=3), TIMING, vibration, 40, frame_size=(160, 160)).numpy()
-    report = live.run_live(Shaking(frames), SlowTracker(TIMING, columns=None), [], drops=drops)
+    report = video.run_live(Shaking(frames), SlowTracker(TIMING, columns=None), [], drops=drops)
     assert (report.frames, report.dropped) == (40, 0)
     assert (report.predicted > 5) == drops
 
@@ -372,6 +372,6 @@ def test_the_motion_of_late_frames_is_predicted(drops):
 def test_an_error_of_an_output_ends_the_session(tmp_path):
     source, output = Numbers(), Broken()
     with pytest.raises(OSError, match="disk full"):
-        live.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+        video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
     assert output.closed
     assert source.closed
