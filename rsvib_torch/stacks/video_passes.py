@@ -243,8 +243,9 @@ class VideoPasses:
 
     def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
         """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
-        window = path.nearest(float(times[tracks[len(tracks) // 2].index]))
-        tones = [tone.at(tracks[0].time - window.origin) for tone in window.tones]
+        middle = float(times[tracks[len(tracks) // 2].index])
+        window = path.nearest(middle)
+        tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
         amplitude, frequency, phase = tone_tables(tones, 2)
         size, rate = (np.full_like(amplitude, math.inf) for _ in range(2))
         for axis in (0, 1):
