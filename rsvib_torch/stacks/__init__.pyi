@@ -3,6 +3,7 @@ from .job import WindowResult, restore_block
 from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
 from .process_video import process_video
+from .recorded_motion import align_stack, check_stack_motion
 from .run_folder import StackReport
 from .window_restoration import RestoredFrames, restore_trusted, without_data
 from .windows import Window, cut_windows
@@ -15,6 +16,8 @@ __all__ = [
     "VibrationCorrector",
     "Window",
     "WindowResult",
+    "align_stack",
+    "check_stack_motion",
     "cut_windows",
     "detect_stack",
     "iterate_stack",

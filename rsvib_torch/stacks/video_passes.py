@@ -27,6 +27,7 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration.corners import CornerFollower, Corners
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.stacks.job import stored_frame
+from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.video_frames import FrameTrack, VideoFrames
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import window_record
@@ -36,7 +37,6 @@ from rsvib_torch.tracking.recorded_rotation import RecordedRotation
 from rsvib_torch.tracking.steadying import steady_shifts
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
-_COMPARED_PAIRS = 48  # of frames, over the whole video, by which a gyroscope is aligned
 CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
@@ -88,7 +88,7 @@ class VideoPasses:
         """The motion of all frames, from corners that are followed from each usable frame to the next one."""
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
-        chosen = np.linspace(0, len(self.starts) - 2, _COMPARED_PAIRS).astype(int) if self.rates is not None else ()
+        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
         compared: dict[int, Corners] = {}  # with a gyroscope, corners between the chosen frames and the next ones
 
         def pairs() -> Iterator[Corners | None]:
@@ -140,15 +140,12 @@ class VideoPasses:
 
     def _alignment(self, rates: AngularRates, pairs: dict[int, Corners]) -> RotationAlignment:
         """The alignment of the gyroscope by the corners between some frames, by number, and the next ones."""
-        source = f"the gyroscope ({rates.source})"
-        if not pairs:
-            raise ValueError(f"{source} cannot be compared with the video: it has no two different frames in sequence")
         timing, size = self.frames.job.timing, self.frames.size
-        starts = np.array([self.starts[index : index + 2] for index in pairs])
-        tracks = tracks_of_pairs(list(pairs.values()), starts, timing, size)
-        found = align_rates(tracks, tensor(starts), size if timing.scan_axis == -2 else size[::-1], timing, rates)
+        tracks = tracks_of_pairs(pairs, self.starts, timing, size)
+        starts = tensor(np.array([self.starts[index : index + 2] for index in pairs]))
+        found = align_rates(tracks, starts, size if timing.scan_axis == -2 else size[::-1], timing, rates)
         if not found.reliable:
-            raise ValueError(f"{source} does not fit the video: {'; '.join(found.reasons)}")
+            raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {'; '.join(found.reasons)}")
         return found
 
     def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:

@@ -133,7 +133,7 @@ def test_a_steady_video_follows_the_mean_of_its_path(shaky, tmp_path):
     inner = slice(5, -6)  # near both ends, the mean is over less than a period of the shaking
     assert np.abs(shifts(raw)[inner, 0] - pan).max() > 0.8
     assert np.abs(shifts(steady)[inner, 0] - pan).max() < 0.2  # the video is compressed twice
-    assert np.abs(shifts(steady)[inner, 1]).max() < 0.08
+    assert np.abs(shifts(steady)[inner, 1]).max() < 0.1
     margins = json.loads(report.manifest.read_text())["margins"]
     assert margins["top"] % 2 == margins["left"] % 2 == 0
     assert min(margins.values()) >= 2
