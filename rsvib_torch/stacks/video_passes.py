@@ -66,6 +66,8 @@ class VideoPasses:
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
+    exposures: list[float] | None  # s, of the frames; None: all that of the sensor
+    stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
 
     @property
     def parts(self) -> int:
@@ -86,6 +88,10 @@ class VideoPasses:
 
     def motion(self, progress: Callable[[], None]) -> VideoMotion:
         """The motion of all frames, from corners that are followed from each usable frame to the next one."""
+        timing = self.frames.job.timing
+        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
+        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        times = np.array(self.starts) + half
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
         chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
@@ -111,18 +117,18 @@ class VideoPasses:
                         if before[0] == index - 1 in chosen:
                             starts = self.starts[index - 1 : index + 1]
                             compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
+                        if corners is not None and self.stabilised:
+                            both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
+                            corners = replace(corners, times=both)
                         yield corners
                     before = index, grey
 
-        timing = self.frames.job.timing
-        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
-        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
-        times = np.array(self.starts) + half
         if self.rates is None:
-            path = camera_path(pairs(), timing, self.frames.size)
+            path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
             places = path.places(times)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])
             polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
+            polynomials[:, :2] *= not self.stabilised
 
             def by_corners(index: int) -> Vibration:
                 return self._removed(path.tones(float(times[index])), polynomials[index])
@@ -161,7 +167,8 @@ class VideoPasses:
 
     def track(self, motion: VideoMotion, index: int) -> FrameTrack:
         """What is removed from a frame."""
-        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index))
+        exposure = None if self.exposures is None else self.exposures[index]
+        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
 
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""

@@ -341,7 +341,9 @@ class _WindowFit:
         return float(frequencies[best]), float(ratio), math.sqrt(explained[best] / float(total.sum()))
 
 
-def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: float) -> WindowPath:
+def fit_window(
+    corners: Corners, interval: float, averaged: Averaged, readout: float, has_tones: bool = True
+) -> WindowPath:
     """Path and tones of the corners of a window.
 
     Args:
@@ -349,6 +351,7 @@ def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: f
         interval: T in s, between frames.
         averaged: s; a corner is displaced by the mean of the displacement over these times.
         readout: s, from the first to the last row.
+        has_tones: Whether to look for tones.
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
@@ -358,7 +361,7 @@ def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: f
     frequencies = np.arange(_LOWEST / interval, highest, step)
     is_visible = np.abs(2 * np.sin(math.pi * frequencies * interval)) > _MIN_GAIN
     frequencies = frequencies[is_visible & (np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1) > _MIN_SINC)]
-    axes = [0, 1] if len(frequencies) else []
+    axes = [0, 1] if has_tones and len(frequencies) else []
     while axes:
         found = [fit.strongest(axis, frequencies[fit.is_apart(axis, frequencies)]) for axis in axes]
         axis, (frequency, ratio, offsets) = max(zip(axes, found, strict=True), key=lambda item: item[1][1])
@@ -419,13 +422,16 @@ class CameraPath:
         return min(self.windows, key=lambda window: abs(window.origin - time))
 
 
-def camera_path(pairs: Iterable[Corners | None], timing: SensorTiming, size: tuple[int, int]) -> CameraPath:
+def camera_path(
+    pairs: Iterable[Corners | None], timing: SensorTiming, size: tuple[int, int], *, has_tones: bool = True
+) -> CameraPath:
     """Path of a camera from the corners of all pairs of neighbouring frames.
 
     Args:
         pairs: Corners of each pair; None where there are too few.
         timing: The sensor.
         size: (height, width) of the frames in px.
+        has_tones: Whether to look for tones.
 
     Raises:
         ValueError: If no window of frames has corners in a quarter of its pairs.
@@ -438,7 +444,8 @@ def camera_path(pairs: Iterable[Corners | None], timing: SensorTiming, size: tup
     def fit() -> None:
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
-            windows.append(fit_window(Corners.joined(known), timing.frame_period, averaged, readout))
+            joined = Corners.joined(known)
+            windows.append(fit_window(joined, timing.frame_period, averaged, readout, has_tones))
 
     fitted = 0
     for pair in pairs:
