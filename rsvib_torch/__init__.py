@@ -8,7 +8,7 @@ from pathlib import Path
 
 import lazy_loader
 
-from rsvib_torch.core.figures import register_figures
+from rsvib_torch.results.figures import register_figures
 
 register_figures(lambda: import_module("rsvib_torch.report.plots"))
 __getattr__, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)

@@ -24,8 +24,8 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
-from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.options import DetectionMethod
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure

@@ -31,9 +31,11 @@ PACKAGES = (
     "restoration",
     "imaging",
     "registration",
-    "calibration",
+    "row_time",
+    "gyroscope",
     "io",
     "stacks",
+    "video",
     "evaluation",
     "augmentation",
 )

@@ -15,12 +15,10 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import check_tensor, checks_arguments
-from rsvib_torch.core.arrays import channels_appear_last
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
-from rsvib_torch.core.precision import full_precision
-from rsvib_torch.core.splines import gauss_legendre, mirrored
-from rsvib_torch.core.text import quoted
+from rsvib_torch.checks.arguments import check_tensor, checks_arguments
+from rsvib_torch.checks.arrays import channels_appear_last
+from rsvib_torch.checks.values import check_choice, check_number, check_whole_number
+from rsvib_torch.execution.precision import full_precision
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
@@ -29,6 +27,8 @@ from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_f
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import gauss_legendre, mirrored
+from rsvib_torch.text import quoted
 
 Range = float | Sequence[float] | Sequence[Sequence[float]]
 Parameters = dict[str, Tensor]

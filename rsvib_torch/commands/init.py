@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsvib_torch import io
+from rsvib_torch import gyroscope, io
+from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import next_step
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_exposure, stated_rate
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.core.atomic import check_writable, whole_file
-from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import measured_text, printable, text_table
-from rsvib_torch.core.validation import MistakesError, fields_of, options
+from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
+from rsvib_torch.text import measured_text, printable, text_table
 
 if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo
@@ -172,7 +172,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         likely["full_scale"] = _likely_full_scale(first)
     elif info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
-    track = io.read_camera_track(path)
+    track = gyroscope.read_camera_track(path)
     if track is not None and "exposure_time" not in values and (exposure := stated_exposure(path)) is not None:
         values["exposure_time"] = exposure
     if track is not None and track.stabilised:

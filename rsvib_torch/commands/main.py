@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 import rsvib_torch
+from rsvib_torch.checks.validation import MistakesError
 from rsvib_torch.commands import motion_commands, stack_commands
 from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.flat_command import flat_command
@@ -18,7 +19,6 @@ from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
 from rsvib_torch.commands.run_stack import run
 from rsvib_torch.commands.terminal import Answer, error_line, print_line, running, warnings_in_one_line
-from rsvib_torch.core.validation import MistakesError
 
 _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "init": init,

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from rsvib_torch import io
+from rsvib_torch import gyroscope, io
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import AXES
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
+from rsvib_torch.text import AXES
 
 if TYPE_CHECKING:
     import torch
@@ -285,7 +285,7 @@ def stated_rate(info: "StackInfo") -> float | None:
 
 def stated_exposure(path: Path) -> float | None:
     """Exposure in s that the track of a GoPro video states, the median over its frames."""
-    track = io.read_camera_track(path)
+    track = gyroscope.read_camera_track(path)
     if track is None or not len(track.exposures):
         return None
     exposures: list[float] = track.exposures.tolist()

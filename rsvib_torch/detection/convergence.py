@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, split_axis
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residual_of
 from rsvib_torch.detection.tones.selection import robust_fit
+from rsvib_torch.numerics.tables import Array, split_axis
 
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 # A step was inexact if the next round corrects more than this part of it. Without long exposures, 0.1 is corrected

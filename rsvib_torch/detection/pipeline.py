@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine
@@ -38,6 +37,7 @@ from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_r
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from rsvib_torch.core.tables import Array, median, select_stacks, table, take_stacks, valid_mean, without_nan
 from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -46,6 +45,7 @@ from rsvib_torch.detection.tones.selection import (
     with_best_aliases,
 )
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.numerics.tables import Array, median, select_stacks, table, take_stacks, valid_mean, without_nan
 from rsvib_torch.registration.gradients import RowGradients
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_single
-from rsvib_torch.core.fourier import fourier_sums
-from rsvib_torch.core.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
-from rsvib_torch.core.tables import Array, table, tensor, unit_wave
-from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.fourier import fourier_sums
+from rsvib_torch.numerics.tables import Array, table, tensor, unit_wave
 from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.results.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
+from rsvib_torch.text import measured_text, text_table
 
 BLIND_GAIN = 0.1  # of the largest response; noise is amplified tenfold, and errors of the timing as well
 _SEARCHED_GAIN = 0.01  # a line in a blind band has ghosts outside, one frame rate away, if it is not subtracted
@@ -60,7 +60,7 @@ class DisplacementSpectrum(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)
         >>> spectrum = rsv.detect_vibration(frames, timing).spectrum()
         >>> spectrum.lines.frequency[:, 0].round().tolist()  # Hz

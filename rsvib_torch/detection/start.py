@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.tables import Array, split_axis, table, tables
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.numerics.tables import Array, split_axis, table, tables
 from rsvib_torch.options import RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.register import check_frame_size, fits_frame, register_rows

@@ -1,6 +1,6 @@
 """The verdict on detected vibrations: the reasons against each axis.
 
-``core/reason.py`` has their texts, docs/verdicts.md the measurements that the limits were chosen with.
+``results/reason.py`` has their texts, docs/verdicts.md the measurements that the limits were chosen with.
 """
 
 import math
@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.registration.register import OffsetCurve, similar_share
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 
 Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
 

@@ -14,17 +14,17 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import check_images, checks_arguments
-from rsvib_torch.core.banded_solver import solve_banded
-from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
-from rsvib_torch.core.validation import Positive
+from rsvib_torch.checks.arguments import check_images, checks_arguments
+from rsvib_torch.checks.validation import Positive
 from rsvib_torch.frames.orientation import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing, simulate_frames
 from rsvib_torch.motion.field import ColumnMotion, displacement_factors
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.banded_solver import solve_banded
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 
 _DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5

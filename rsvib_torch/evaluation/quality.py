@@ -7,9 +7,9 @@ from kornia.metrics import ssim as kornia_ssim
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checks_arguments
-from rsvib_torch.core.arrays import FramesLike, as_tensor
-from rsvib_torch.core.validation import Positive
+from rsvib_torch.checks.arguments import check_broadcast, checks_arguments
+from rsvib_torch.checks.arrays import FramesLike, as_tensor
+from rsvib_torch.checks.validation import Positive
 
 _Rim = Annotated[int, Field(ge=0)]
 

@@ -12,20 +12,20 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import check_broadcast, check_images, checked_methods, checks_arguments
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.splines import (
+from rsvib_torch.checks.arguments import check_broadcast, check_images, checked_methods, checks_arguments
+from rsvib_torch.checks.values import check_choice, check_whole_number
+from rsvib_torch.execution.precision import full_precision, outside_graphs
+from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming
+from rsvib_torch.numerics.splines import (
     bspline_coefficients,
     bspline_coefficients_adjoint,
     bspline_weights,
     mirrored,
     spread_taps,
 )
-from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
-from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming
 
 Interpolation = Literal["linear", "cubic"]
 SPLINE_DEGREES: dict[str, int] = {"linear": 1, "cubic": 3}

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.splines import gauss_legendre
-from rsvib_torch.core.tables import Array, cos_sin, tables, tensor
+from rsvib_torch.checks.values import check_choice, check_whole_number
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.tables import Array, cos_sin, tables, tensor
 
 Quadrature = Literal["midpoint", "gauss"]
 

@@ -1,6 +1,5 @@
 from .formats import StackFormat, register_format
 from .frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
-from .gyroscope.gpmf_track import read_camera_track
 from .stack_info import FrameError, FrameReader, StackInfo
 from .stack_reading import open_stack, read_stack, read_stack_info
 from .stack_writing import check_stack_target, metadata_not_kept, stack_files, write_stack
@@ -16,7 +15,6 @@ __all__ = [
     "exposure_times",
     "metadata_not_kept",
     "open_stack",
-    "read_camera_track",
     "read_stack",
     "read_stack_info",
     "register_format",

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from rsvib_torch.core.arrays import channels_appear_last
+from rsvib_torch.checks.arrays import channels_appear_last
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rsvib_torch.core.arrays import channels_appear_last
-from rsvib_torch.core.validation import Section, read_json, validate
+from rsvib_torch.checks.arrays import channels_appear_last
+from rsvib_torch.checks.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale

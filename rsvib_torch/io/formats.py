@@ -12,15 +12,15 @@ from typing import Any, Literal
 
 from numpy.typing import NDArray
 
-from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.text import quoted
+from rsvib_torch.files.reading import check_regular
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+from rsvib_torch.text import quoted
 
 Frame = NDArray[Any]
 
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
-# folder, which the caller renames when it is complete (``rsvib_torch/core/atomic.py``).
+# folder, which the caller renames when it is complete (``rsvib_torch/files/atomic.py``).
 #
 # Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
 #              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.text import number_of
+from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming
+from rsvib_torch.text import number_of
 
 _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
 

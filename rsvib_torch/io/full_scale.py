@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.checks.values import check_number
 
 
 def check_dtype(dtype: np.dtype[Any]) -> None:

@@ -11,9 +11,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import check_fields, checked_methods
-from rsvib_torch.core.presentation import Summarised
-from rsvib_torch.core.text import one_line
+from rsvib_torch.checks.arguments import check_fields, checked_methods
+from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
 H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)

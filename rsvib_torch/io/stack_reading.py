@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import FramesLike
-from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.progress import steps
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import FramesLike
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts

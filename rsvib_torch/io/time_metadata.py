@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from PIL import ExifTags, Image
 
-from rsvib_torch.core.text import one_line
+from rsvib_torch.text import one_line
 
 _SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.checks import needed_package
+from rsvib_torch.checks.values import needed_package
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype

@@ -5,8 +5,16 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from rsvib_torch.core.checks import described
-from rsvib_torch.core.presentation import (
+from rsvib_torch.checks.values import described
+from rsvib_torch.motion.vibration import (
+    Vibration,
+    VibrationStd,
+    image_motion_line,
+    tone_head,
+    tone_places,
+    tone_rows,
+)
+from rsvib_torch.results.presentation import (
     AXIS_NAMES,
     PHYSICAL_HEAD,
     JudgedResult,
@@ -17,15 +25,7 @@ from rsvib_torch.core.presentation import (
     plain_values,
     verdict_table,
 )
-from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.motion.vibration import (
-    Vibration,
-    VibrationStd,
-    image_motion_line,
-    tone_head,
-    tone_places,
-    tone_rows,
-)
+from rsvib_torch.text import measured_text, text_table, wrapped
 
 _UNITS_OF_AXES = ("px", "px", "rad", "relative")  # in names of columns
 
@@ -115,7 +115,7 @@ class DetectedVibration(
 
         Example:
             >>> import rsvib_torch as rsv
-            >>> from rsvib_torch.evaluation import example_frames
+            >>> from rsvib_torch.datasets import example_frames
             >>> frames, timing, _ = example_frames()
             >>> table = rsv.detect_vibration(frames, timing).table(pixel_size=5e-6)
             >>> table["axis"], table["tone"], [round(value, 1) for value in table["amplitude_um"]]

@@ -9,11 +9,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checked_methods
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.checks.arguments import check_broadcast, checked_methods
+from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
+from rsvib_torch.results.presentation import Result
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, checked_methods
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.presentation import axis_head, axis_rows
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
-from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.checks.arguments import as_numbers, checked_methods
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
+from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, gauss_legendre
+from rsvib_torch.results.presentation import axis_head, axis_rows
+from rsvib_torch.text import measured_text, text_table
 
 MAX_DISPLACEMENT = 1e9  # px; image motion of 1e5 px/s for three hours
 MAX_KNOTS = 100_000_000  # 1.6 GB of coefficients; a gyroscope with 8 kHz for three hours

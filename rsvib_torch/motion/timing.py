@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import model_validator
 
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
-from rsvib_torch.core.reading import read_toml
-from rsvib_torch.core.validation import Section, checked, validate
+from rsvib_torch.checks.validation import Section, checked, validate
+from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
+from rsvib_torch.files.reading import read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -115,7 +115,7 @@ class SensorTiming:
         object.__setattr__(self, "frame_rows", frame_rows)
         object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
         if self.frame_start_times is not None:
-            from rsvib_torch.core.arguments import as_numbers  # noqa: PLC0415
+            from rsvib_torch.checks.arguments import as_numbers  # noqa: PLC0415
 
             times = as_numbers("frame_start_times", self.frame_start_times).flatten().tolist()
             starts = tuple(check_number("frame_start_times", start) for start in times)
@@ -241,7 +241,7 @@ class SensorTiming:
         """
         import torch  # noqa: PLC0415
 
-        from rsvib_torch.core.arguments import check_device  # noqa: PLC0415
+        from rsvib_torch.checks.arguments import check_device  # noqa: PLC0415
 
         count = check_whole_number("num_frames", num_frames, at_least=0, at_most=MAX_FRAMES)
         device = check_device("device", "cpu" if device is None else device)

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array, table, tensor
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel

@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks
-from rsvib_torch.core.fourier import fast_length
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.execution.chunking import chunks
+from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.registration.row_spectra import (
     combined,
     differences,

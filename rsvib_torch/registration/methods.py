@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.execution.chunking import chunks
+from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.registration.bands import (
     BINNING,
     LAGS,

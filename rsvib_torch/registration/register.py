@@ -16,19 +16,19 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.chunking import at_once, chunks, runs
-from rsvib_torch.core.fourier import fast_length
-from rsvib_torch.core.presentation import Result
-from rsvib_torch.core.progress import steps
+from rsvib_torch.checks.values import check_choice
+from rsvib_torch.execution.chunking import at_once, chunks, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
 from rsvib_torch.registration.bands import BandTask, template_margin
 from rsvib_torch.registration.methods import BAND_METHODS
+from rsvib_torch.results.presentation import Result
 
 # Correlation of bands of independent noise times the root of their pixels: medians of 12.6 (32 x 128 px), 10.4 (32 x
 # 256 px) and 10.6 (32 x 320 px) were measured, of the bands that count as registered.

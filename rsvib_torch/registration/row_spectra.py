@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import at_once, chunks, gathered, runs
-from rsvib_torch.core.fourier import (
+from rsvib_torch.execution.chunking import at_once, chunks, gathered, runs
+from rsvib_torch.numerics.fourier import (
     extend_rows,
     fast_length,
     phase_products,
@@ -21,7 +21,7 @@ from rsvib_torch.core.fourier import (
     shift_phases,
     squared_modulus,
 )
-from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
+from rsvib_torch.numerics.splines import bspline_coefficient_rows, bspline_weights
 
 DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
 MARGIN = 8  # px; rows and columns this close to an edge have no weight: they are interpolated from extended values

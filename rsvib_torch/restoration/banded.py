@@ -10,12 +10,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extend_rows, extended_length
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.splines import bspline_weights, mirrored
+from rsvib_torch.checks.values import check_whole_number
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.numerics.fourier import extend_rows, extended_length
+from rsvib_torch.numerics.splines import bspline_weights, mirrored
 from rsvib_torch.options import BandedOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.values import check_whole_number
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import squared_modulus, waves
+from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts
+from rsvib_torch.numerics.fourier import squared_modulus, waves
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
 from rsvib_torch.restoration.scene_model.observation import row_kernels

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arrays import ArrayLike
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, outside_graphs
+from rsvib_torch.checks.arrays import ArrayLike
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, outside_graphs
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
@@ -137,7 +137,7 @@ def restore(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
@@ -238,7 +238,7 @@ class VibrationRestorer(TimedModule):
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
         >>> model = torch.nn.Conv2d(1, 4, 3)  # any network

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.progress import steps
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
 from rsvib_torch.options import RichardsonLucyOptions
 from rsvib_torch.restoration.dewarp import restore_dewarp

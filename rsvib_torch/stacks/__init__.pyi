@@ -2,7 +2,6 @@ from .corrector import CorrectedFrames, VibrationCorrector
 from .job import WindowResult, restore_block
 from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
-from .process_video import process_video
 from .recorded_motion import align_stack, check_stack_motion
 from .run_folder import StackReport
 from .window_restoration import RestoredFrames, restore_trusted, without_data
@@ -22,7 +21,6 @@ __all__ = [
     "detect_stack",
     "iterate_stack",
     "process_stack",
-    "process_video",
     "read_manifest",
     "restore_block",
     "restore_trusted",

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
@@ -120,7 +120,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
         >>> rsv.write_stack(f"{folder}/frames.npy", frames)

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.detection.recorded.alignment import ClockAlignment, FittedClock, align_motion
-from rsvib_torch.detection.recorded.clock_range import offset_range, outside
-from rsvib_torch.detection.recorded.corner_tracks import corner_tracks
-from rsvib_torch.detection.recorded.motion_check import MotionCheck, check_motion
-from rsvib_torch.detection.recorded.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
+from rsvib_torch.gyroscope.clock_range import offset_range, outside
+from rsvib_torch.gyroscope.corner_tracks import corner_tracks
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.motion_check import MotionCheck, check_motion
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.frame_times import timing_from_first_frame
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.stack_reading import open_stack
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.gyroscope_rates import AngularRates
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import stored_frame

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import softmax
 
-from rsvib_torch.core.tables import Array, median, split_axis, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
+from rsvib_torch.numerics.tables import Array, median, split_axis, without_nan
 
 # Random walk of g and 2 pi f in rad/s per square root of a second, and of a in px/s^2 per square root of a second.
 # A tone that sweeps by 2 Hz/s changes by 12.6 rad/s in a second; a tone that grows to twice its amplitude has 0.7 / s.

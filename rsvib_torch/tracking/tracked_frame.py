@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.tables import table, tensor
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.assemble import assembled, offset_curve
 from rsvib_torch.detection.measurements import Measurements
@@ -19,6 +18,7 @@ from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import table, tensor
 from rsvib_torch.options import TrackerOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames

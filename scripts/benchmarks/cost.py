@@ -19,7 +19,7 @@ from benchmarks.honesty_cases import BLANKING, FRAME_PERIOD, of_tones, plain, re
 from harness import Rows, in_turns, named, seconds_of, shown_seconds, table
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 OPTIONS = {
     "cost_size": (384, "cost: rows and columns of the difficult inputs"),

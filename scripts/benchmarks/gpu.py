@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 _CUDA = "cuda" in devices()
 OPTIONS = {

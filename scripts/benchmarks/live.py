@@ -20,8 +20,8 @@ from harness import Rows, table
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
-from rsvib_torch.live import LiveReport, TimedFrame, run_live
+from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.video import LiveReport, TimedFrame, run_live
 
 OPTIONS = {
     "minutes": (0.5, "live: duration of the session"),

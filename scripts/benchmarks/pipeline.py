@@ -21,7 +21,7 @@ from harness import Rows, Timed, in_turns, named, shown_seconds, table
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
 
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "city": city_and_fields,

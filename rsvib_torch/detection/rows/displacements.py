@@ -18,16 +18,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks, runs
-from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
+from rsvib_torch.execution.chunking import chunks, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing, shown_by_tones
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.registration.gradients import (
     BLOCK,
     RowGradients,

@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import Array, table, take_stacks, tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroups,
@@ -29,12 +27,14 @@ from rsvib_torch.detection.rows.displacements import (
     uneven_motion,
 )
 from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import Array, table, take_stacks, tensor
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import MARGIN
 

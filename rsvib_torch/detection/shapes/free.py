@@ -18,20 +18,15 @@ from scipy import linalg
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, without_gradients
-from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.splines import gauss_legendre, spline_taps
-from rsvib_torch.core.tables import Array, table, tensor
-from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
@@ -45,8 +40,13 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
+from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text
 
 MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
 _SECOND = (1.0, -2.0, 1.0)  # second difference
@@ -91,7 +91,7 @@ class MotionDetection(
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> found = rsv.detect_motion(frames, timing)
         >>> found.motion.displacement(torch.tensor(0.01, dtype=torch.float64)).shape  # px along x and y at 10 ms
@@ -148,7 +148,7 @@ def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMoti
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
         >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px

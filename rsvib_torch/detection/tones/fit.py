@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from scipy.linalg import block_diag
 
-from rsvib_torch.core.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
 # px, amplitude of tones near blind frequencies, of x, y, roll and zoom. A clip with a blind vibration along y was

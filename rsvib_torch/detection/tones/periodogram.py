@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.fourier import fourier_sums
-from rsvib_torch.core.tables import Array, quantile, split_axis, take_stacks, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, tone_response
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.numerics.fourier import fourier_sums
+from rsvib_torch.numerics.tables import Array, quantile, split_axis, take_stacks, without_nan
 
 _OVERSAMPLING = 8  # grid points per 1 / duration: a peak between two of them keeps 98 % of its height
 _MAX_POWERS = 2**18  # frequencies, times weightings and stacks, at a time; each takes about 1.3 kB

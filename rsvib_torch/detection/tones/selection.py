@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, median, quantile, select_stacks, split_axis, take_stacks, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import (
     LARGEST,
@@ -18,6 +17,7 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
+from rsvib_torch.numerics.tables import Array, median, quantile, select_stacks, split_axis, take_stacks, without_nan
 from rsvib_torch.options import MAX_TONES
 
 MIN_SIGNIFICANCE = 4.0  # amplitude over its standard deviation

@@ -31,8 +31,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
@@ -46,7 +44,9 @@ from rsvib_torch.detection.tones.fit import (
     tone_response,
     vibration_of_fit,
 )
+from rsvib_torch.execution.chunking import runs
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 
 # Mean, and standard deviations of b, c and s, of x and of y over the expected size of b; chosen with 220 recordings of
 # drawn and real scenes. In 60 others each behind optics of 0.4 and 0.55 px, with one tone in 2 to 8 frames, the rms

@@ -8,12 +8,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -30,7 +27,10 @@ from rsvib_torch.report.html.template import (
     write_page,
 )
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks import StackManifest
+from rsvib_torch.text import measured_text
 
 Box = tuple[int, int, int, int]  # top, left, height, width in px
 

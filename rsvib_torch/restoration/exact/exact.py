@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
-from rsvib_torch.core.parallel import in_parallel
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import take_stacks
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.numerics.fourier import extend_rows, extended_length, fast_length
+from rsvib_torch.numerics.tables import take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import (
     FILLED_BLUR_REACH,

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.fourier import squared_modulus
+from rsvib_torch.numerics.fourier import squared_modulus
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
-from rsvib_torch.core.fourier import extend_rows
-from rsvib_torch.core.progress import steps
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
+from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.exact import given_level, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values

@@ -20,15 +20,15 @@ from math import prod
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import (
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
+from rsvib_torch.numerics.banded_solver import (
     BandedFactor,
     InterpolatedFactors,
     factor_banded,
     node_frequencies,
     solve_halves,
 )
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import allowed_threads, in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
 

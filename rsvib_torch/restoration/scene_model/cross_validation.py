@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.fourier import waves
-from rsvib_torch.core.parallel import allowed_threads, in_parallel
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
+from rsvib_torch.numerics.fourier import waves
 from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 

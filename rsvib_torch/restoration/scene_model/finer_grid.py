@@ -21,8 +21,8 @@ from math import pi
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.splines import bspline_weights
 from rsvib_torch.imaging.blur import row_taps
+from rsvib_torch.numerics.splines import bspline_weights
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import (
     MARGIN,

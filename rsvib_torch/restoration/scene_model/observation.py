@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import from_both_ends
-from rsvib_torch.core.fourier import shift_phases
-from rsvib_torch.core.splines import correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
+from rsvib_torch.numerics.banded_solver import from_both_ends
+from rsvib_torch.numerics.fourier import shift_phases
+from rsvib_torch.numerics.splines import correlated, gauss_legendre
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
-from rsvib_torch.core.splines import mirrored
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
+from rsvib_torch.numerics.splines import mirrored
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
 

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extended_length, spline_spectra
-from rsvib_torch.core.splines import correlated
+from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts, detailed_parts
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.numerics.fourier import extended_length, spline_spectra
+from rsvib_torch.numerics.splines import correlated
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear

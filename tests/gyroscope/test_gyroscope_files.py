@@ -1,0 +1,182 @@
+"""Angular rates from gyroflow logs, GPMF tracks and CSV files, written here byte by byte."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from gpmf_file import RATES, TIMES, box, mp4, packet, packets_of
+from refusals import refuses
+
+import rsvib_torch as rsv
+from rsvib_torch.gyroscope import read_camera_track
+
+
+def lines_of(times, rates):
+    return [",".join(f"{value:.10g}" for value in (time, *row)) for time, row in zip(times, rates, strict=True)]
+
+
+def gcsv(path, *, orientation="XYZ", header=(), columns="t,gx,gy,gz,ax,ay,az", rows=None):
+    """A gyroflow log with times in ms and rates in units of 0.5 mrad/s."""
+    raw = np.round(RATES / 5e-4).astype(int)
+    rows = [f"{5 * i},{x},{y},{z},0,0,1" for i, (x, y, z) in enumerate(raw)] if rows is None else rows
+    start = [
+        "GYROFLOW IMU LOG",
+        "version,1.3",
+        "id,test",
+        f"orientation,{orientation}",
+        "tscale,0.001",
+        "gscale,0.0005",
+    ]
+    path.write_text("\n".join([*start, *header, columns, *rows]) + "\n")
+    return path
+
+
+def test_gyroflow_log(tmp_path):
+    found = rsv.read_gyroscope(gcsv(tmp_path / "clip.gcsv"))
+    assert np.allclose(found.times.numpy(), TIMES, atol=1e-12)
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-12)
+    assert "gyroflow" in found.source
+    assert "200 Hz" in found.summary()
+    with pytest.raises(ValueError, match="states its units; omit unit"):
+        rsv.read_gyroscope(tmp_path / "clip.gcsv", unit="rad/s")
+
+
+def test_orientation_of_a_gyroflow_log(tmp_path):
+    found = rsv.read_gyroscope(gcsv(tmp_path / "clip.gcsv", orientation="YxZ")).rates.numpy()
+    assert np.allclose(found, np.stack([RATES[:, 1], -RATES[:, 0], RATES[:, 2]], -1), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "factor", "options"),
+    [
+        ("time_s,x_rad_s,y_rad_s,z_rad_s", (1.0, 1.0), {}),
+        ("t (ms),gx (deg/s),gy (deg/s),gz (deg/s)", (1e3, 180 / math.pi), {}),
+        ("Timestamp, gyro_x, gyro_y, gyro_z", (1e6, 180 / math.pi), {"unit": "deg/s", "time_unit": "us"}),
+    ],
+)
+def test_csv(tmp_path, names, factor, options):
+    path = tmp_path / "clip.csv"
+    path.write_text("\n".join([names, *lines_of(TIMES * factor[0], RATES * factor[1])]))
+    found = rsv.read_gyroscope(path, **options)
+    assert np.allclose(found.times.numpy(), TIMES, atol=1e-9)
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-8)
+
+
+def test_gopro_video(tmp_path):
+    found = rsv.read_gyroscope(mp4(tmp_path / "clip.MP4", packets_of(), duration=100))
+    assert np.allclose(found.times.numpy(), TIMES, atol=1e-9)  # packets of 20 samples in 0.1 s
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-9)
+    turned = rsv.read_gyroscope(mp4(tmp_path / "turned.mp4", packets_of(orientation=b"zXy"), duration=100)).rates
+    assert np.allclose(turned.numpy(), np.stack([-RATES[:, 2], RATES[:, 0], -RATES[:, 1]], -1), atol=1e-9)
+
+
+def test_gopro_times_are_those_of_the_video(tmp_path):
+    # the clock of the stamps starts anywhere: the first one of any sensor is time 0 of the video
+    def stamp(number):
+        return 5_020_000 + (0, 100_000, 210_000)[number]
+
+    packets = packets_of(stamp=stamp, first=lambda n: 5_000_000 + 100_000 * n)
+    stamps = rsv.read_gyroscope(mp4(tmp_path / "stamp.mp4", packets, duration=100))
+    assert stamps.times[[0, 20, 30, 40]].tolist() == pytest.approx([0.02, 0.12, 0.175, 0.23])
+
+
+def test_gopro_gyroscope_that_starts_late_and_ends_early(tmp_path):
+    # the first packet has 13 of 20 samples, the last one 4: their ends are those of the video nevertheless
+    counts = np.cumsum([0, 13, 20, 20, 4])
+    packets = [packet(RATES[a:b], total=b) for a, b in itertools.pairwise(counts)]
+    found = rsv.read_gyroscope(mp4(tmp_path / "late.mp4", packets, duration=100))
+    assert found.times[[0, 13, 33, 56]].tolist() == pytest.approx([0.035, 0.1, 0.2, 0.315])
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path: gcsv(path, rows=["0,1,2,3", "5,x,2,3"]), "line 9: gx must be a number, got 'x'"),
+        (lambda path: gcsv(path, orientation="XXZ"), "orientation must have x, y and z once each"),
+        (lambda path: gcsv(path, columns="t,ax,ay,az"), "columns t, gx, gy and gz expected"),
+        (lambda path: path.write_text("GYROFLOW IMU LOG\nversion,1.3\n"), "without a line of column names"),
+        (lambda path: path.write_text("time,gx,gy,gz\n" + "0,0,0,0\n" * 5), "the unit of the rates is not stated"),
+        (lambda path: path.write_text("time,gx_dps,gy_rad_s,gz_dps\n"), "the first line states deg/s, rad/s"),
+        (lambda path: path.write_text("time,gx,rate_x,gy,gz\n"), "could both be x"),
+        (lambda path: path.write_text("time,x_dps,y_dps,z_dps\n" + "7" * 200_000), "a line of more than 65536"),
+        (
+            lambda path: path.write_text("t,x_dps,y_dps,z_dps\n" + "1,0,0,0\n" * 5),
+            "times must increase, but sample 1 at 1 s",
+        ),
+        (lambda path: mp4(path, [b"\0\0\0\1"] * 3, kind=b"tmcd"), "a video without a GPMF track"),
+        (lambda path: mp4(path, packets_of(), count=2**31), "damaged MP4 file"),
+        (lambda path: mp4(path, packets_of(), offsets=[2**31] * 3), "a video without a GPMF track"),
+        (lambda path: mp4(path, [packets_of()[0][:-40]] * 3), "damaged MP4 file: a GPMF entry"),
+        (lambda path: path.write_bytes(box(b"ftyp", b"mp41") + b"\xff\xff\xff\xffmdat"), "damaged MP4 file"),
+        (lambda path: path.write_bytes(box(b"ftyp", b"mp41")), "damaged MP4 file"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(tmp_path, write, message):
+    path = tmp_path / "clip.dat"
+    write(path)
+    with pytest.raises(ValueError, match=r"clip\.dat") as caught:
+        rsv.read_gyroscope(path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_random_damage_ends_in_an_error_or_a_result(tmp_path):
+    whole = mp4(tmp_path / "clip.mp4", packets_of()).read_bytes()
+    random = np.random.default_rng(0)
+    outcomes = set()
+    for _ in range(300):
+        data = bytearray(whole)
+        for place in random.integers(0, len(data), 3):
+            data[place] = random.integers(256)
+        path = tmp_path / "damaged.mp4"
+        path.write_bytes(data)
+        try:
+            rsv.read_gyroscope(path)
+            outcomes.add("read")
+        except ValueError as error:
+            outcomes.add("several lines" if "\n" in str(error) else "refused")
+    assert outcomes == {"read", "refused"}
+
+
+@pytest.mark.parametrize(
+    ("columns", "row", "message"),
+    [
+        ("time,x,y,z", "{0},1,0,1,0,2,0,3", r"line 2: 8 values in 4 columns; write decimal points, not commas"),
+        ("time,x,y,z,x", "{0},1,2,3,4", "column 'x' occurs twice|could both be x"),
+    ],
+)
+def test_decimal_commas_and_repeated_columns_are_refused(tmp_path, columns, row, message):
+    """Motions were read from the wrong cells: decimal commas shift them, and the last of two columns counted."""
+    rows = [row.format(number) for number in range(8)]
+    (tmp_path / "a.csv").write_text("\n".join([columns, *rows]))
+    message = f"a.{{}}.*({message})"
+    refuses(lambda: rsv.read_motion(tmp_path / "a.csv", unit="px"), message.format("csv"))
+    refuses(lambda: rsv.read_gyroscope(tmp_path / "a.csv", unit="rad/s"), message.format("csv"))
+    log = gcsv(
+        tmp_path / "a.gcsv", columns=columns.replace("time", "t").replace("x", "gx").replace("y,z", "gy,gz"), rows=rows
+    )
+    refuses(lambda: rsv.read_gyroscope(log), message.format("gcsv").replace("line 2", "line 8").replace("'x'", "'gx'"))
+
+
+@pytest.mark.parametrize(("turned", "stated"), [((1.0, 0.0, 0.0, 0.0), False), ((0.9998, 0.0, 0.02, 0.0), True)])
+def test_images_that_the_camera_has_stabilised_are_stated(tmp_path, turned, stated):
+    found = rsv.read_gyroscope(mp4(tmp_path / "clip.mp4", packets_of(turned=[turned] * 3)))
+    assert ("IORI" in found.source) == stated
+    assert np.allclose(found.rates.numpy(), RATES, atol=1e-9)
+
+
+def test_exposures_and_rotations_of_the_images_in_a_track(tmp_path):
+    exposures = [[0.002] * 9, [0.002] * 5 + [0.004] * 4, [0.004] * 9]
+    turned = [[0.9998, 0.0, 0.02, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    path = mp4(tmp_path / "clip.mp4", packets_of(exposures=lambda number: exposures[number], turned=turned))
+    track = read_camera_track(path)
+    assert len(track.exposures) == 27
+    assert track.exposures_at(np.array([0.1, 0.3 + 0.1, 0.3 + 0.2, 0.8])) == pytest.approx([0.002, 0.002, 0.004, 0.004])
+    assert track.turned == pytest.approx(0.04, rel=1e-2)
+    assert track.stabilised
+    plain = read_camera_track(mp4(tmp_path / "plain.mp4", packets_of()))
+    assert len(plain.exposures) == 0
+    assert not plain.stabilised
+    assert read_camera_track(mp4(tmp_path / "other.mp4", packets_of(), kind=b"text")) is None
+    assert read_camera_track(tmp_path / "missing.tif") is None
