@@ -52,11 +52,9 @@ def measured_text(
 ) -> str:
     """Format ``value ± std`` with two significant digits of the standard deviation.
 
-    Args:
-        value: The value; an infinite one is written as ∞, and NaN as "unknown".
-        std: Its standard deviation; None to write the value alone.
-        digits: Significant digits of the value if its standard deviation is not given, zero, infinite or unknown.
-        hidden: Standard deviation if a further tone is hidden; it is added in brackets if it is larger by a tenth.
+    Infinity is written as ∞, and NaN as "unknown". The value has ``digits`` if its standard deviation is not given,
+    zero, infinite or unknown. The standard deviation if a further tone is ``hidden`` is added in brackets if it is
+    larger by a tenth.
 
     Example:
         >>> measured_text(60.0, 0.01234)

@@ -82,13 +82,7 @@ def value_text(value: object) -> str:
 
 
 def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] | None = None) -> list[str]:
-    """Table of keys.
-
-    Args:
-        group: Group of options, or section.
-        keys: Keys to list, by default all.
-        meaning: Descriptions of keys whose field has none.
-    """
+    """Table of the keys of a group of options or section, by default of all; ``meaning`` describes fields without."""
     rows = []
     for name in keys or fields_of(group):
         field = fields_of(group)[name]

@@ -47,14 +47,10 @@ def test_every_public_name_is_in_the_reference(docs):
 
 
 def test_reference_begins_with_the_main_function(docs):
-    for package, first in (
-        ("detection", ["detect_vibration", "DetectionResult", "VibrationDetector"]),
-        ("restoration", ["restore", "VibrationRestorer", "FixedDewarp"]),
-        ("imaging", ["simulate_frames"]),
-        ("motion", ["SensorTiming", "Vibration"]),
-    ):
+    first = {"detection": "detect_vibration", "restoration": "restore", "imaging": "simulate_frames"}
+    for package, name in {**first, "motion": "SensorTiming"}.items():
         page = docs["reference_page"](package, docs["public_names"]()[package])
-        assert re.findall(r"^::: .*\.(\w+)$", page, flags=re.MULTILINE)[: len(first)] == first
+        assert re.findall(r"^::: .*\.(\w+)$", page, flags=re.MULTILINE)[0] == name
 
 
 def test_reference_pages_are_up_to_date():

@@ -12,7 +12,8 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import check_tensor
 from rsvib_torch.checks.values import check_choice
 
-ArrayLike = Tensor | NDArray[Any]
+Array = NDArray[Any]
+ArrayLike = Tensor | Array
 FramesLike = ArrayLike | Sequence[ArrayLike]
 Channels = Literal["first", "last"] | None
 

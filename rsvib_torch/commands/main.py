@@ -113,11 +113,10 @@ def _options(
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run ``rsvib`` with these arguments.
+    """Run ``rsvib`` with these arguments; the exit code is returned.
 
-    Returns:
-        Exit code: 0; 2 after an error, which is one line on standard error (``--debug`` prints the traceback before
-        it); 3 if an axis of ``--require-reliable`` is not reliable; 130 after Ctrl-C.
+    It is 0; 2 after an error, which is one line on standard error (``--debug`` prints the traceback before it); 3 if an
+    axis of ``--require-reliable`` is not reliable; 130 after Ctrl-C.
     """
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)

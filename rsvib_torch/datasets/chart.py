@@ -33,9 +33,10 @@ def resolution_chart(
 ) -> Tensor:
     """Draw a resolution chart: slanted edges, hyperbolic wedges, bar groups, stars, rings and grey fields.
 
-    A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals,
-    dark on light and light on dark in turn, and bar groups, rings, stars and textured grey steps between them, on
-    paper with a fine grain. Edges are error functions of the distance, without aliasing at any size.
+    A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals, dark on light
+    and light on dark in turn, and bar groups, rings, stars and textured grey steps between them, on paper with a fine
+    grain. Edges are error functions of the distance, without aliasing at any size. The result is float32 (height,
+    width) with values in 0 ... 1.
 
     Args:
         height: Rows, at least 64.
@@ -43,9 +44,6 @@ def resolution_chart(
         sigma: Blur of the optics in px (Gaussian, pixel area included).
         seed: Seed of the grain and texture.
         field: px, approximate size of a field of the chart, at least 32.
-
-    Returns:
-        float32 tensor (height, width) with values in 0 ... 1.
 
     Example:
         >>> chart = resolution_chart(256, 320)

@@ -49,7 +49,7 @@ class _Line(NamedTuple):
 
 @checks_arguments
 def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6) -> Tensor:
-    """Draw towns and fields from above, with Gaussian optics.
+    """Draw towns and fields from above, with Gaussian optics: float32 (height, width) with values in 0 ... 1.
 
     Fractal ground in districts of different direction: fields with furrows and hedges, streets with rows of small
     gabled buildings and their shadows, larger works, woods, country roads and a river.
@@ -59,9 +59,6 @@ def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6
         width: Columns, at least 64.
         seed: Seed of everything random.
         sigma: Blur of the optics in px (Gaussian, pixel area included).
-
-    Returns:
-        float32 tensor (height, width) with values in 0 ... 1.
 
     Example:
         >>> scene = city_and_fields(128, 96, seed=3)

@@ -75,12 +75,9 @@ class Acceleration:
     A wrong motion also blurs the warped frames wrongly. With long exposures, rows therefore measure up to twice their
     residual displacement, or half of it. The measurements are corrected by the combination of the last steps that would
     have left the least change.
-
-    Attributes:
-        steps: The last steps with the same tones.
     """
 
-    steps: list[Step] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)  # the last steps with the same tones
 
     def ratio(self, step: Step) -> Array | None:
         """(B,) length of a step over the length of the last one; None if there is none."""

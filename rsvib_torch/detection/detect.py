@@ -110,7 +110,6 @@ def detect_vibration(
         TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option
             is out of range.
 
@@ -184,7 +183,6 @@ class VibrationDetector(TimedModule):
         timing: The sensor.
 
     Raises:
-        TypeError: If an option is unknown.
         ValueError: If another model is given.
 
     Example:

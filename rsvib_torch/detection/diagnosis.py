@@ -80,7 +80,6 @@ def diagnose_timing(frames: FramesOrFiles, timing: SensorTiming, options: Offset
         agree with no other one.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If frames are a batch, or too small, see ``detect_vibration``.
 
     Example:
@@ -198,17 +197,12 @@ _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual 
 def period_factor(
     measurements: Measurements, timing: RowTiming, num_frames: int, block_rows: int
 ) -> tuple[float, Array] | None:
-    """Factor of the frame start times with which one tone along each axis explains the measurements best.
+    """Factor c of the frame start times with which one tone along each axis explains the measurements best.
 
-    A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the
-    rows of a frame and the phase from frame to frame must agree with the same frequency, which determines c. Reversed
-    readout is c = -1, because a vibration in reversed time is a vibration.
-
-    Args:
-        measurements: Displacements of one stack (B = 1) of at least three frames, in row order.
-        timing: The sensor.
-        num_frames: Frames of the stack.
-        block_rows: Rows of a measurement, which limit the frequency of the tones.
+    A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the rows
+    of a frame and the phase from frame to frame must agree with the same frequency, which determines c. Reversed
+    readout is c = -1, because a vibration in reversed time is a vibration. The measurements are those of one stack of
+    at least three frames, in row order; ``block_rows`` limit the frequency of the tones.
 
     Returns:
         c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements

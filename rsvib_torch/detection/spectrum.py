@@ -134,16 +134,9 @@ class DisplacementSpectrum(
 def displacement_spectrum(
     curve: OffsetCurve, timing: SensorTiming, vibration: Vibration, fitted: Tensor
 ) -> DisplacementSpectrum:
-    """The spectrum of the displacement from the offsets of one stack.
+    """The spectrum of the displacement from the offsets of one stack, at least 8.
 
-    Args:
-        curve: The offsets (not a batch).
-        timing: The sensor.
-        vibration: The tones that were fitted to the offsets: lines that are known.
-        fitted: (P, N, A), the offsets by these tones and the image motion.
-
-    Raises:
-        ValueError: If the curve is a batch, or fewer than 8 offsets were measured.
+    Lines of the ``vibration`` are known; ``fitted`` (P, N, A) are the offsets by its tones and the image motion.
     """
     check_single("result", curve)
     good = curve.good & (curve.quality > 0)
@@ -188,23 +181,14 @@ def displacement_spectrum(
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Offsets of one axis and their times, from which a spectrum is computed.
+    """Offsets of one axis and their times, from which a spectrum is computed."""
 
-    Attributes:
-        earlier: (N,) s, mid-exposures of the rows in the earlier frame, from the middle of the record.
-        later: (N,) s, those in the later frame.
-        values: (N,) px, displacement at ``later`` less that at ``earlier``, without the lines that are known.
-        weights: (N,) px^-2, inverse variances up to a factor.
-        exposure_time: s.
-        band_time: s, time over which the rows of one offset are exposed.
-    """
-
-    earlier: Array
-    later: Array
-    values: Array
-    weights: Array
-    exposure_time: float
-    band_time: float
+    earlier: Array  # (N,) s, mid-exposures of the rows in the earlier frame, from the middle of the record
+    later: Array  # (N,) s, those in the later frame
+    values: Array  # (N,) px, displacement at ``later`` less that at ``earlier``, without the lines that are known
+    weights: Array  # (N,) px^-2, inverse variances up to a factor
+    exposure_time: float  # s
+    band_time: float  # s, time over which the rows of one offset are exposed
 
     def spectrum(
         self, frequency: Array, span: float, known: Array, most_lines: int = _MAX_LINES

@@ -77,10 +77,9 @@ def remove_abandoned(path: Path) -> None:
 
 @contextmanager
 def _locked(folder: Path, *, wait: bool = False) -> Iterator[int]:
-    """Open and lock a folder; ``wait`` until another process releases its lock.
+    """Open and lock a folder; ``wait`` until another process releases its lock, or raise an ``OSError``.
 
-    Raises:
-        OSError: If it is a link or not a folder, another process has locked it, or the file system has no locks.
+    A link, something else than a folder, and a file system without locks are refused.
     """
     file = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
     try:

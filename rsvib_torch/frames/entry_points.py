@@ -102,12 +102,7 @@ def module_options(
 
 
 class TimedModule(nn.Module):
-    """A module with a fixed timing and fixed options, which its representation states.
-
-    Attributes:
-        timing: The sensor.
-        options: The options of its function.
-    """
+    """A module with a fixed timing and fixed options of its function, which its representation states."""
 
     def __init__(self, timing: SensorTiming, options: Any) -> None:
         super().__init__()

@@ -351,20 +351,11 @@ def fit_clock(
     fit_gain: bool,
     rows: Array | None = None,
 ) -> tuple[FittedClock, Array, float]:
-    """Gauss-Newton on clock reading, scale, gain and drift, and on the row time.
+    """Gauss-Newton on clock reading, scale, gain and drift, and on the row time, from start values.
 
-    Args:
-        measured: The displacements.
-        recorded: The motion on its own clock.
-        clock: Start values.
-        fit_scale: Whether to fit the scale.
-        fit_gain: Whether to fit the gain.
-        rows: (1, N, G) frame rows, to fit the row time as well; the exposure of row r starts r row times after a time
-            that is known. None if the row time is known.
-
-    Returns:
-        The fitted values, the covariance (7, 7) of clock reading, scale, gain and drift of x and y, and row time, and
-        the change of the row time in s.
+    To fit the row time, give the frame rows (1, N, G): the exposure of row r starts r row times after a time that is
+    known. The result has the fitted values, the covariance (7, 7) of clock reading, scale, gain and drift of x and y,
+    and row time, and the change of the row time in s.
     """
     row_time = 0.0
     exposure_starts = measured.exposure_starts

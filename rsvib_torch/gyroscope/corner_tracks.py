@@ -51,11 +51,9 @@ def corner_tracks(
 ) -> CornerTracks:
     """Follow the corners of frames to the next ones.
 
-    Args:
-        frames: Number, grey frame (H, W) in image axes, and mask (H, W), False at missing pixels, None if there are
-            none. A frame is compared with the one before if their numbers follow each other.
-        starts: s, exposure starts of all frames, by number.
-        timing: The sensor.
+    Frames are given with their number, as grey pixels (H, W) in image axes, and with a mask (H, W), False at missing
+    pixels, or None. A frame is compared with the one before if their numbers follow each other; the exposures of all
+    frames start at ``starts`` in s.
 
     Raises:
         ValueError: If fewer than half of the pairs of frames have enough corners.

@@ -106,13 +106,9 @@ class AngularRates(
     def rotation(self, start: Tensor, end: Tensor) -> Tensor:
         """Rotation vectors (S, 3) in rad of the gyroscope from times ``start`` (S) to ``end`` (S) in s.
 
-        The rates are about axes that rotate themselves. To second order (Magnus), the vector is
-        ``a(end) - a(start) + 1/2 integral (a(t) - a(start)) x rate(t) dt`` with the integral a of the rates, a cubic
-        spline; the error is of third order in the rotation. Beyond the record the end pieces of the spline continue.
-
-        Args:
-            start: s.
-            end: s; the same shape.
+        The rates are about axes that rotate themselves. To second order (Magnus), the vector is ``a(end) - a(start) +
+        1/2 integral (a(t) - a(start)) x rate(t) dt`` with the integral a of the rates, a cubic spline; the error is of
+        third order in the rotation. Beyond the record the end pieces of the spline continue.
         """
         angle, area = self._integrals
         first, last = start.detach().cpu().numpy(), end.detach().cpu().numpy()

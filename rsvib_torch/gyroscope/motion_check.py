@@ -113,7 +113,6 @@ def check_motion(frames: FramesOrFiles, timing: SensorTiming, motion: Motion, op
         Rms offsets with and without the motion, and a verdict.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If frames or motion are a batch, or the frames cannot be registered.
 
     Example:

@@ -66,7 +66,6 @@ def read_gyroscope(
         Times and rates on the clock of the gyroscope.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If it is damaged, has no angular rates or no unit, or its times do not increase.
 
     Example:

@@ -54,11 +54,7 @@ class Optics(OpticsOptions):
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
     def apply(self, scene: Tensor) -> Tensor:
-        """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
-
-        Raises:
-            TypeError: If the scene is not a floating-point tensor.
-        """
+        """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype."""
         check_images({"scene": scene}, {"scene": "... H W"})
         return filtered(scene, self.transfer)
 
@@ -181,7 +177,6 @@ class SensorNoise:
             generator: Source of randomness, on the device of the frames.
 
         Raises:
-            TypeError: If the frames are not a floating-point tensor.
             ValueError: If a pixel is NaN or infinite.
         """
         patterned = self.gain_spread > 0 or self.column_offset > 0 or self.row_offset > 0

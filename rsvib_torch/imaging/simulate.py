@@ -62,7 +62,6 @@ def simulate_frames(
         rest, scene pixel ``(r + (H - h) // 2, c + (W - w) // 2)``.
 
     Raises:
-        TypeError: If the scene is not a floating-point tensor.
         ValueError: If the scene is too small for the frame and motion, or is not finite, or the frames do not fit into
             the free memory.
 

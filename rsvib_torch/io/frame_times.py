@@ -25,19 +25,7 @@ _ORIENTATIONS = {
 
 
 class TimingWarning(UserWarning):
-    """The frame rate or the times in a file contradict the timing of the sensor.
-
-    Example:
-        >>> import warnings
-        >>> import rsvib_torch as rsv
-        >>> timing = rsv.SensorTiming(row_time=1 / 30000, exposure_rows=20, frame_rows=1000)  # 30 frames per second
-        >>> info = rsv.StackInfo((8, 256, 256), "uint8", 255, frame_rate=97.0)  # the file states another rate
-        >>> with warnings.catch_warnings(record=True) as caught:
-        ...     warnings.simplefilter("always")
-        ...     timing = rsv.timing_from_first_frame(timing, info)
-        >>> caught[0].category.__name__
-        'TimingWarning'
-    """
+    """The frame rate or the times in a file contradict the timing of the sensor."""
 
 
 @dataclass(frozen=True, eq=False)

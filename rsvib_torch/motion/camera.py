@@ -183,11 +183,6 @@ class Camera:
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
         """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles.
 
-        Args:
-            x: px, position at rest.
-            y: The same along y.
-            axes: Number A of components, 2 to 4.
-
         Example:
             >>> Camera(1000.0).factors(torch.tensor(500.0), torch.tensor(0.0), 3).tolist()
             [[1.25, 0.0, 0.0], [0.0, 1.0, 500.0]]

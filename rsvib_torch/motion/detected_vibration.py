@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from rsvib_torch.checks.values import described
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.vibration import (
     Vibration,
     VibrationStd,
@@ -41,17 +42,7 @@ class DetectedVibration(
 ):
     """A detection without its offset curve: everything that restoration needs. A batch leads all tensors.
 
-    Attributes:
-        vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
-        std: Standard deviations of its parameters, given the tones that were found; infinite where unknown.
-        std_if_hidden_tone: The same if the record may contain a further tone, which few frames cannot exclude; None:
-            not larger.
-        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames.
-        residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
-        reliable: (..., 2) bool, verdict for each axis (x, y).
-        findings: Each ``Reason`` against each axis that is not reliable; a tuple of those for a batch. ``reasons`` has
-            their texts.
-        assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
+    The fields are those of ``DetectionResult``.
     """
 
     _MADE_BY: ClassVar[str] = "from detect_vibration; of other results, pass .motion"  # for errors about arguments
@@ -123,15 +114,15 @@ class DetectedVibration(
         """
         return joined_columns(self.tone_lines(pixel_size))
 
-    def tone_lines(self, pixel_size: float | None = None) -> list[dict[str, Any]]:
+    def tone_lines(self, pixel_size: float | None = None) -> list[Table]:
         """Lines of ``table``."""
         pixel_size = check_pixel_size(pixel_size)
         vibration, hidden = self.vibration, self.std_if_hidden_tone or self.std
-        lines: list[dict[str, Any]] = []
+        lines: list[Table] = []
         for at, _ in tone_places(vibration):
             *batch, axis, tone = at
             found, unit = float(vibration.amplitude[at]) > 0, _UNITS_OF_AXES[axis]
-            line: dict[str, Any] = {"index": ", ".join(map(str, batch))} if batch else {}
+            line: Table = {"index": ", ".join(map(str, batch))} if batch else {}
             middle = self._middle_time(tuple(batch))
             line |= {} if middle is None else {"middle_time_s": middle}
             line |= {"axis": AXIS_NAMES[axis], "tone": found * (tone + 1)}

@@ -58,7 +58,6 @@ def read_motion(
         The motion without its mean, with the times of the file in seconds.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If a column is missing, a value is not a number, times do not increase or have gaps, or values or
             time steps indicate another unit; the message names the line of the file.
 

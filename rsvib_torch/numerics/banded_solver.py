@@ -38,15 +38,12 @@ class _Triangle:
 
     The views of every step are kept with the memory of the solution, because creating them takes as long as a solution
     of few systems.
-
-    Attributes:
-        upper: (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; values beyond the last column have no meaning, and rows
-            that are not eliminated are 0.
-        inverse: (steps, S), ``1 / d_j`` of the eliminated rows, real.
     """
 
+    # (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; values beyond the last column have no meaning, and rows that are not
+    # eliminated are 0
     upper: Tensor
-    inverse: Tensor
+    inverse: Tensor  # (steps, S), ``1 / d_j`` of the eliminated rows, real
     _solutions: dict[int, "_Solution"] = field(default_factory=dict)
 
     @cached_property
@@ -238,29 +235,19 @@ class _Solve(torch.autograd.Function):
 
 
 def solve_halves(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
-    """Solve Hermitian positive definite systems, differentiably.
+    """Solve Hermitian positive definite systems differentiably, for right sides and solutions (K, M, S).
 
-    Args:
-        system: (H + b, 2 b + 1, 2 S) as from ``from_both_ends``, overwritten unless its gradient is required; or its
-            factors, for solving several times, through which no gradient flows.
-        right_side: (K, M, S), M right sides per matrix.
-
-    Returns:
-        Solutions (K, M, S).
+    The systems (H + b, 2 b + 1, 2 S), as from ``from_both_ends``, are overwritten unless their gradient is required; or
+    their factors, for solving several times, through which no gradient flows.
     """
     solution: Tensor = _Solve.apply(system, right_side)  # type: ignore[no-untyped-call]
     return solution
 
 
 def solve_banded(band: Tensor, right_side: Tensor) -> Tensor:
-    """Solve Hermitian positive definite banded systems, differentiably.
+    """Solutions (K, M, *S) of Hermitian positive definite banded systems, differentiable, for M right sides per matrix.
 
-    Args:
-        band: Lower band (K, b + 1, *S), ``band[k, d] = A[k + d, k]``; the imaginary part of the diagonal is ignored.
-        right_side: (K, M, *S), M right sides per matrix.
-
-    Returns:
-        Solutions (K, M, *S).
+    The lower band is (K, b + 1, *S), ``band[k, d] = A[k + d, k]``; the imaginary part of the diagonal is ignored.
 
     Example:
         >>> band = torch.tensor([[2.0, 1.0], [2.0, 1.0], [2.0, 0.0]])

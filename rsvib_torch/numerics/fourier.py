@@ -68,21 +68,13 @@ def fourier_sums(times: Array, values: Array, grid: tuple[float, int, int]) -> A
 
 
 def extend_rows(images: Tensor, length: int, hold: float = 0.25) -> Tensor:
-    """Extend rows at their right end to ``length``, so that they close smoothly into a period.
+    """Extend rows (..., W) at their right end to ``length``, so that they close smoothly into a period.
 
     Both ends are extended by odd reflection, which keeps value and slope; a cosine blends the reflection of the last
     pixels into that of the first ones. Without it, the jump would ring into the image, and displaced rows would wrap
-    around.
-
-    Args:
-        images: (..., W).
-        length: Length of the period, at least W.
-        hold: Share of the gap next to either end that consists of the reflection of that end only, 0 <= hold < 0.5.
-            With a quarter, rows displaced by up to a quarter of the gap contain no content of the opposite end, which
-            improves restoration near the ends by up to 0.7 dB (displacements of 40 px, exposures of 100 rows).
-
-    Returns:
-        Tensor (..., length) whose first W columns are the image.
+    around. ``hold`` is the share of the gap next to either end that consists of the reflection of that end only, below
+    0.5. With a quarter, rows displaced by up to a quarter of the gap contain no content of the opposite end, which
+    improves restoration near the ends by up to 0.7 dB (displacements of 40 px, exposures of 100 rows).
     """
     width = images.shape[-1]
     extra = length - width

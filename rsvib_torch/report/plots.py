@@ -13,13 +13,13 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch import detection, gyroscope
 from rsvib_torch.checks.arguments import check_shapes, checks_arguments
+from rsvib_torch.checks.arrays import Array
 from rsvib_torch.checks.validation import Count
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult
@@ -53,7 +53,7 @@ _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", _X_COLOUR])  # poor ... good
 
 
-Panels = NDArray[Any]  # (rows, columns) of ``Axes``
+Panels = Array  # (rows, columns) of ``Axes``
 
 
 class _Drawing(Figure):
@@ -112,7 +112,7 @@ def _two_panels() -> tuple[Figure, list[tuple[int, str, Axes]]]:
 
 
 def _plot_axes(
-    panel: Axes, x: NDArray[Any] | Tensor, values: Tensor, std: Tensor | None = None, *, legend: bool = True
+    panel: Axes, x: Array | Tensor, values: Tensor, std: Tensor | None = None, *, legend: bool = True
 ) -> None:
     """Draw values (N, 2) of x and y in their colours, with bands of two standard deviations."""
     for axis, (name, colour) in enumerate(_AXIS_COLOURS.items()):

@@ -49,7 +49,6 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         timing: The sensor of the frames to be restored, which must be that of the file; None not to compare them.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
 
     Example:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from torch import Tensor
 from rsvib_torch.checks.arrays import ArrayLike
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, outside_graphs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
@@ -34,18 +35,14 @@ from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 
 @dataclass(frozen=True)
 class RestorationMethod:
-    """An entry of ``METHODS``.
+    """An entry of ``METHODS``."""
 
-    Attributes:
-        function: The method, see the contract above ``METHODS``.
-        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
-        strips: Whether it takes ``strips``, and estimates once what strips of the same frames have in common.
-        mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
-    """
-
-    function: Callable[..., Tensor]
+    function: Callable[..., Tensor]  # the method, see the contract above ``METHODS``
+    # masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels)
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
+    # whether it takes ``strips``, and estimates once what strips of the same frames have in common
     strips: bool = False
+    # the method for colour mosaics, which has the same options and takes ``colours``; None for none
     mosaic: "RestorationMethod | None" = None
 
 
@@ -192,7 +189,7 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
     chosen = method if frames.colours is None else method.mosaic
     assert chosen is not None, "methods without mosaic have no option mosaic"
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
-    more: dict[str, Any] = {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    more: Table = {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         more["colours"] = frames.colours
     if chosen.strips:

@@ -111,12 +111,9 @@ def joined_columns(lines: Sequence[Mapping[str, object]]) -> dict[str, list[obje
 
 
 def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict[str, float]:
-    """Amplitude A, and the amplitudes of velocity 2 pi f A and acceleration (2 pi f)^2 A, with units in the names.
+    """Amplitude A in px, and those of velocity 2 pi f A and acceleration (2 pi f)^2 A, with units in the names.
 
-    Args:
-        amplitude: A in px.
-        frequency: f in Hz.
-        pixel_size: Size of a pixel in m.
+    The size of a pixel is in m.
     """
     angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
     return {
@@ -346,14 +343,7 @@ class Result(Summarised):
         return self.mapped(lambda values: values.to(device))
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
-        """Draw the result.
-
-        Args:
-            path: Picture to write (PNG, SVG, PDF); None to draw only.
-
-        Returns:
-            The figure, which notebooks show.
-        """
+        """Draw the result, and write the picture (PNG, SVG, PDF) if a path is given; notebooks show the figure."""
         draw = figure_of(type(self), len(self.batch_shape))
         if draw is None:
             drawn = sorted({kind.__name__ for kind, _ in FIGURES})

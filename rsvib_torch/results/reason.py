@@ -35,24 +35,17 @@ class ReasonKind:
 class Reason:
     """Why a result, or one axis of it, is not reliable.
 
-    Attributes:
-        code: Key of the table ``REASONS``.
-        axis: ``"x"``, ``"y"``, ``"roll"`` or ``"zoom"``; None for all axes.
-        value: The compared quantity in the unit of the table; None if nothing is compared.
-        limit: Its limit in the same unit.
-        details: Further numbers and texts of the sentence.
-
     Example:
         >>> reason = Reason("tone_averaged_out", "x", 2600.0, 2500.0)
         >>> print(reason)
         tone of 2600 Hz is above 1/T_e = 2500 Hz, where the exposure averages it out; use a shorter exposure
     """
 
-    code: str
-    axis: str | None = None
-    value: float | None = None
-    limit: float | None = None
-    details: Mapping[str, float | str] = field(default_factory=dict)
+    code: str  # key of the table ``REASONS``
+    axis: str | None = None  # ``"x"``, ``"y"``, ``"roll"`` or ``"zoom"``; None for all axes
+    value: float | None = None  # the compared quantity in the unit of the table; None if nothing is compared
+    limit: float | None = None  # its limit in the same unit
+    details: Mapping[str, float | str] = field(default_factory=dict)  # further numbers and texts of the sentence
 
     def __post_init__(self) -> None:
         if self.code not in REASONS:

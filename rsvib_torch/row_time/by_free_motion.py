@@ -150,12 +150,8 @@ class _Problem:
 def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor: Array) -> tuple[Array, Array]:
     """Coefficients of a spline that is fitted to displacements (N, G) of a record, and its residual (N, G).
 
-    Args:
-        values: The displacements.
-        record: Weights of the rows.
-        index: (N, G, M) coefficients that the displacements depend on.
-        basis: (N, G, M) their factors.
-        factor: Banded Cholesky factor of the normal matrix.
+    Displacements depend on coefficients ``index`` (N, G, M) by the factors ``basis``; ``factor`` is the banded Cholesky
+    factor of the normal matrix.
     """
     weighted = table(record.weights)[:, None, None] * values[..., None]
     right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])

@@ -111,7 +111,6 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         False, with ``findings``, if the row time is not determined; it is None if nothing is known about it.
 
     Raises:
-        TypeError: If an argument is not a number, or frames are not.
         ValueError: If frames cannot be registered, or an option is out of range.
 
     Example:

@@ -6,18 +6,16 @@ of period P. Gauss-Newton fits period, waveforms and a smooth scene, and the tex
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from rsvib_torch.checks.arrays import Channels, channel_axis
+from rsvib_torch.checks.arrays import Array, Channels, channel_axis
 from rsvib_torch.frames.prepare import as_float_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 
 SceneModel = Literal["smooth", "fixed"]
-Array = NDArray[Any]
 _TINY = 1e-300  # smallest divisor
 MIN_PERIODS = 1.5  # that a frame must contain
 _MIN_PERIOD = 4.0  # rows; shorter bands may be aliases of longer ones

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq, least_squares
 
-from rsvib_torch.row_time.flicker import Array, deviations, unexplained
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.row_time.flicker import deviations, unexplained
 
 _MAX_MISFIT = 0.3  # largest root mean square of the residuals over the brightness
 
@@ -35,12 +36,9 @@ def fit_strobe(
 ) -> StrobeFit:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row.
 
-    Args:
-        brightness: (T, H), in proportion to light.
-        period: Period of the bands in rows, to start with.
-        phases: (T,) phase of the fundamental in each frame, ``cos(2 pi i / P - phase)``, to start with.
-        exposures: (T,) exposure of each frame, in any unit.
-        on_fraction: Fraction of the period that the light is on; None to estimate it, from different exposures.
+    ``brightness`` (T, H) is in proportion to light; ``period`` in rows, and ``phases`` (T,) of the fundamental, ``cos(2
+    pi i / P - phase)``, are start values. ``exposures`` (T,) have any unit. The fraction of the period that the light
+    is on is estimated from different exposures unless it is given.
     """
     values = brightness / brightness.mean(1, keepdims=True)
     count, height = values.shape

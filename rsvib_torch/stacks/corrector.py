@@ -35,10 +35,6 @@ class VibrationCorrector(nn.Module):
         detection: Options of ``detect_vibration``.
         restoration: Options of ``restore``.
 
-    Raises:
-        TypeError: If an option is unknown.
-        ValueError: If an option is out of range.
-
     Example:
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.datasets import example_frames

@@ -332,7 +332,6 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
         path: The ``manifest.json``.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If it is not a complete manifest.
 
     Example:

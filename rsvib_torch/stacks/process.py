@@ -44,8 +44,6 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
         One ``WindowResult`` per window, in order.
 
     Raises:
-        OSError: If the stack cannot be read.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
 
     Example:
@@ -70,7 +68,6 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
 
     Raises:
         OSError: If the stack cannot be read, or the manifest cannot be written.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
             ``sink`` is a file of the stack.
 
@@ -112,7 +109,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         FileExistsError: If there is an interrupted run and ``resume`` is False.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
             detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
             or versions differ from those of the run to resume, or its journal is damaged.

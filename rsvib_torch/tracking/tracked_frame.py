@@ -33,20 +33,13 @@ def time_to_middle(height: int, timing: RowTiming) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrackedTones:
-    """The tones at one frame, in row order.
+    """The tones at one frame, in row order."""
 
-    Attributes:
-        time: s, exposure start of the frame.
-        fit: The tones; the time origin is ``time``.
-        measurements: Displacements of the rows of the last frame that was measured and of the one before, with the
-            same time origin.
-        findings: Reasons against each axis.
-    """
-
-    time: float
-    fit: ToneFit
+    time: float  # s, exposure start of the frame
+    fit: ToneFit  # the tones; the time origin is ``time``
+    # displacements of the rows of the last frame that was measured and of the one before, with the same time origin
     measurements: Measurements
-    findings: Findings
+    findings: Findings  # reasons against each axis
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,7 +167,6 @@ class VibrationTracker:
         timing: The sensor, without ``frame_start_times``.
 
     Raises:
-        TypeError: If the method does not have an option.
         ValueError: If a value is out of range, or the timing has frame start times.
 
     Example:
@@ -215,7 +214,6 @@ class VibrationTracker:
             The restored frame with the vibration.
 
         Raises:
-            TypeError: If the frame is not numbers.
             ValueError: If the frame has another shape than the frames before, or its time is not later.
         """
         # 1. Input. Frames that show nothing new do not count, except for the time of the next one.
@@ -440,14 +438,9 @@ class VibrationTracker:
         return stacks if self.options.columns is None else stacks.narrowed(self.options.columns)
 
     def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
-        """Start the filter with tones of a detection, and measure the last frame.
+        """Start the filter with the ``chosen`` (2, K) tones of a detection from the last frames; measure the last one.
 
-        Args:
-            state: The state.
-            found: The detection from the last frames.
-            chosen: (2, K) bool, the tones.
-            middle: s, the time origin of the detection.
-            record: s, from the first to the last frame of it.
+        The ``middle`` of these frames is the time origin of the detection, the ``record`` their duration (s).
         """
         vibration, std, curve = found.vibration[0], found.std_if_hidden_tone[0], found.fitted.offsets[0].to("cpu")
         # 1. Image motion. A record does not distinguish a tone of less than one period from a drift, and its amplitude

@@ -344,14 +344,10 @@ class _WindowFit:
 def fit_window(
     corners: Corners, interval: float, averaged: Averaged, readout: float, has_tones: bool = True
 ) -> WindowPath:
-    """Path and tones of the corners of a window.
+    """Path and tones of the ``corners`` of all pairs of a window of frames, which are an ``interval`` in s apart.
 
-    Args:
-        corners: Corners of all pairs of the window.
-        interval: T in s, between frames.
-        averaged: s; a corner is displaced by the mean of the displacement over these times.
-        readout: s, from the first to the last row.
-        has_tones: Whether to look for tones.
+    A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
+    first to the last row (s). Without ``has_tones``, no tones are looked for.
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
@@ -425,16 +421,9 @@ class CameraPath:
 def camera_path(
     pairs: Iterable[Corners | None], timing: SensorTiming, size: tuple[int, int], *, has_tones: bool = True
 ) -> CameraPath:
-    """Path of a camera from the corners of all pairs of neighbouring frames.
+    """Path of a camera from the corners of all pairs of neighbouring frames (None where there are too few).
 
-    Args:
-        pairs: Corners of each pair; None where there are too few.
-        timing: The sensor.
-        size: (height, width) of the frames in px.
-        has_tones: Whether to look for tones.
-
-    Raises:
-        ValueError: If no window of frames has corners in a quarter of its pairs.
+    A ``ValueError`` is raised if no window of frames has corners in a quarter of its pairs.
     """
     readout = timing.row_time * size[0 if timing.scan_axis == -2 else 1]
     averaged = timing.exposure_time, _PATCH_ROWS * reduction(*size) * timing.row_time

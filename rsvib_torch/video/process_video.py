@@ -95,7 +95,6 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         FileExistsError: If there is an interrupted run and ``resume`` is False.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the source is not readable, margins leave nothing, an output would
             replace the input, input, settings or versions differ from those of the run to resume, frames have no motion
             in common, the alignment of the gyroscope is not reliable, or the result shakes more than the source.

@@ -32,11 +32,7 @@ class RecordedRotation:
 
     @classmethod
     def aligned(cls, rates: AngularRates, found: RotationAlignment, times: Array) -> "RecordedRotation":
-        """The rotation at the middles of all frames, by rates that were aligned with some of them.
-
-        Raises:
-            ValueError: If the recording does not cover all frames.
-        """
+        """The rotation at the middles of all frames, which the recording must cover, by rates aligned with some."""
         # 1. The rates about the axes of the camera, per second of the frames.
         turned = found.scale * (rates.rates.cpu() - found.bias) @ orientation_matrix(found.orientation).T
         of_camera = AngularRates((rates.times.cpu() - found.offset) / found.scale, turned)

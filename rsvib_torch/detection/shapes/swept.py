@@ -150,7 +150,6 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
         Parameters of both axes at the time origin, with standard deviations and verdict.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or three frames
             cover more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 
@@ -397,13 +396,7 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
 def _settle(
     measured: Measurements, axis: int, record: tuple[float, float], fits: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Levenberg-Marquardt from several starts side by side.
-
-    Args:
-        measured: Displacements of one stack.
-        axis: Axis to fit.
-        record: Start and end of the record in seconds.
-        fits: (S, 6) start parameters.
+    """Levenberg-Marquardt from several starts (S, 6) side by side, for one axis of one stack.
 
     Returns:
         Best fit first: parameters (S, 6), their covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the

@@ -334,7 +334,6 @@ def judge_restoration(
         may differ in brightness and contrast.
 
     Raises:
-        TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
 
     Example:
@@ -418,11 +417,7 @@ def judge_prepared(
     joint: bool | int = False,
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
-    """``judge_restoration`` of one stack of frames that are already prepared; arguments as in ``judge_stacks``.
-
-    Raises:
-        TooLittleInCommonError: If two frames have too little in common.
-    """
+    """``judge_restoration`` of one stack of frames that are already prepared; arguments as in ``judge_stacks``."""
     motion = motion_in_row_order(frames, vibration)
     moves = {0: motion.moving_axes()[0].tolist()}
     (verdict,) = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=most_pairs)
