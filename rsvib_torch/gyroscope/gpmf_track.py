@@ -68,11 +68,7 @@ class CameraTrack:
 
 
 def read_camera_track(path: Path) -> CameraTrack | None:
-    """What the GPMF track of a video states about its frames; None for other files, and without such a track.
-
-    Raises:
-        ValueError: If the track is damaged.
-    """
+    """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one."""
     if not path.is_file():
         return None
     with path.open("rb") as file:
@@ -88,17 +84,11 @@ def read_camera_track(path: Path) -> CameraTrack | None:
                         times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
                         exposures.append(shutter[:, 0])
                     turned = max(turned, _largest_turn(stream))
-    except _NoTrackError:
+    except (ValueError, struct.error, IndexError):
         return None
-    except (struct.error, IndexError) as error:
-        raise ValueError(f"{path}: damaged GPMF track: {error}") from error
     if not times:
         return CameraTrack(np.zeros(0), np.zeros(0), turned)
     return CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
-
-
-class _NoTrackError(ValueError):
-    """A video without a GPMF track."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +120,7 @@ def _packets(path: Path) -> Iterator[_Packet]:
                 container.seek(0)
     except av.error.FFmpegError as error:
         raise ValueError(f"{path}: damaged MP4 file: {error.strerror}") from error
-    raise _NoTrackError(f"{path}: a video without a GPMF track (gpmd); read its gyroscope from another file")
+    raise ValueError(f"{path}: a video without a GPMF track (gpmd); read its gyroscope from another file")
 
 
 # GPMF

@@ -19,7 +19,7 @@ _CELLS = 6  # of the shorter side: every cell has the same number of corners, so
 _QUALITY = 0.01  # of the best corner of a cell, below which there is none
 # Of noise, the best corner of a cell has 6 to 10 times the median quality of all pixels, and at night 1 % of the best
 # of the frame. Of dense detail, the best have 10 times the median as well, but few corners are below 2 % of the best.
-_NOISE, _FAINT = 15.0, 0.02
+_NOISE, _FAINT = 12.5, 0.02
 PATCH = 11  # px, side of the patch that is compared; 21 px blur the motion of the rows, with 1.7 times the residuals
 _COARSE = 21  # px, side of the patch in the pyramid, where the motion is found
 _LARGEST_MOTION = 0.25  # of the longer side, which the coarsest level of the pyramid reaches
