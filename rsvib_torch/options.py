@@ -455,6 +455,9 @@ class ProcessStackOptions(RunOptions, WindowOptions, StackOptions):
 
     given: Detections = None
     """Detections to use instead, one for each window (see ``read_manifest``)."""
+    motion: Any = None
+    """A ``FreeMotion`` of all frames to use instead of detections, such as a recorded one (``align_motion``): in image
+    axes, with the exposure start of the first row of frame 0 as time origin. Frames are restored to its place 0."""
     scheduler: str | None = None
     """Address of a Dask scheduler whose workers can read ``source`` under the same path; ``"local"`` starts workers on
     this machine; None computes in this process."""

@@ -17,7 +17,7 @@ def entry(key, kind, size, count, content):
     return key + kind + struct.pack(">BH", size, count) + content + b"\0" * (-len(content) % 4)
 
 
-def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None, turned=None):
+def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None, turned=None, exposures=None):
     accelerations = entry(b"ACCL", b"s", 6, 1, struct.pack(">hhh", 1, 2, 3))
     if first is not None:
         accelerations = entry(b"STMP", b"J", 8, 1, struct.pack(">Q", first)) + accelerations
@@ -25,6 +25,10 @@ def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None,
         quaternions = np.round(32767 * np.asarray(turned)).astype(">i2")
         accelerations = entry(b"SCAL", b"s", 2, 1, struct.pack(">h", 32767)) + accelerations
         accelerations += entry(b"IORI", b"s", 8, len(quaternions), quaternions.tobytes())
+    more = b""
+    if exposures is not None:  # s, of the frames
+        values = entry(b"SHUT", b"f", 4, len(exposures), np.asarray(exposures).astype(">f4").tobytes())
+        more = entry(b"STRM", b"\0", 1, len(values), values)
     parts = [entry(b"TSMP", b"L", 4, 1, struct.pack(">I", total))]
     if stamp is not None:
         parts.append(entry(b"STMP", b"J", 8, 1, struct.pack(">Q", stamp)))
@@ -35,7 +39,7 @@ def packet(rates, *, total, scale=1000, orientation=b"", stamp=None, first=None,
     parts.append(entry(b"GYRO", b"s", 6, len(rates), raw))
     other = entry(b"STRM", b"\0", 1, len(accelerations), accelerations)
     own = b"".join(parts)
-    content = entry(b"DVID", b"L", 4, 1, b"\0\0\0\1") + other + entry(b"STRM", b"\0", 1, len(own), own)
+    content = entry(b"DVID", b"L", 4, 1, b"\0\0\0\1") + other + more + entry(b"STRM", b"\0", 1, len(own), own)
     return entry(b"DEVC", b"\0", 1, len(content), content)
 
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rsvib_torch import io
+from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import next_step
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_rate
+from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_exposure, stated_rate
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
 from rsvib_torch.files.atomic import check_writable, whole_file
@@ -172,6 +172,14 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         likely["full_scale"] = _likely_full_scale(first)
     elif info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
+    track = gyroscope.read_camera_track(path)
+    if track is not None and "exposure_time" not in values and (exposure := stated_exposure(path)) is not None:
+        values["exposure_time"] = exposure
+    if track is not None and track.stabilised:
+        warn(
+            f"the camera has stabilised the frames (IORI in the track of the video): it turned them by up to "
+            f"{math.degrees(track.turned):.2g} degrees, and their rows no longer show its motion"
+        )
     _complete(values, rows, likely, proposal)
     settings = read_config(None, sensor=values)
     _check_timing(settings.timing, rows)

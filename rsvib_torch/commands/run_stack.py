@@ -244,6 +244,11 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
         warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
     if not result.restored:
         warn("no vibration was found that can be removed: the frames are written unchanged")
+    if stored.settings["video"].get("stabilised"):
+        warn(
+            "the camera has stabilised the frames (IORI in the track of the video): they are moved as a whole, and "
+            "vibration within them is not measured"
+        )
     worse = [record for record in stored.windows if record.outcome == "worse"]
     if worse:
         where = f"{len(worse)} of {number_of(result.windows, 'part')} of the video"

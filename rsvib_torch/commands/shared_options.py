@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from rsvib_torch import io
+from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
@@ -160,6 +160,11 @@ class CameraOptions:
             shape = io.read_stack_info(frames).shape
             sensor = sensor | {"row_time": self.readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
         missing = [option for name, option in _TIMES.items() if name not in sensor]
+        if self.config is None and "--exposure" in missing and "--row-time" not in missing and frames is not None:
+            exposure = stated_exposure(frames)
+            if exposure is not None:
+                missing.remove("--exposure")
+                sensor = sensor | {"exposure_time": exposure}
         if self.config is None and missing == ["--frame-rate"] and frames is not None:
             frame_rate = stated_rate(io.read_stack_info(frames))
             if frame_rate is not None:
@@ -276,6 +281,18 @@ def stated_rate(info: "StackInfo") -> float | None:
     intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
     period = statistics.median(intervals)
     return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
+
+
+def stated_exposure(path: Path) -> float | None:
+    """Exposure in s that the track of a GoPro video states, the median over its frames."""
+    track = gyroscope.read_camera_track(path)
+    if track is None or not len(track.exposures):
+        return None
+    exposures: list[float] = track.exposures.tolist()
+    exposure = statistics.median(exposures)
+    spread = f"{1e3 * min(exposures):.4g} to {1e3 * max(exposures):.4g} ms"
+    note(f"exposure {1e3 * exposure:.4g} ms ({spread}), from the track of {path} (SHUT)")
+    return exposure
 
 
 def check_new(

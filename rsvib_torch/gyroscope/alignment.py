@@ -246,10 +246,11 @@ def align_motion(
         raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
     grey = stack.images
     if isinstance(recorded, AngularRates):
-        valid = None if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
-        starts = timing.in_row_order().frame_starts(grey.shape[1]).cpu()
+        images = frames_from_row_order(grey[0], timing)
+        masks = [None] * len(images) if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
+        starts = timing.in_row_order().frame_starts(len(images)).cpu()
         return align_rates(
-            corner_tracks(frames_from_row_order(grey[0], timing), valid, timing),
+            corner_tracks(zip(range(len(images)), images, masks, strict=True), starts.tolist(), timing),
             torch.stack([starts[:-1], starts[1:]], -1),
             grey.shape[2:],
             timing,

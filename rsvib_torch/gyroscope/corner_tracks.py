@@ -1,6 +1,6 @@
 """Corners that are followed between consecutive frames, with the times at which their rows were exposed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.numerics.tables import tensor
 from rsvib_torch.registration.corners import CornerFollower, Corners, Grey
 
 CELL_ROWS, CELL_COLUMNS = 6, 8  # cells of a frame, in which residuals may be alike
@@ -30,6 +30,7 @@ class CornerTracks:
     place: Tensor  # (M, 2) px from the centre of the frame, (x, y) in the earlier frame
     offsets: Tensor  # (M, 2) px, (x, y)
     num_pairs: int  # pairs of frames
+    first_frames: Tensor  # (P,) number of the earlier frame of each pair
     radius: float  # px, root-mean-square distance of the pixels from the centre
 
     def times(self, row_time: float) -> Tensor:
@@ -45,23 +46,33 @@ class CornerTracks:
         return near[:, None, None] * torch.eye(2, dtype=rest.dtype)
 
 
-def corner_tracks(frames: Tensor, valid: Tensor | None, timing: SensorTiming) -> CornerTracks:
-    """Follow the corners of every frame to the next one, in grey frames (T, H, W) in image axes.
+def corner_tracks(
+    frames: Iterable[tuple[int, Tensor, Tensor | None]], starts: Sequence[float], timing: SensorTiming
+) -> CornerTracks:
+    """Follow the corners of frames to the next ones.
+
+    Frames are given with their number, as grey pixels (H, W) in image axes, and with a mask (H, W), False at missing
+    pixels, or None. A frame is compared with the one before if their numbers follow each other; the exposures of all
+    frames start at ``starts`` in s.
 
     Raises:
         ValueError: If fewer than half of the pairs of frames have enough corners.
     """
     follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
-    starts = timing.frame_starts(len(frames)).tolist()
-    # The same scale for all frames, so that places keep their grey level.
-    low, high = np.percentile(frames[0].cpu().numpy(), (0.1, 99.9))
-    pairs: list[Corners] = []
-    for number, start in enumerate(starts):
-        levels = (frames[number].cpu().numpy() - low) / max(high - low, 1e-12)
-        grey = (255 * levels.clip(0, 1)).round().astype(np.uint8)
-        followed = follower.next(grey, start, None if valid is None else _inner(valid[number]))
-        pairs += [] if followed is None else [followed]
-    return tracks_of_pairs(pairs, np.stack([starts[:-1], starts[1:]], -1), timing, (frames.shape[1], frames.shape[2]))
+    range_of_levels: tuple[float, float] | None = None
+    size, before = (0, 0), -2
+    pairs: dict[int, Corners] = {}
+    for number, frame, valid in frames:
+        values = frame.cpu().numpy()
+        if range_of_levels is None:  # the same for all frames, so that places keep their grey level
+            low, high = np.percentile(values, (0.1, 99.9))
+            range_of_levels, size = (low, max(high - low, 1e-12)), (values.shape[0], values.shape[1])
+        grey = (255 * ((values - range_of_levels[0]) / range_of_levels[1]).clip(0, 1)).round().astype(np.uint8)
+        followed = follower.next(grey, starts[number], None if valid is None else _inner(valid))
+        if followed is not None and before == number - 1:
+            pairs[before] = followed
+        before = number
+    return tracks_of_pairs(pairs, starts, timing, size)
 
 
 def followed_pair(first: Grey, second: Grey, starts: Sequence[float], timing: SensorTiming) -> Corners:
@@ -74,13 +85,18 @@ def followed_pair(first: Grey, second: Grey, starts: Sequence[float], timing: Se
 
 
 def tracks_of_pairs(
-    pairs: Sequence[Corners], starts: Array, timing: SensorTiming, size: tuple[int, int]
+    followed: Mapping[int, Corners], starts: Sequence[float], timing: SensorTiming, size: tuple[int, int]
 ) -> CornerTracks:
-    """The corners of pairs of frames (height, width) = ``size`` whose exposures start at ``starts`` (P, 2) in s.
+    """The corners of pairs of frames (height, width) = ``size``, by the number of the earlier frame.
+
+    The exposures of all frames start at ``starts`` in s.
 
     Raises:
-        ValueError: If fewer than half of the pairs have enough corners.
+        ValueError: If there are none, or fewer than half of the pairs have enough corners.
     """
+    if not followed:
+        raise ValueError("no two different frames follow each other")
+    first_frames, pairs = np.array([*followed]), list(followed.values())
     enough = np.array([len(pair.rows) >= _LEAST_CORNERS for pair in pairs])
     if enough.mean() < 0.5:
         raise ValueError(
@@ -91,7 +107,8 @@ def tracks_of_pairs(
     used = enough[corners.pairs]
     pair, offsets, times = corners.pairs[used], corners.offsets[used], corners.times[used]
     place = corners.places[used] - 0.5 * offsets
-    of_frames = starts[pair]
+    times_of_frames = np.array(starts)
+    of_frames = np.stack([times_of_frames[first_frames], times_of_frames[first_frames + 1]], -1)[pair]
     cells = np.floor((place / [width, height] + 0.5) * [CELL_COLUMNS, CELL_ROWS]).astype(np.int64)
     return CornerTracks(
         pair=torch.from_numpy(pair),
@@ -101,6 +118,7 @@ def tracks_of_pairs(
         place=tensor(place),
         offsets=tensor(offsets),
         num_pairs=len(pairs),
+        first_frames=torch.from_numpy(first_frames),
         radius=float((height**2 + width**2 - 2) / 12) ** 0.5,
     )
 

@@ -50,6 +50,48 @@ def read_gpmf(path: Path) -> AngularRates:
 
 
 @dataclass(frozen=True)
+class CameraTrack:
+    """What the GPMF track of a video states about its frames."""
+
+    times: Array  # (N,) s, of the exposures in the video
+    exposures: Array  # (N,) s (SHUT); empty if they are not stated
+    turned: float  # rad, largest rotation of an image against the camera (IORI); 0 if it is not stated
+
+    @property
+    def stabilised(self) -> bool:
+        """Whether the camera has stabilised its images."""
+        return self.turned > 2 * _SMALLEST_TURN
+
+    def exposures_at(self, times: Array) -> Array:
+        """Exposures in s of frames at times in s of the video."""
+        return np.interp(times, self.times, self.exposures)
+
+
+def read_camera_track(path: Path) -> CameraTrack | None:
+    """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        if not is_mp4(file.read(64)):
+            return None
+    times, exposures, turned = [], [], 0.0
+    try:
+        for packet in _packets(path):
+            for _, streams in _devices(packet.data):
+                for stream in streams:
+                    shutter = _found(stream, b"SHUT")
+                    if shutter is not None and len(shutter) and (shutter > 0).all():
+                        times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
+                        exposures.append(shutter[:, 0])
+                    turned = max(turned, _largest_turn(stream))
+    except (ValueError, struct.error, IndexError):
+        return None
+    if not times:
+        return CameraTrack(np.zeros(0), np.zeros(0), turned)
+    return CameraTrack(np.concatenate(times), np.concatenate(exposures), turned)
+
+
+@dataclass(frozen=True)
 class _Packet:
     """Content of one packet of the track, with its time and duration in s."""
 
@@ -129,20 +171,25 @@ def _parts(packets: Iterator[_Packet]) -> Iterator[_Part]:
     for count, packet in enumerate(packets):
         if count == _MAX_PACKETS:
             raise IndexError(f"more than {_MAX_PACKETS:,} GPMF packets")
-        for key, _, _, _, device in _entries(packet.data):
-            if key != b"DEVC":
-                continue
-            number = next((content for name, *_, content in _entries(device) if name == b"DVID"), b"")
+        for number, streams in _devices(packet.data):
             if chosen is not None and number != chosen:
                 continue
-            streams = [content for name, *_, content in _entries(device) if name == b"STRM"]
             stamps = [stamp for stamp in map(_stamp, streams) if stamp is not None]
             earliest = min(stamps, default=None)
             part = next(filter(None, (_part(stream, packet, earliest) for stream in streams)), None)
             if part is not None:
                 chosen = number
-                yield replace(part, stabilised=any(map(_turns_images, streams)))
+                yield replace(part, stabilised=max(map(_largest_turn, streams)) > 2 * _SMALLEST_TURN)
                 break
+
+
+def _devices(data: bytes) -> Iterator[tuple[bytes, list[bytes]]]:
+    """Number and streams of each device in a packet."""
+    for key, _, _, _, device in _entries(data):
+        if key == b"DEVC":
+            entries = [(name, content) for name, *_, content in _entries(device)]
+            number = next((content for name, content in entries if name == b"DVID"), b"")
+            yield number, [content for name, content in entries if name == b"STRM"]
 
 
 def _found(stream: bytes, key: bytes) -> Array | None:
@@ -157,12 +204,12 @@ def _stamp(stream: bytes) -> float | None:
     return None if stamp is None else float(stamp[0, 0]) * 1e-6
 
 
-def _turns_images(stream: bytes) -> bool:
-    """Whether a stream has orientations of the images against the camera (IORI, quaternions w, x, y, z) that differ."""
+def _largest_turn(stream: bytes) -> float:
+    """Largest rotation in rad of the images against the camera (IORI, quaternions w, x, y, z); 0 without."""
     quaternions = _found(stream, b"IORI")
-    if quaternions is None:
-        return False
-    return bool((np.abs(quaternions[:, 1:]) > _SMALLEST_TURN * np.abs(quaternions[:, :1])).any())
+    if quaternions is None or not len(quaternions) or quaternions.shape[1] != 4:
+        return 0.0
+    return float(2 * np.arctan2(np.linalg.norm(quaternions[:, 1:], axis=1), np.abs(quaternions[:, 0])).max())
 
 
 def _part(stream: bytes, packet: _Packet, earliest: float | None) -> _Part | None:

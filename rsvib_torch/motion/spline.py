@@ -219,7 +219,9 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """
         check_number("offset", offset)
         check_number("scale", scale, above=0.0)
-        size, old = self.coefficients.new_tensor(gain), self.tones
+        size = self.coefficients.new_ones(self.num_axes)
+        size[:2] = size.new_tensor(gain)
+        old = self.tones
         tones = replace(
             old,
             amplitude=old.amplitude * size[:, None],
@@ -232,6 +234,22 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         moved = old.image_motion * offset + 0.5 * old.image_acceleration * offset**2
         rest = (self.coefficients + moved[..., None]) * size[:, None]
         return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones, self.camera)
+
+    def within(self, first: float, last: float) -> "FreeMotion":
+        """The motion between two times in seconds, without the knots that have no influence there.
+
+        Example:
+            >>> times = torch.linspace(0, 1, 101, dtype=torch.float64)
+            >>> motion = FreeMotion.through(times, torch.stack([times, times.square()], -1))
+            >>> part = motion.within(0.42, 0.5)
+            >>> part.coefficients.shape[-1], round(float(part.displacement(torch.tensor(0.45))[1]), 4)
+            (11, 0.2025)
+        """
+        count = self.coefficients.shape[-1]
+        low = min(max(math.floor((first - self.start) / self.spacing), 0), count - 4)
+        high = min(max(math.ceil((last - self.start) / self.spacing) + 3, low + 4), count)
+        start = self.start + low * self.spacing
+        return FreeMotion(self.coefficients[..., low:high], start, self.spacing, self.tones, self.camera)
 
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> Self:
         """The motion whose component k is ``signs[k]`` (1 or -1) times component ``order[k]`` of this motion."""

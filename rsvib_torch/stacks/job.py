@@ -29,6 +29,7 @@ from rsvib_torch.io.full_scale import (
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import (
     BadFrames,
@@ -117,6 +118,7 @@ class StackJob:
     restoration: Mapping[str, Any] | None = field(default_factory=dict)
     # detections to use instead, by number of the window; None where a window has none
     given: Mapping[int, DetectedVibration | None] | None = None
+    motion: FreeMotion | None = None  # motion of all frames to use instead, from the start of the first one
     bad_frames: BadFrames = "pass"  # whether frames that cannot be used are written unchanged or omitted
     force: bool = False  # whether to write restored frames even if they are judged worse than the raw ones
     device: str = "cpu"  # device for the computation
@@ -187,19 +189,20 @@ class StackJob:
         timing = window_timing(self.timing, window, list(usable))
         detection: DetectionResult | DetectedVibration | None = None
         try:
-            if self.given is not None:
-                detection = self.given[window.index]
-            else:
-                detection = detect_vibration(frames, timing, **self.detection)
-            if detection is None:
-                return replace(as_taken, error="no detection was given for this window")
-            if self.restoration is None:
+            motion = self.motion and self._motion_of(window)
+            if motion is None:
+                known = None if self.given is None else self.given[window.index]
+                detection = detect_vibration(frames, timing, **self.detection) if self.given is None else known
+                if detection is None:
+                    return replace(as_taken, error="no detection was given for this window")
+            found = detection if motion is None else motion
+            if self.restoration is None or found is None:
                 return replace(as_taken, detection=detection)
             joint = bool(self.restoration.get("joint", False))
             restoration = restore_trusted(
                 frames,
                 timing,
-                detection,
+                found,
                 self.restoration,
                 force=self.force,
                 first_frames=len(kept) if len(kept) > 1 and not joint else None,
@@ -219,6 +222,14 @@ class StackJob:
             detection=detection,
             restoration=restoration,
         )
+
+    def _motion_of(self, window: Window) -> FreeMotion:
+        """The given motion in a window, with the time origin at its first frame."""
+        assert self.motion is not None
+        starts = self.timing.frame_starts(window.last + 1)
+        first, last = float(starts[window.first] - starts[0]), float(starts[-1] - starts[0])
+        readout = self.info.shape[int(self.timing.scan_axis)] * self.timing.row_time + self.timing.exposure_time
+        return self.motion.within(first - readout, last + 2 * readout).retimed(first).to(self.device)
 
     def _followed(self, as_taken: WindowResult, indices: list[int], frames: Tensor) -> WindowResult:
         """The result of a window by a tracker, from its usable frames and those before it."""
@@ -360,6 +371,7 @@ def plan_job(
         detection,
         restoration,
         None if run.given is None else dict(enumerate(run.given)),
+        run.motion,
         run.bad_frames,
         restored is not None and restored.force,
         device,

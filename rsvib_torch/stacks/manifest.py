@@ -278,6 +278,8 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     if job.given is not None:
         records = plain_values([detected and DetectedVibration.of(detected) for detected in job.given.values()])
         given = hashlib.sha256(json.dumps(records).encode()).hexdigest()
+    elif job.motion is not None:
+        given = hashlib.sha256(json.dumps(plain_values(job.motion)).encode()).hexdigest()
     header = {
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
         "settings": {

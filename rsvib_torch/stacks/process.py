@@ -14,6 +14,7 @@ from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
+from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
@@ -128,6 +129,9 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     """
     sink = Path(sink)
     scheduler, compression, given = options.scheduler, options.compression, options.given
+    other = options.follow or options.detection or given is not None
+    if options.motion is not None and (other or not isinstance(options.motion, FreeMotion)):
+        raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
     job, windows, at_once = plan_job(source, timing, options, here=scheduler in (None, "local"))
     if given is not None and len(given) != len(windows):
         raise ValueError(

@@ -3,14 +3,15 @@
 A corner at the place p (px from the centre of the frame) is exposed at the time t of its row. Between two frames it is
 displaced by ``B(p) (P(t') - P(t)) + V(t') - V(t)``. The path P has the components x, y (px), roll (rad) and zoom, with
 ``B(p) = [[1, 0, -p_y, p_x], [0, 1, p_x, p_y]]``; the vibration V is a sum of tones along x and y. P is a cubic B-spline
-with two knots per frame, which follows a hand. Tones are found in a periodogram from which everything that P explains
-has been projected out. Both are fitted together, with weights that leave out moving objects.
+with two knots per frame, which follows a hand. The amplitude and phase of a tone are a spline with a knot every four
+frames, which follows a vibration that decays or grows. Tones are found in a periodogram from which everything that P
+explains has been projected out. Both are fitted together, with weights that leave out moving objects.
 """
 
 import math
 from collections.abc import Callable, Iterable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -26,11 +27,14 @@ WINDOW_FRAMES = 96  # of one fit; amplitudes and frequencies may change from win
 _MOST_TONES = 3  # of an axis in a window
 _KNOTS = 2  # of the spline per frame; with one, residuals of hand-held clips are 1.7 times as large
 _STIFFNESS = 1e-3  # of the third difference of the spline, in units of the information of a typical knot
+_ENVELOPE = 4  # frames between the knots of a tone; a blow that decays with 0.3 s is followed at 30 frames per second
+_STEADY = 0.1  # of a tone, by which neighbouring knots differ (standard deviation), where corners do not tell
 _CELLS = 24  # of the rows, in which the search for tones takes means; resolves tones of 12 periods per readout
 _MIN_RATIO = 60.0  # of the variance that a tone explains and that of the rest; compression and parallax reach 40
 _MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller ones are not visible in a video
 _LOWEST = 0.6  # of the frame rate; the path follows slower motion
 _MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate hardly change from frame to frame
+_MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
 # 1 to 2 %, and 2 to 15 % too small without
@@ -43,26 +47,60 @@ _SOFT = 3.0  # standard deviations, at which a corner has a quarter of the weigh
 Averaged = tuple[float, float]  # s, the exposure, and the time in which the rows of the patch of a corner are read
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Tone:
-    """A tone of one axis of the vibration in a window."""
+    """A tone of one axis of the vibration around a time."""
 
     axis: int  # 0: x, 1: y
     frequency: float  # Hz
-    coefficient: complex = 0.0  # px; the displacement is Re c exp(2 pi i f (t - origin))
+    coefficient: complex  # px; the displacement is Re c exp(2 pi i f t)
+    amplitude_std: float  # px
+    frequency_std: float  # Hz
+
+
+@dataclass(eq=False)
+class WindowTone:
+    """A tone of one axis in a window, whose amplitude and phase change slowly; times count from its middle."""
+
+    axis: int  # 0: x, 1: y
+    frequency: float  # Hz
+    # (M,) px, coefficients of a spline c(t); the displacement is Re c(t) exp(2 pi i f t)
+    knots: NDArray[np.complex128]
+    start: float  # s, of the first knot
+    step: float  # s, between knots
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
 
-    def at(self, time: float, weight: float = 1.0) -> "Tone":
-        """The tone with the time origin moved to a time in s, and multiplied by a weight."""
-        turned = weight * self.coefficient * complex(np.exp(2j * math.pi * self.frequency * time))
-        return replace(self, coefficient=turned, amplitude_std=weight * self.amplitude_std)
+    def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
+        """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
+        index, factors = spline_taps(np.array([time]), self.start, self.step, len(self.knots))
+        turned = weight * (factors * self.knots[index]).sum() * np.exp(2j * math.pi * self.frequency * origin)
+        return Tone(self.axis, self.frequency, complex(turned), weight * self.amplitude_std, self.frequency_std)
 
-    def columns(self, times: Array, averaged: Averaged) -> Array:
-        """(N, 3), offsets between both times (N, 2) by Re c, Im c and a change of the frequency in Hz."""
-        waves = np.exp(2j * math.pi * self.frequency * times) * np.prod(np.sinc(self.frequency * np.array(averaged)))
-        slope = 2j * math.pi * times * waves * self.coefficient
-        return np.stack([part[:, 1] - part[:, 0] for part in (waves.real, -waves.imag, slope.real)], -1)
+    def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
+        """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
+        attenuation = np.prod(np.sinc(self.frequency * np.array(averaged)))
+        return np.asarray(attenuation * np.exp(2j * math.pi * self.frequency * times))
+
+    def correct_frequency(self, limit: float) -> None:
+        """Change the frequency, by at most ``limit`` in Hz, so that the phase of the knots stays the same."""
+        turns = np.angle(np.vdot(self.knots[:-1], self.knots[1:])) / (2 * math.pi * self.step)  # mean, weighted by size
+        change = float(np.clip(turns, -limit, limit))
+        times = self.start + self.step * (np.arange(len(self.knots)) - 1)
+        self.frequency, self.knots = self.frequency + change, self.knots * np.exp(-2j * math.pi * change * times)
+
+    def set_std(self, covariance: Array) -> None:
+        """Standard deviations, from the covariance (2 M, 2 M) of the real and the imaginary parts of the knots."""
+        count = len(self.knots)
+        variance = covariance.diagonal()
+        self.amplitude_std = math.sqrt(max(np.median(variance[:count]), np.median(variance[count:])))
+        weight = np.square(np.abs(self.knots))
+        times = self.step * np.arange(count)
+        times -= weight @ times / max(float(weight.sum()), 1e-30)
+        spread = float(weight @ np.square(times))
+        # The slope of the phase is sum(|c|^2 t phi) / sum(|c|^2 t^2), and phi changes by Im(dc / c).
+        gradient = np.concatenate([-times * self.knots.imag, times * self.knots.real])
+        self.frequency_std = math.sqrt(max(gradient @ covariance @ gradient, 0.0)) / (2 * math.pi * max(spread, 1e-30))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +111,7 @@ class WindowPath:
     start: float  # s, of the first knot
     step: float  # s, between knots
     knots: Array  # (N, 4) coefficients of the spline
-    tones: tuple[Tone, ...]
+    tones: tuple[WindowTone, ...]
     residual: float  # px, robust standard deviation of the offsets of corners along one axis
 
     def path(self, times: Array, derivative: int = 0) -> Array:
@@ -82,16 +120,29 @@ class WindowPath:
         return np.einsum("nk,nka->na", weights, self.knots[index])
 
 
-def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
-    """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
-    basis = np.zeros((len(index), count))
-    np.add.at(basis, (np.arange(len(index))[:, None, None], index), factors * [[-1.0], [1.0]])
+def _basis(index: NDArray[np.int64], factors: Array, count: int) -> Array:
+    """(N, 2, count) B-splines from ``spline_taps`` at both times (N, 2)."""
+    basis = np.zeros((*index.shape[:2], count))
+    np.put_along_axis(basis, index, factors, -1)
     return basis
 
 
-def _robust_weights(distance: Array, std: float) -> Array:
-    """Weights of residuals of the size ``distance`` with a standard deviation, which is at least 0.001 px."""
-    return 1.0 / (1.0 + (distance / (_SOFT * max(std, 1e-3))) ** 2) ** 2
+def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
+    """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
+    basis = _basis(index, factors, count)
+    return np.asarray(basis[:, 1] - basis[:, 0])
+
+
+def _wave_columns(waves: NDArray[np.complex128], values: Array) -> Array:
+    """(N, 2 M) offsets between both times of waves (N, 2), by the real and imaginary parts of M knots (N, 2, M)."""
+    late, early = (waves[:, time, None] * values[:, time] for time in (1, 0))
+    return np.concatenate([(late - early).real, (early - late).imag], -1)
+
+
+def _robust_weights(distance: Array, std: Array | float) -> Array:
+    """Weights of residuals of the size ``distance`` with standard deviations, which are at least 0.001 px."""
+    weights: Array = 1.0 / (1.0 + (distance / (_SOFT * np.maximum(std, 1e-3))) ** 2) ** 2
+    return weights
 
 
 class _WindowFit:
@@ -110,6 +161,10 @@ class _WindowFit:
         # Columns of the path, for the few knots that a pair of frames depends on: every component of a knot at the
         # places of the corners.
         self.pairs: list[tuple[slice, NDArray[np.int64], Array]] = []  # corners, unknowns, columns (2, n, unknowns)
+        self.envelope_step = _ENVELOPE * interval
+        self.envelope_knots = max(4, math.ceil((end - self.start) / self.envelope_step) + 3)
+        taps = self._envelope(self.times)
+        self.envelopes: list[tuple[NDArray[np.int64], Array]] = []  # knots of a tone, and their values (n, 2, knots)
         ends = np.append(np.nonzero(np.diff(corners.pairs))[0] + 1, len(factors))
         for begin, stop in pairwise((0, *ends)):
             part = slice(int(begin), int(stop))
@@ -118,11 +173,18 @@ class _WindowFit:
             columns = np.einsum("nac,nk->anck", factors[part], basis).reshape(2, len(basis), -1)
             unknowns = (np.arange(4)[:, None] * self.count + np.arange(low, knots)).ravel()
             self.pairs.append((part, unknowns, columns))
+            knots_of_tone = np.arange(taps[0][part].min(), taps[0][part].max() + 1)
+            self.envelopes.append(
+                (knots_of_tone, _basis(taps[0][part] - knots_of_tone[0], taps[1][part], len(knots_of_tone)))
+            )
         third = np.diff(np.eye(self.count), 3, axis=0)
         self.penalty = third.T @ third
-        self.tones: list[Tone] = []
+        steps = np.diff(np.eye(self.envelope_knots), axis=0)
+        self.steadiness = steps.T @ steps
+        self.tones: list[WindowTone] = []
         self.weights = np.ones(len(factors))
-        self.sigma = math.inf
+        self.sigma = math.inf  # px, standard deviation of a corner along one axis
+        self.unexplained = math.inf  # px^2, mean over the pairs of the square of the median residual
         self.knots = np.zeros((4, self.count))
 
     def explained(self, knots: Array) -> Array:
@@ -132,38 +194,74 @@ class _WindowFit:
             offsets[part] = (columns @ knots.ravel()[unknowns]).T
         return offsets
 
+    def _envelope(self, times: Array) -> tuple[NDArray[np.int64], Array]:
+        """Knots of a tone at times in s from the middle, and their values."""
+        return spline_taps(times, self.start - self.origin, self.envelope_step, self.envelope_knots)
+
+    def tone(self, axis: int, frequency: float) -> WindowTone:
+        """A tone with an amplitude that is not known yet."""
+        knots = np.zeros(self.envelope_knots, complex)
+        return WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step)
+
     def solve(self, rounds: int = 2) -> None:
-        """Fit path and tones; each round corrects the weights and, to first order, the frequencies."""
-        size, extra = 4 * self.count, 3 * len(self.tones)
-        limit = 0.25 / (self.times.max() - self.times.min())  # Hz, of a change, which is linear within a period
+        """Fit path and tones; each round corrects the weights and the frequencies."""
+        size, of_tone = 4 * self.count, 2 * self.envelope_knots
+        total = size + of_tone * len(self.tones)
         for _ in range(rounds):
-            waves = np.zeros((2, len(self.times), extra))
-            for number, tone in enumerate(self.tones):
-                waves[tone.axis, :, 3 * number : 3 * number + 3] = tone.columns(self.times, self.averaged)
-            gram, right = np.zeros((size + extra, size + extra)), np.zeros(size + extra)
-            for part, unknowns, columns in self.pairs:
-                both = np.concatenate([columns, waves[:, part]], -1).reshape(2 * columns.shape[1], -1)
-                index = np.concatenate([unknowns, np.arange(size, size + extra)])
+            for tone in self.tones:
+                if tone.knots.any():
+                    tone.correct_frequency(0.25 / (self.times.max() - self.times.min()))
+            # 1. Columns of the path and the tones, for the few knots that a pair of frames depends on.
+            waves = [tone.waves(self.times, self.averaged) for tone in self.tones]
+            gram, right, columns = np.zeros((total, total)), np.zeros(total), []
+            for (part, unknowns, of_path), (knots, values) in zip(self.pairs, self.envelopes, strict=True):
+                count, places = of_path.shape[1], [unknowns]
+                of_tones = np.zeros((len(self.tones), 2, count, 2 * len(knots)))
+                for number, (tone, wave) in enumerate(zip(self.tones, waves, strict=True)):
+                    of_tones[number, tone.axis] = _wave_columns(wave[part], values)
+                    first = size + of_tone * number
+                    places += [first + knots, first + self.envelope_knots + knots]
+                both = np.concatenate([of_path, *of_tones], -1).reshape(2 * count, -1)
+                index = np.concatenate(places)
                 heavy = both.T * np.tile(self.weights[part], 2)
                 gram[np.ix_(index, index)] += heavy @ both
                 right[index] += heavy @ self.corners.offsets[part].T.ravel()
+                columns.append((part, index, both))
+            # 2. The solution with a stiff path, and tones that are steady where nothing tells.
             self._regularise(gram, size)
+            for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
+                spread = _STEADY * np.sqrt(np.square(np.abs(tone.knots)).mean())
+                stiffness = (self.sigma / spread) ** 2 if spread > 0 else 1e-3 * gram.diagonal()[:size].mean()
+                for begin in (first, first + self.envelope_knots):
+                    part = slice(begin, begin + self.envelope_knots)
+                    gram[part, part] += stiffness * self.steadiness
             factor = cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)
             solution = cho_solve(factor, right)
             self.knots = solution[:size].reshape(4, self.count)
-            residual = self.corners.offsets - self.explained(self.knots) - (waves @ solution[size:]).T
+            # 3. Weights by the residuals, and the tones.
+            residual = self.corners.offsets.copy()
+            for part, index, both in columns:
+                residual[part] -= (both @ solution[index]).reshape(2, -1).T
             length = np.hypot(*residual.T)
             self.sigma = max(float(np.median(length)) / 1.177, 1e-3)  # of two normal components: 1.177 std
-            self.weights = _robust_weights(length, self.sigma)
-            variance = np.abs(cho_solve(factor, np.eye(size + extra)[:, size:])[size:].diagonal())
-            for number, tone in enumerate(self.tones):
-                part = slice(size + 3 * number, size + 3 * number + 3)
-                real, imaginary, change = solution[part]
-                tone.frequency += float(np.clip(change, -limit, limit)) * (tone.coefficient != 0)
-                tone.coefficient = complex(real, imaginary)
-                of_tone = variance[3 * number : 3 * number + 3]
-                tone.amplitude_std = self.sigma * math.sqrt(of_tone[:2].max())
-                tone.frequency_std = self.sigma * math.sqrt(of_tone[2])
+            self.weights = self._weights(length, self.sigma, 1 / 1.177)
+            self.unexplained = float(np.mean([np.median(length[part]) ** 2 for part, *_ in self.pairs]))
+            for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
+                real, imaginary = solution[first : first + of_tone].reshape(2, -1)
+                tone.knots = real + 1j * imaginary
+        unit = np.eye(total)[:, size:]
+        covariance = self.sigma**2 * cho_solve(factor, unit)[size:]
+        for number, tone in enumerate(self.tones):
+            part = slice(of_tone * number, of_tone * (number + 1))
+            tone.set_std(covariance[part, part])
+
+    def _weights(self, distance: Array, std: float, factor: float) -> Array:
+        """Weights of residuals with a standard deviation, or that of their pair: ``factor`` times the median.
+
+        A vibration that is not found yet displaces all corners of a pair.
+        """
+        of_pairs = [max(std, factor * float(np.median(distance[part]))) for part, *_ in self.pairs]
+        return _robust_weights(distance, np.repeat(of_pairs, [part.stop - part.start for part, *_ in self.pairs]))
 
     def _regularise(self, gram: Array, size: int) -> None:
         """Add the stiffness of the path, whose columns are the first ones, and a little for what is not determined."""
@@ -173,21 +271,21 @@ class _WindowFit:
             gram[part, part] += _STIFFNESS * typical * self.penalty
         gram[np.diag_indices(len(gram))] += 1e-9 * typical
 
-    def with_tone(self, tone: Tone) -> "_WindowFit":
+    def with_tone(self, axis: int, frequency: float) -> "_WindowFit":
         """The fit with one more tone."""
         other = copy(self)
-        other.tones, other.weights = [*(copy(one) for one in self.tones), tone], np.ones_like(self.weights)
+        other.tones, other.weights = [*map(copy, self.tones), self.tone(axis, frequency)], np.ones_like(self.weights)
         other.solve(_ROUNDS)
         return other
 
     def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
-        """Whether frequencies are those of none of the tones of an axis, which the window does not separate."""
-        resolved = 2.0 / (self.times.max() - self.times.min())
+        """Whether frequencies are those of none of the tones of an axis, nor of a change of their amplitudes."""
+        resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
         others = [tone.frequency for tone in self.tones if tone.axis == axis]
         return np.all([np.abs(frequencies - other) > resolved for other in others] or [frequencies > 0], axis=0)
 
-    def strongest(self, axis: int, frequencies: Array) -> tuple[Tone, float, float]:
-        """The tone that explains most of an axis, its ratio of variances, and the offsets that it explains (px rms)."""
+    def strongest(self, axis: int, frequencies: Array) -> tuple[float, float, float]:
+        """The frequency that explains most of an axis, its ratio of variances, and the offsets by it (px rms)."""
         # 1. Means of the offsets along the axis in cells of rows, without those by the other components.
         others = self.knots.copy()
         others[axis] = 0.0
@@ -199,13 +297,14 @@ class _WindowFit:
         order, sizes = np.lexsort((offsets, cell)), np.bincount(cell)
         middle = np.cumsum(sizes) - sizes + (sizes - 1) // 2
         apart = np.abs(offsets - offsets[order[middle]][cell])
-        weights = _robust_weights(apart, 1.5 * float(np.median(apart)))
+        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5)
         total = np.maximum(np.bincount(cell, weights), 1e-9)
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
         # 2. Project out what the path and the tones so far explain.
         basis = _differences(*spline_taps(times + self.origin, self.start, self.step, self.count), self.count)
-        tones = [tone.columns(times, self.averaged)[:, :2] for tone in self.tones if tone.axis == axis]
+        values = _basis(*self._envelope(times), self.envelope_knots)
+        tones = [_wave_columns(tone.waves(times, self.averaged), values) for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known
         self._regularise(gram, self.count)
@@ -227,7 +326,8 @@ class _WindowFit:
             cs = (cosine * sine).sum(0) - (hidden[0] * hidden[1]).sum(0)
             c, s = single_rest @ cosine, single_rest @ sine
             determinant = cc * ss - cs**2
-            is_visible = determinant > 1e-2 * (cc + cs).max() ** 2
+            size = 0.5 * (cc + ss)  # of what remains of a wave; its phase must be determined as well
+            is_visible = (size > _MIN_SHARE * size.max()) & (determinant > 1e-2 * size**2)
             explained[some] = (ss * c**2 - 2 * cs * c * s + cc * s**2) / np.where(is_visible, determinant, np.inf)
         # 4. The highest peak; a maximum at the edge of a band of frequencies belongs to a tone outside of it.
         spacing = np.diff(frequencies)
@@ -238,14 +338,16 @@ class _WindowFit:
         best = int(explained.argmax())
         freedom = max(len(rest) - len(gram) - 3, 1)
         ratio = 0.5 * explained[best] / max((before - explained[best]) / freedom, 1e-12)
-        return Tone(axis, float(frequencies[best])), float(ratio), math.sqrt(explained[best] / float(total.sum()))
+        return float(frequencies[best]), float(ratio), math.sqrt(explained[best] / float(total.sum()))
 
 
-def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: float) -> WindowPath:
+def fit_window(
+    corners: Corners, interval: float, averaged: Averaged, readout: float, has_tones: bool = True
+) -> WindowPath:
     """Path and tones of the ``corners`` of all pairs of a window of frames, which are an ``interval`` in s apart.
 
     A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
-    first to the last row (s).
+    first to the last row (s). Without ``has_tones``, no tones are looked for.
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
@@ -255,19 +357,18 @@ def fit_window(corners: Corners, interval: float, averaged: Averaged, readout: f
     frequencies = np.arange(_LOWEST / interval, highest, step)
     is_visible = np.abs(2 * np.sin(math.pi * frequencies * interval)) > _MIN_GAIN
     frequencies = frequencies[is_visible & (np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1) > _MIN_SINC)]
-    axes = [0, 1] if len(frequencies) else []
+    axes = [0, 1] if has_tones and len(frequencies) else []
     while axes:
         found = [fit.strongest(axis, frequencies[fit.is_apart(axis, frequencies)]) for axis in axes]
-        tone, ratio, offsets = max(found, key=lambda item: item[1])
+        axis, (frequency, ratio, offsets) = max(zip(axes, found, strict=True), key=lambda item: item[1][1])
         if ratio < _MIN_RATIO or offsets < _MIN_EXPLAINED:
             break
         # Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
         # tone: they are compared by what remains of both axes.
-        aliases = tone.frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
+        aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
         inside = (aliases > frequencies[0]) & (aliases < frequencies[-1])
-        aliases = aliases[inside & fit.is_apart(tone.axis, aliases)]
-        trials = [fit.with_tone(replace(tone, frequency=float(frequency))) for frequency in aliases]
-        fit = min(trials, key=lambda trial: trial.sigma)
+        trials = [fit.with_tone(axis, float(alias)) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
+        fit = min(trials, key=lambda trial: trial.unexplained)
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
     fit.solve()
     knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])
@@ -306,7 +407,7 @@ class CameraPath:
         """Tones around a time in s, which is the origin of their phases."""
         weights = self._weights(np.array([time]))[:, 0]
         return [
-            tone.at(time - window.origin, float(weight))
+            tone.at(time - window.origin, time - window.origin, float(weight))
             for weight, window in zip(weights, self.windows, strict=True)
             if weight > 0
             for tone in window.tones
@@ -317,7 +418,9 @@ class CameraPath:
         return min(self.windows, key=lambda window: abs(window.origin - time))
 
 
-def camera_path(pairs: Iterable[Corners | None], timing: SensorTiming, size: tuple[int, int]) -> CameraPath:
+def camera_path(
+    pairs: Iterable[Corners | None], timing: SensorTiming, size: tuple[int, int], *, has_tones: bool = True
+) -> CameraPath:
     """Path of a camera from the corners of all pairs of neighbouring frames (None where there are too few).
 
     A ``ValueError`` is raised if no window of frames has corners in a quarter of its pairs.
@@ -330,7 +433,8 @@ def camera_path(pairs: Iterable[Corners | None], timing: SensorTiming, size: tup
     def fit() -> None:
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
-            windows.append(fit_window(Corners.joined(known), timing.frame_period, averaged, readout))
+            joined = Corners.joined(known)
+            windows.append(fit_window(joined, timing.frame_period, averaged, readout, has_tones))
 
     fitted = 0
     for pair in pairs:

@@ -15,6 +15,7 @@ from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.execution.prefetch import in_threads
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.frames.entry_points import file_options
+from rsvib_torch.gyroscope.gpmf_track import read_camera_track
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.read_gyroscope import read_gyroscope
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
@@ -72,6 +73,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
     ``"dewarp"``. Decoding, restoration and encoding run in threads.
 
+    If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
+    states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
+
     Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
     parts of 32 frames in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
     the first frames of each part is compared with that of the input: a video that shakes more is not written.
@@ -119,6 +123,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "steady": options.steady,
             "crop_limit": options.crop_limit,
             "gyroscope": None if recording is None else fingerprint(recording),
+            "stabilised": video.stabilised,
+            "exposures": None if video.exposures is None else [min(video.exposures), max(video.exposures)],
         },
     }
 
@@ -188,8 +194,20 @@ def _planned(
         picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
     frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
-    starts = [start - times[0] for start in times]
-    return VideoPasses(frames, starts, options.steady, options.crop_limit, rates), at_once
+    starts = np.array(times) - times[0]
+    # What the track of a GoPro video states of its frames. Rows are read at equal intervals, where exposures end:
+    # frames of a longer exposure are exposed earlier in the mean.
+    whole, part = split_range(source)
+    track, exposures = read_camera_track(whole), None
+    if track is not None and len(track.exposures):
+        begin = 0.0 if part is None else part[0] * job.timing.frame_period
+        exposures = track.exposures_at(starts + begin)
+        starts = starts - 0.5 * (exposures - job.timing.exposure_time)
+        starts = starts - starts[0]
+    stabilised = track is not None and track.stabilised
+    stated = None if exposures is None else exposures.tolist()
+    passes = VideoPasses(frames, starts.tolist(), options.steady, options.crop_limit, rates, stated, stabilised)
+    return passes, at_once
 
 
 def _restored_parts(

@@ -36,6 +36,7 @@ class FrameTrack:
     time: float  # s, exposure start of its first row, from the first frame
     motion: Vibration | FreeMotion  # the motion to remove, in image axes; its time origin is the middle of the frame
     fault: str | None = None  # why the frame could not be used; None if it was used
+    exposure: float | None = None  # s, of this frame; None: that of the sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,8 @@ class VideoFrames:
         results: list[Frame] = []
         visible: list[NDArray[np.bool_]] = []
         for number, plane in enumerate(planes):
-            motion, timing = (track.motion if number == 0 else _on_half_pixels(track.motion)), self.timing_of(number)
+            motion = track.motion if number == 0 else _on_half_pixels(track.motion)
+            timing = self.timing_of(number, track.exposure)
             separately = number == 0 and self.options.method != "dewarp"
             if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
                 # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
@@ -152,9 +154,11 @@ class VideoFrames:
             visible.append(np.all((source >= 0) & (source <= limits), axis=0))
         return RestoredFrame(results, visible if self.masks else None)
 
-    def timing_of(self, plane: int) -> SensorTiming:
+    def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
         """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
         timing = self.job.timing
+        if exposure is not None:
+            timing = replace(timing, exposure_rows=min(exposure / timing.row_time, timing.frame_rows))
         rows = self.size[0 if timing.scan_axis == -2 else 1]
         half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
         if plane == 0:

@@ -27,6 +27,7 @@ from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
+from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import window_record
 from rsvib_torch.video import Margins
@@ -36,7 +37,6 @@ from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
-_COMPARED_PAIRS = 48  # of frames, over the whole video, by which a gyroscope is aligned
 CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
@@ -66,6 +66,8 @@ class VideoPasses:
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
+    exposures: list[float] | None  # s, of the frames; None: all that of the sensor
+    stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
 
     @property
     def parts(self) -> int:
@@ -86,9 +88,13 @@ class VideoPasses:
 
     def motion(self, progress: Callable[[], None]) -> VideoMotion:
         """The motion of all frames, from corners that are followed from each usable frame to the next one."""
+        timing = self.frames.job.timing
+        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
+        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        times = np.array(self.starts) + half
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
-        chosen = np.linspace(0, len(self.starts) - 2, _COMPARED_PAIRS).astype(int) if self.rates is not None else ()
+        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
         compared: dict[int, Corners] = {}  # with a gyroscope, corners between the chosen frames and the next ones
 
         def pairs() -> Iterator[Corners | None]:
@@ -111,18 +117,18 @@ class VideoPasses:
                         if before[0] == index - 1 in chosen:
                             starts = self.starts[index - 1 : index + 1]
                             compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
+                        if corners is not None and self.stabilised:
+                            both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
+                            corners = replace(corners, times=both)
                         yield corners
                     before = index, grey
 
-        timing = self.frames.job.timing
-        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
-        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
-        times = np.array(self.starts) + half
         if self.rates is None:
-            path = camera_path(pairs(), timing, self.frames.size)
+            path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
             places = path.places(times)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])
             polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
+            polynomials[:, :2] *= not self.stabilised
 
             def by_corners(index: int) -> Vibration:
                 return self._removed(path.tones(float(times[index])), polynomials[index])
@@ -140,15 +146,12 @@ class VideoPasses:
 
     def _alignment(self, rates: AngularRates, pairs: dict[int, Corners]) -> RotationAlignment:
         """The alignment of the gyroscope by the corners between some frames, by number, and the next ones."""
-        source = f"the gyroscope ({rates.source})"
-        if not pairs:
-            raise ValueError(f"{source} cannot be compared with the video: it has no two different frames in sequence")
         timing, size = self.frames.job.timing, self.frames.size
-        starts = np.array([self.starts[index : index + 2] for index in pairs])
-        tracks = tracks_of_pairs(list(pairs.values()), starts, timing, size)
-        found = align_rates(tracks, tensor(starts), size if timing.scan_axis == -2 else size[::-1], timing, rates)
+        tracks = tracks_of_pairs(pairs, self.starts, timing, size)
+        starts = tensor(np.array([self.starts[index : index + 2] for index in pairs]))
+        found = align_rates(tracks, starts, size if timing.scan_axis == -2 else size[::-1], timing, rates)
         if not found.reliable:
-            raise ValueError(f"{source} does not fit the video: {'; '.join(found.reasons)}")
+            raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {'; '.join(found.reasons)}")
         return found
 
     def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
@@ -164,7 +167,8 @@ class VideoPasses:
 
     def track(self, motion: VideoMotion, index: int) -> FrameTrack:
         """What is removed from a frame."""
-        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index))
+        exposure = None if self.exposures is None else self.exposures[index]
+        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
 
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
@@ -243,8 +247,9 @@ class VideoPasses:
 
     def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
         """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
-        window = path.nearest(float(times[tracks[len(tracks) // 2].index]))
-        tones = [tone.at(tracks[0].time - window.origin) for tone in window.tones]
+        middle = float(times[tracks[len(tracks) // 2].index])
+        window = path.nearest(middle)
+        tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
         amplitude, frequency, phase = tone_tables(tones, 2)
         size, rate = (np.full_like(amplitude, math.inf) for _ in range(2))
         for axis in (0, 1):

@@ -144,7 +144,8 @@ def test_command(frames, gyroscope, tmp_path, capsys):
     assert re.search(r"restored frames agree; estimated improvement \+\d", printed)
     assert rsvib(*arguments, *focal, "--offset", CLOCK, "--overwrite") == 0
     assert (rsv.read_stack(tmp_path / "out.tif") - first).square().mean() < 0.01
-    (tmp_path / "out.tif").unlink()
+    for name in ("out.tif", "out.tif.manifest.json"):
+        (tmp_path / name).unlink()
     for more, message in (
         ((*focal, "--offset", 813.35), "the frames need"),
         ((*focal, "--offset", CLOCK, "--flip-x", "--flip-y"), "x: rows are further apart"),

@@ -9,6 +9,7 @@ from gpmf_file import RATES, TIMES, box, mp4, packet, packets_of
 from refusals import refuses
 
 import rsvib_torch as rsv
+from rsvib_torch.gyroscope import read_camera_track
 
 
 def lines_of(times, rates):
@@ -163,3 +164,19 @@ def test_images_that_the_camera_has_stabilised_are_stated(tmp_path, turned, stat
     found = rsv.read_gyroscope(mp4(tmp_path / "clip.mp4", packets_of(turned=[turned] * 3)))
     assert ("IORI" in found.source) == stated
     assert np.allclose(found.rates.numpy(), RATES, atol=1e-9)
+
+
+def test_exposures_and_rotations_of_the_images_in_a_track(tmp_path):
+    exposures = [[0.002] * 9, [0.002] * 5 + [0.004] * 4, [0.004] * 9]
+    turned = [[0.9998, 0.0, 0.02, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    path = mp4(tmp_path / "clip.mp4", packets_of(exposures=lambda number: exposures[number], turned=turned))
+    track = read_camera_track(path)
+    assert len(track.exposures) == 27
+    assert track.exposures_at(np.array([0.1, 0.3 + 0.1, 0.3 + 0.2, 0.8])) == pytest.approx([0.002, 0.002, 0.004, 0.004])
+    assert track.turned == pytest.approx(0.04, rel=1e-2)
+    assert track.stabilised
+    plain = read_camera_track(mp4(tmp_path / "plain.mp4", packets_of()))
+    assert len(plain.exposures) == 0
+    assert not plain.stabilised
+    assert read_camera_track(mp4(tmp_path / "other.mp4", packets_of(), kind=b"text")) is None
+    assert read_camera_track(tmp_path / "missing.tif") is None

@@ -27,7 +27,8 @@ def make_frames():
 
 @pytest.fixture(scope="module", name="tracks")
 def make_tracks(frames):
-    return corner_tracks(frames, None, TIMING)
+    starts = TIMING.frame_starts(len(frames)).tolist()
+    return corner_tracks(((number, frame, None) for number, frame in enumerate(frames)), starts, TIMING)
 
 
 def aligned(tracks, rates, camera=None):
@@ -225,7 +226,7 @@ def test_translation_of_the_camera_is_no_bias(axes, speed):
     starts = np.stack([start, start + timing.frame_period], -1)
     cell = ((place[:, 1] + 240) // 80 * 8 + (place[:, 0] + 320) // 80).astype(int)
     tables = (torch.from_numpy(values) for values in (pair, cell, starts, rows, place, offsets))
-    tracks = CornerTracks(*tables, num_pairs=pairs, radius=230.0)
+    tracks = CornerTracks(*tables, num_pairs=pairs, first_frames=torch.arange(pairs), radius=230.0)
     times = np.arange(-0.04, 0.8, 1e-3)
     own = in_axes(axes, rates_of(times, 3.0))
     recording = rsv.AngularRates(torch.from_numpy(times + OFFSET), torch.from_numpy(own + np.array(BIAS)))

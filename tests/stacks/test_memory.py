@@ -62,7 +62,7 @@ def test_zarr_that_expands_is_refused_by_every_command(tmp_path, set_free, capsy
     (tmp_path / "a.zarr" / "zarr.json").write_text(json.dumps(header))
     (tmp_path / "a.zarr" / "more").write_bytes(bytes(96_000))
     (tmp_path / "camera.toml").write_text(CAMERA.replace("frame_rows = 104", "frame_rows = 7000"))
-    (tmp_path / "motion.csv").write_text("time,x,y\n" + "".join(f"{n / 100},0,0\n" for n in range(100)))
+    (tmp_path / "motion.csv").write_text("time,x,y\n" + "".join(f"{n / 100},0,0\n" for n in range(10000)))
     set_free(GB)
     camera = ("--config", tmp_path / "camera.toml")
     stack, out = tmp_path / "a.zarr", tmp_path / "out"

@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from truth import draw_scene
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.registration.corners import CornerFollower
+from rsvib_torch.registration.corners import CornerFollower, find_corners
 from rsvib_torch.video.camera_path import camera_path, shake
 from rsvib_torch.video.steadying import largest_displacement, steady_shifts
 
@@ -91,10 +91,26 @@ def test_a_hand_without_vibration_has_no_tones():
     assert fitted(recorded({}, subject=False))[1].tones(0.5) == []
 
 
-def test_a_vibration_that_decays_has_no_tones_that_cancel():
-    tones = fitted(recorded({0: (1.5, 37.0, 0.3), 1: (1.0, 53.0, 1.0)}, subject=False, decay=0.8))[1].tones(0.5)
-    assert tones
-    assert max(abs(tone.coefficient) for tone in tones) < 1.5
+def test_a_vibration_that_decays_is_followed():
+    truth, decay = {0: (1.5, 37.0, 0.3), 1: (1.0, 53.0, 1.0)}, 0.8
+    path = fitted(recorded(truth, subject=False, decay=decay))[1]
+    for time in (0.15, 0.7, 1.4):
+        tones = {tone.axis: tone for tone in path.tones(time)}
+        assert len(path.tones(time)) == 2
+        for axis, (size, frequency, phase) in truth.items():
+            expected = size * np.exp(-time / decay) * np.exp(1j * (2 * np.pi * frequency * time + phase - np.pi / 2))
+            assert abs(tones[axis].coefficient - expected) < 0.06  # px
+
+
+def test_corners_at_night_are_those_of_the_lights():
+    rng = np.random.default_rng(2)
+    frame = np.clip(np.round(6 + 4 * rng.normal(size=(HEIGHT, WIDTH))), 0, 255).astype(np.uint8)
+    places = [(40, 60), (120, 200), (180, 90)]
+    for row, column in places:
+        frame[row : row + 3, column : column + 3] = 200
+    found = find_corners(frame, most=256)
+    assert 3 <= len(found) <= 12
+    assert all(min(np.hypot(*(point - [column + 1, row + 1])) for row, column in places) < 5 for point in found)
 
 
 def test_unrelated_frames_have_no_path():

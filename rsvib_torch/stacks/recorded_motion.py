@@ -1,0 +1,186 @@
+"""Alignment of a recording with a stack of any length: some of its frames are read and compared."""
+
+import math
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
+from rsvib_torch.gyroscope.clock_range import offset_range, outside
+from rsvib_torch.gyroscope.corner_tracks import corner_tracks
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.motion_check import MotionCheck, check_motion
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.io.frame_times import timing_from_first_frame
+from rsvib_torch.io.full_scale import counts_to_frames
+from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.io.stack_reading import open_stack
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.stacks.job import stored_frame
+from rsvib_torch.stacks.memory import check_stack_fits
+
+_COMPARED_PAIRS = 48  # of frames, over the whole stack, by which a gyroscope is aligned
+_RUNS, _RUN_FRAMES = 3, 16  # runs of frames, over the whole stack, by which a motion is aligned
+_CLOCK_ERROR = 1e-3  # of the ratio of two clocks; oscillators are within 1e-4
+
+
+def compared_pairs(count: int) -> list[int]:
+    """First frames of the pairs of neighbouring frames, of ``count``, by which a gyroscope is aligned.
+
+    Example:
+        >>> compared_pairs(4), len(compared_pairs(1000))
+        ([0, 1, 2], 48)
+    """
+    return sorted({int(index) for index in np.linspace(0, count - 2, _COMPARED_PAIRS)}) if count > 1 else []
+
+
+def compared_runs(count: int) -> list[slice]:
+    """Frames, of ``count``, by which a motion is aligned: all of a short stack, or several runs.
+
+    Example:
+        >>> compared_runs(40), compared_runs(1000)
+        ([slice(0, 40, None)], [slice(0, 16, None), slice(492, 508, None), slice(984, 1000, None)])
+    """
+    if count <= _RUNS * _RUN_FRAMES:
+        return [slice(0, count)]
+    firsts = np.linspace(0, count - _RUN_FRAMES, _RUNS).astype(int).tolist()
+    return [slice(first, first + _RUN_FRAMES) for first in firsts]
+
+
+def part_of_stack(source: Path, info: StackInfo, timing: SensorTiming, part: slice) -> tuple[Tensor, SensorTiming]:
+    """Some frames of a stack, as ``read_stack`` returns them, and the timing from the start of its first frame.
+
+    The full scale is that of ``info``.
+    """
+    check_stack_fits(info.with_frames(part.stop - part.start))
+    starts = timing.frame_starts(info.shape[0])
+    times = (starts[part] - starts[0]).tolist()
+    with closing(open_stack(source)) as reader:
+        frames = [reader.frame(index) for index in range(part.start, part.stop)]
+    images = counts_to_frames(np.stack(frames), info.full_scale, str(source), info.nodata)
+    return images, replace(timing, frame_start_times=times)
+
+
+def align_stack(
+    source: Path,
+    info: StackInfo,
+    timing: SensorTiming,
+    recorded: FreeMotion | AngularRates,
+    *,
+    camera: Camera | None = None,
+    offsets: tuple[float, float] | None = None,
+    fit_gain: bool = False,
+    fit_row_time: bool = False,
+) -> ClockAlignment | RotationAlignment:
+    """``align_motion`` for a stack of any length, in bounded time and memory.
+
+    Angular rates are compared with 48 pairs of neighbouring frames over the whole stack, a motion with three runs of 16
+    frames; of stacks that are not longer, all frames are used. ``info`` describes the stack, with its full scale;
+    ``timing`` is that of the caller.
+
+    Raises:
+        OSError: If the stack cannot be read.
+        ValueError: As ``align_motion``.
+    """
+    timing = timing_from_first_frame(timing, info)
+    if isinstance(recorded, AngularRates):
+        pairs = compared_pairs(info.shape[0])
+        starts = timing.frame_starts(info.shape[0])
+        tracks = corner_tracks(_grey_frames(source, info, pairs), starts.tolist(), timing)
+        index = tracks.first_frames
+        size = info.shape[-2:] if timing.scan_axis == -2 else info.shape[:-3:-1]
+        of_pairs = torch.stack([starts[index], starts[index + 1]], -1)
+        fit_focal_length = camera is None or fit_gain
+        more: dict[str, Any] = {"offsets": offsets, "fit_focal_length": fit_focal_length, "fit_row_time": fit_row_time}
+        return align_rates(tracks, of_pairs, size, timing, recorded, camera, **more)
+    runs = compared_runs(info.shape[0])
+    if len(runs) == 1:
+        frames, of_run = part_of_stack(source, info, timing, runs[0])
+        return align_motion(frames, of_run, recorded, offsets=offsets, fit_gain=fit_gain)
+    return _aligned_runs(source, info, timing, recorded, runs, offsets, fit_gain)
+
+
+def check_stack_motion(source: Path, info: StackInfo, timing: SensorTiming, motion: FreeMotion) -> MotionCheck:
+    """``check_motion`` for a stack of any length, by the frames in its middle."""
+    timing = timing_from_first_frame(timing, info)
+    runs = compared_runs(info.shape[0])
+    frames, of_run = part_of_stack(source, info, timing, runs[len(runs) // 2])
+    return check_motion(frames, of_run, motion)
+
+
+def _grey_frames(source: Path, info: StackInfo, pairs: list[int]) -> Iterator[tuple[int, Tensor, Tensor | None]]:
+    """Number and pixels (H, W) of the frames of pairs, and which of them have data if some have not."""
+    with closing(open_stack(source)) as reader:
+        for index in sorted({*pairs, *(first + 1 for first in pairs)}):
+            frame = stored_frame(reader.frame, index)
+            if isinstance(frame, str):
+                continue
+            image = counts_to_frames(frame[None], info.full_scale, str(source), info.nodata)[0]
+            image = image if image.ndim == 2 else image.mean(0)
+            valid = torch.isfinite(image)
+            yield index, image.nan_to_num(0.0), None if bool(valid.all()) else valid
+
+
+def _aligned_runs(
+    source: Path,
+    info: StackInfo,
+    timing: SensorTiming,
+    recorded: FreeMotion,
+    runs: list[slice],
+    offsets: tuple[float, float] | None,
+    fit_gain: bool,
+) -> ClockAlignment:
+    """The clock by the runs of a long stack, each of which determines its reading at one time."""
+    # 1. The run in the middle, at all offsets; then the others, near its clock.
+    starts = timing.frame_starts(info.shape[0])
+    readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+    limits = offset_range(recorded, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
+    order = [runs[len(runs) // 2], *runs[: len(runs) // 2], *runs[len(runs) // 2 + 1 :]]
+    found: list[ClockAlignment] = []
+    middles: list[float] = []
+    for run in order:
+        frames, of_run = part_of_stack(source, info, timing, run)
+        middles.append(0.5 * float(starts[run.start] + starts[run.stop - 1] - 2 * starts[0]) + 0.5 * readout)
+        near = limits
+        if found:
+            error = _CLOCK_ERROR * abs(middles[-1] - middles[0]) + 4 * found[0].offset_std
+            near = max(limits[0], found[0].offset - error), min(limits[1], found[0].offset + error)
+        one = align_motion(frames, of_run, recorded, offsets=near, fit_gain=fit_gain, fit_scale=False)
+        found.append(one)
+        if not one.reliable:  # the others cannot make it reliable
+            return one
+    # 2. A straight line through the readings.
+    times, readings = np.array(middles), np.array([one.offset for one in found])  # s; less the times of the frames
+    weights = 1 / np.array([one.offset_std for one in found])
+    design = np.stack([np.ones_like(times), times - times.mean()], -1)
+    solution, *_ = np.linalg.lstsq(design * weights[:, None], readings * weights, rcond=None)
+    rest = float(np.square((readings - design @ solution) * weights).sum())  # of one degree of freedom
+    covariance = np.linalg.inv(design.T @ (design * np.square(weights)[:, None])) * max(1.0, rest)
+    scale, gradient = 1.0 + float(solution[1]), np.array([1.0, -times.mean()])
+    offset, offset_std = float(gradient @ solution), math.sqrt(gradient @ covariance @ gradient)
+    # 3. The motion with the mean gain and drift.
+    gain_x, gain_y = np.mean([one.gain for one in found], 0).tolist()
+    drift = torch.stack([one.drift for one in found]).mean(0)
+    middle = float(times.mean())
+    clock = FittedClock(offset + scale * middle, scale, (gain_x, gain_y), tuple(drift.tolist()), middle)
+    findings = outside(offset, offset_std, offsets)
+    return ClockAlignment(
+        motion=clock.motion(recorded),
+        offset=offset,
+        offset_std=offset_std,
+        scale=scale,
+        scale_std=math.sqrt(covariance[1, 1]),
+        gain=(gain_x, gain_y),
+        drift=drift,
+        unexplained=torch.stack([one.unexplained for one in found]).square().mean(0).sqrt(),
+        reliable=not findings,
+        findings=tuple(findings),
+    )
