@@ -55,6 +55,7 @@ from .io import (
 from .io.gyroscope.read_gyroscope import read_gyroscope
 from .motion.camera import Camera
 from .motion.cameras import CameraMode, camera_mode, find_cameras
+from .motion.detected_vibration import FollowedVibration
 from .motion.gyroscope_rates import AngularRates
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
@@ -114,6 +115,7 @@ __all__ = [
     "DetectionResult",
     "DisplacementSpectrum",
     "FixedDewarp",
+    "FollowedVibration",
     "FreeMotion",
     "Margins",
     "MotionCheck",

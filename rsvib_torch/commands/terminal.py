@@ -1,6 +1,7 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
 import os
+import re
 import shlex
 import sys
 import textwrap
@@ -45,8 +46,23 @@ class Output:
     warnings: list[str] = field(default_factory=list)
 
 
-LOG_AFTER = 20.0  # s; commands that take less write no progress to files
+LOG_AFTER = 2.0  # s; commands that take less write no progress to files
 _SHOWN_AFTER = 2.0  # s, from which the elapsed time is shown beside that of a loop, which may be one of several
+
+# How the command line calls what texts name as in Python.
+_NAMES = {
+    "follow=True": "--follow",
+    "model='free'": "rsvib motion",
+    "check frame_rows, row_time": "check --frame-rate, --row-time",
+    "check exposure_rows": "check --exposure",
+    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
+    "check row_time": "check --row-time",
+    "increase search": "increase search in [detection]",
+    "scan_axis=": "--scan-axis ",
+    "readout_direction=": "--readout-direction ",
+    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
+}
+_NAME = re.compile("|".join(re.escape(name).replace(r"\ ", r"\s+") for name in _NAMES))
 
 _outputs: list[Output] = [Output()]  # that of the running command is the last
 
@@ -95,7 +111,8 @@ def show_answer(command: str, answer: Answer) -> None:
         return
     notes = {"Notes": output.notes} if output.notes else {}
     for title, lines in {**answer.results, **notes}.items():
-        print_line("\n".join([printable(title), *(f"  {line}" for text in lines for line in text.splitlines())]) + "\n")
+        text = on_command_line("\n".join(lines))
+        print_line("\n".join([printable(title), *(f"  {line}" for line in text.splitlines())]) + "\n")
     if answer.files:
         print_line(f"Files (open {printable(answer.files[0].name)} first)" if len(answer.files) > 1 else "File")
         for folder in dict.fromkeys(path.parent for path in answer.files):
@@ -103,7 +120,13 @@ def show_answer(command: str, answer: Answer) -> None:
             text = str(folder / names[0]) if len(names) == 1 else f"{folder}: {', '.join(names)}"
             print_line(textwrap.indent(wrapped(printable(text)), "  "))
     if answer.next_steps:
-        print_line("\n".join(["", "Next", *(textwrap.indent(step, "  ") for step in answer.next_steps)]))
+        steps = [textwrap.indent(on_command_line(step), "  ") for step in answer.next_steps]
+        print_line("\n".join(["", "Next", *steps]))
+
+
+def on_command_line(text: str) -> str:
+    """A text with the options of the command line instead of those of Python."""
+    return _NAME.sub(lambda match: _NAMES[" ".join(match[0].split())], text)
 
 
 def note(message: str) -> None:
@@ -118,7 +141,7 @@ def error_line(message: str, kind: str = "error") -> None:
     Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
     end of a terminal, the command continues.
     """
-    message = shortened(message)
+    message = on_command_line(shortened(message)) if kind == "warning" else shortened(message)
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)

@@ -74,7 +74,8 @@ class Reason:
         values = {"axis": self.axis, "other": {"x": "y", "y": "x"}.get(self.axis or ""), **self.details}
         # JSON has no infinity: a number that is missing in a file was infinite
         values |= {name: getattr(self, name) if getattr(self, name) is not None else math.inf for name in _COMPARED}
-        template = "; ".join(filter(None, (self.kind.sentence, self.kind.remedy))) + _AT_RADIUS
+        remedy = str(self.details.get("instead", self.kind.remedy))  # another remedy than that of the table
+        template = "; ".join(filter(None, (self.kind.sentence, remedy))) + _AT_RADIUS
 
         def part(match: re.Match[str]) -> str:
             names = {name for _, name, _, _ in Formatter().parse(match[1]) if name}
@@ -129,7 +130,7 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
-_FOLLOW = "use follow=True (--follow) if the vibration changes"
+_FOLLOW = "use follow=True if the vibration changes"
 _TONES_OR_FREE = f"{_FOLLOW}, try more tones or model='free'"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
@@ -278,6 +279,26 @@ _TONES = {
     ),
     "other_scan_axis": ReasonKind(
         "the frames agree with scan_axis='{agreeing}', not with '{stated}'", refuses="all axes"
+    ),
+}
+_FOLLOWED = {
+    "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),
+    "directions_differ": ReasonKind(
+        "forwards and backwards in time, the displacement of the rows differs by {value:.2g} px, {limit:.2g} px are "
+        "allowed",
+        "use more frames, or frames at shorter intervals",
+        "rms difference of the displacements that both trackers find, above 0.01 px, 3 % and 4 standard deviations",
+        "px",
+    ),
+    "tones_contradicted": ReasonKind(
+        "in {value:.0%} of the frames the rows contradict the tones, {limit:.0%} are allowed: tones are missing",
+        "use more frames, or frames at shorter intervals",
+        "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ or "
+        "not_followed, above 5 %",
+    ),
+    "other_tone": ReasonKind(
+        "a tone of {frequency:.4g} Hz explains the frames as well",
+        "use more frames, or frames at other intervals",
     ),
 }
 _SHAPES = {
@@ -441,6 +462,7 @@ _RESTORATION = {
 # The codes by what they refuse; a code belongs to one group.
 GROUPS = {
     "Tones (`detect_vibration`)": _TONES,
+    "A vibration that is followed (`follow=True`)": _FOLLOWED,
     "Other motions (`detect_motion`, `detect_swept_tone`)": _SHAPES,
     "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,

@@ -151,3 +151,21 @@ class DetectedVibration(
     def _middle_time(self, batch: tuple[int, ...]) -> float | None:
         """Middle of the frames of a result in s; None without an offset curve."""
         return None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "times": "..."}):
+    """The vibration at each frame of a stack, from ``detect_vibration(follow=True)``: a batch with one entry per frame.
+
+    Amplitude and frequency may change from frame to frame. A frame whose vibration is not known has amplitude 0, and is
+    not reliable. Phases and the image motion refer to the time origin of the stack, as those of all detections; their
+    values hold around the frame. ``restore`` restores each frame with its own entry.
+
+    Attributes:
+        times: (...) s, middle of the exposures of each frame.
+    """
+
+    times: Tensor = field(kw_only=True)
+
+    def _middle_time(self, batch: tuple[int, ...]) -> float | None:
+        return float(self.times[batch])

@@ -264,8 +264,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         lines = [*vibration[1:], *(restoration if report.windows.output is not None else [])]
         windows = {"lines": lines, "table": report.windows.tone_table()}
         if report.windows.gyroscope is None:  # no tones are searched for otherwise
-            starts = [record.start_time for record in report.windows.windows]
-            figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
+            figures["windows"] = drawing(plots.windows_figure(report.windows.times(), report.windows.detections()))
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
         "report": report,
