@@ -752,7 +752,7 @@ FIGURES.update(
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
         (FollowedVibration, 1): lambda followed: windows_figure(
-            followed.times.tolist(), [followed[index] for index in range(len(followed.times))], time_label="time (s)"
+            followed.times.tolist(), [followed[index] for index in range(len(followed.times))]
         ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
         (detection.MotionDetection, 0): free_motion_figure,
