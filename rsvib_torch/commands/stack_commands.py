@@ -372,7 +372,12 @@ def report(given: ReportOptions) -> Answer:
     _, _, options = given.planned_restoration(given.restoration)
     stack = load(given, options)
     detection = _detect(stack, settings)
-    result = _restore(stack, detection, options, given.force, "page")
+    followed = None if windows is None else windows.followed()
+    if followed is not None and len(followed.times) == len(stack.frames):
+        with working("restoring and judging"):
+            result = stacks.restore_followed(stack.frames, stack.timing, followed, options, force=given.force)[0]
+    else:
+        result = _restore(stack, detection, options, given.force, "page")
     pattern = options.get("mosaic")
     steps = []
     if result.restored:
@@ -380,7 +385,7 @@ def report(given: ReportOptions) -> Answer:
     elif result.moves:
         forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
         steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
-    steps += answers.steps_after_detection(detection, frames, settings)
+    steps += [] if followed is not None else answers.steps_after_detection(detection, frames, settings)
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
 
     content = reports.Report(
@@ -402,9 +407,16 @@ def report(given: ReportOptions) -> Answer:
     with whole_folder(out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
         shared.check_new([out / name for name in files], overwrite=True, inputs=inputs)
-    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and followed is not None:
+        answer = answers.windows_answer(f"Vibration in {frames.name}", windows)
+        answer.results["Restoration of the page"] = answers.restoration_lines(result, len(stack.frames))
+        answer.data["restoration"] = reports.restoration_data(result)
+    else:
+        answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
     if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
-        answer.results["Restoration of the page, of one vibration in all frames"] = answer.results.pop("Restoration")
+        if followed is None:
+            title = "Restoration of the page, of one vibration in all frames"
+            answer.results[title] = answer.results.pop("Restoration")
         answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
     answer.files += [out / name for name in files]
     answer.next_steps += steps

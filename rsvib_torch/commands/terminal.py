@@ -1,7 +1,6 @@
 """Terminal output: progress, the answer of a command as text or JSON, and warnings and errors in one line each."""
 
 import os
-import re
 import shlex
 import sys
 import textwrap
@@ -21,6 +20,7 @@ from rich.text import Text
 
 from rsvib_torch.core.progress import listening
 from rsvib_torch.core.reading import Table
+from rsvib_torch.core.reason import on_command_line
 from rsvib_torch.core.text import json_text, printable, shortened, wrapped
 
 
@@ -48,21 +48,6 @@ class Output:
 
 LOG_AFTER = 2.0  # s; commands that take less write no progress to files
 _SHOWN_AFTER = 2.0  # s, from which the elapsed time is shown beside that of a loop, which may be one of several
-
-# How the command line calls what texts name as in Python.
-_NAMES = {
-    "follow=True": "--follow",
-    "model='free'": "rsvib motion",
-    "check frame_rows, row_time": "check --frame-rate, --row-time",
-    "check exposure_rows": "check --exposure",
-    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
-    "check row_time": "check --row-time",
-    "increase search": "increase search in [detection]",
-    "scan_axis=": "--scan-axis ",
-    "readout_direction=": "--readout-direction ",
-    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
-}
-_NAME = re.compile("|".join(re.escape(name).replace(r"\ ", r"\s+") for name in _NAMES))
 
 _outputs: list[Output] = [Output()]  # that of the running command is the last
 
@@ -122,11 +107,6 @@ def show_answer(command: str, answer: Answer) -> None:
     if answer.next_steps:
         steps = [textwrap.indent(on_command_line(step), "  ") for step in answer.next_steps]
         print_line("\n".join(["", "Next", *steps]))
-
-
-def on_command_line(text: str) -> str:
-    """A text with the options of the command line instead of those of Python."""
-    return _NAME.sub(lambda match: _NAMES[" ".join(match[0].split())], text)
 
 
 def note(message: str) -> None:

@@ -470,3 +470,23 @@ GROUPS = {
     "Files of later versions": {"unspecified": ReasonKind("{text}")},
 }
 REASONS = {code: kind for kinds in GROUPS.values() for code, kind in kinds.items()}
+
+# How the command line calls what texts name as in Python.
+_NAMES = {
+    "follow=True": "--follow",
+    "model='free'": "rsvib motion",
+    "check frame_rows, row_time": "check --frame-rate, --row-time",
+    "check exposure_rows": "check --exposure",
+    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
+    "check row_time": "check --row-time",
+    "increase search": "increase search in [detection]",
+    "scan_axis=": "--scan-axis ",
+    "readout_direction=": "--readout-direction ",
+    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
+}
+_NAME = re.compile("|".join(re.escape(name).replace(r"\ ", r"\s+") for name in _NAMES))
+
+
+def on_command_line(text: str) -> str:
+    """A text with the options of the command line instead of those of Python."""
+    return _NAME.sub(lambda match: _NAMES[" ".join(match[0].split())], text)

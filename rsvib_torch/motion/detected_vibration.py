@@ -1,9 +1,12 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
-from dataclasses import dataclass, field, fields
+import math
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.core.checks import described
 from rsvib_torch.core.presentation import (
@@ -166,6 +169,23 @@ class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "
     """
 
     times: Tensor = field(kw_only=True)
+
+    def with_tones(self, count: int) -> "FollowedVibration":
+        """The same with ``count`` tones on each axis; those that it does not have are 0."""
+        missing = count - self.gain.shape[-1]
+
+        def padded(values: Tensor) -> Tensor:
+            return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values
+
+        vibration, std = self.vibration.mapped(padded), self.std.mapped(padded)
+        return replace(self, vibration=vibration, std=std, gain=padded(self.gain))
+
+    def timed_from(self, origin: float) -> "FollowedVibration":
+        """The same with another time origin, in s from the present one; times count from it as well."""
+        found, turn = self.vibration, 2 * math.pi * origin
+        phase = torch.remainder(found.phase + turn * found.frequency + math.pi, 2 * math.pi) - math.pi
+        moved = found.image_motion + origin * found.image_acceleration
+        return replace(self, vibration=replace(found, phase=phase, image_motion=moved), times=self.times - origin)
 
     def _middle_time(self, batch: tuple[int, ...]) -> float | None:
         return float(self.times[batch])

@@ -230,14 +230,13 @@ def restore_each(
     if frames.batched:
         followed = followed.mapped(lambda values: values.flatten(0, 1))
         object.__setattr__(followed, "findings", tuple(one for stack in followed.findings for one in stack))
-    vibration, middle = followed.vibration, followed.times[..., None]
+    moved = replace(
+        followed.vibration,
+        phase=followed.vibration.phase + 2 * math.pi * followed.vibration.frequency * followed.times[:, None, None],
+        image_motion=followed.vibration.image_motion + followed.vibration.image_acceleration * followed.times[:, None],
+    )
     start = -0.5 * ((height - 1) * frames.timing.row_time + frames.timing.exposure_time)
     timing = replace(frames.image_timing, frame_start_times=(start,))
-    moved = replace(
-        vibration,
-        phase=vibration.phase + 2 * math.pi * vibration.frequency * middle[..., None],
-        image_motion=vibration.image_motion + vibration.image_acceleration * middle,
-    )
     trusted, left_alone = trusted_vibration(replace(followed, vibration=moved), timing, 1, height)
     axes = trusted.moving_axes()
     # 2. Only frames that move are restored.

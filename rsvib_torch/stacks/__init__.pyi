@@ -4,7 +4,7 @@ from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
 from .process_video import process_video
 from .run_folder import StackReport
-from .window_restoration import RestoredFrames, may_change, restore_trusted, without_data
+from .window_restoration import RestoredFrames, may_change, restore_followed, restore_trusted, without_data
 from .windows import Window, cut_windows
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "process_video",
     "read_manifest",
     "restore_block",
+    "restore_followed",
     "restore_trusted",
     "without_data",
 ]

@@ -5,20 +5,21 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
 from typing import Any
 
 import numpy as np
+import torch
 
 from rsvib_torch.core.arguments import checks_arguments
 from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joined_columns, physical_tone, plain_values
 from rsvib_torch.core.result_files import decode
 from rsvib_torch.core.text import json_text, measured_text, number_of, text_table, wrapped
 from rsvib_torch.io.stack_info import split_range
-from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import WindowRecord
@@ -108,6 +109,18 @@ class StackManifest(Result, file_format="rsvib stack"):
                 ends = ends if frame is None else (frame, frame)
                 middle = None if starts is None else 0.5 * (starts[ends[0]] + starts[ends[1]]) + half_frame
                 yield record, frame, detection, middle
+
+    def followed(self) -> FollowedVibration | None:
+        """The vibration at every frame, with the time origin of the stack; None unless all windows were followed."""
+        parts = []
+        for record, frame, found, middle in self._results():
+            if frame is None or found is None or middle is None:
+                return None
+            time = torch.tensor(middle - record.start_time, dtype=torch.float64)
+            one = FollowedVibration(**{part.name: getattr(found, part.name) for part in fields(found)}, times=time)
+            parts.append(one.timed_from(-record.start_time))
+        count = max(one.gain.shape[-1] for one in parts)
+        return FollowedVibration.stacked([one.with_tones(count) for one in parts])
 
     def times(self) -> list[float]:
         """Time of each of the ``detections`` in s: start of the window, or middle of the frame."""

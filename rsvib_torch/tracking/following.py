@@ -96,7 +96,7 @@ def follow_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Follo
     if not stacks.batched:
         return followed[0]
     count = max(one.gain.shape[-1] for one in followed)
-    return FollowedVibration.stacked([_with_tones(one, count) for one in followed])
+    return FollowedVibration.stacked([one.with_tones(count) for one in followed])
 
 
 def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
@@ -258,14 +258,3 @@ def _assembled(
         assumptions=((),) * len(found),
         times=tensor(starts + time_to_middle(stack.images.shape[-2], timing.in_row_order())),
     ).to(stack.images.device)
-
-
-def _with_tones(followed: FollowedVibration, count: int) -> FollowedVibration:
-    """The same with ``count`` tones on each axis; those that it does not have are 0."""
-    missing = count - followed.gain.shape[-1]
-
-    def padded(values: Tensor) -> Tensor:
-        return functional.pad(values, (0, missing)) if values.shape == followed.gain.shape else values
-
-    vibration, std = followed.vibration.mapped(padded), followed.std.mapped(padded)
-    return replace(followed, vibration=vibration, std=std, gain=padded(followed.gain))

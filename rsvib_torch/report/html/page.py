@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
 from rsvib_torch.core.reading import Table
-from rsvib_torch.core.reason import Reason
+from rsvib_torch.core.reason import Reason, on_command_line
 from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
@@ -257,6 +257,15 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     )
     if not restored and report.windows is not None and report.windows.totals()["restored"]:
         sentences[0] = words.WINDOWS_RESTORED
+    mark = words.overall_result(result, report.verdict, restored)[0]
+    if restored and report.windows is not None and report.windows.followed() is not None:
+        details = [] if report.verdict is None else [sentences[-1]]
+        sentences, mark = (
+            [words.FOLLOWED, *details],
+            "good" if report.verdict and report.verdict.overall == "helps" else "doubt",
+        )
+    if report.command is not None:
+        sentences = list(map(on_command_line, sentences))
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
     windows = None
     if report.windows is not None:
@@ -269,7 +278,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     content = {
         "report": report,
         "title": report.title,
-        "mark": words.overall_result(result, report.verdict, restored)[0],
+        "mark": mark,
         "verdict": sentences if restored else sentences[:1],
         "tried": tried,
         "frames_title": "Input and restored frame" if restored else "Input frame",
