@@ -20,7 +20,7 @@ from rsvib_torch.core.atomic import check_writable, whole_folder
 from rsvib_torch.core.reading import Table, check_regular
 from rsvib_torch.core.text import printable
 from rsvib_torch.core.validation import options
-from rsvib_torch.options import DetectStackOptions, WindowSize
+from rsvib_torch.options import DetectStackOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -200,7 +200,7 @@ def detect(given: DetectOptions) -> Answer:
         if not many:
             stack = load(given)
             result = _detect(stack, settings)
-            may_change = count > WindowSize.window and windows.get("follow") is not False and stacks.may_change(result)
+            may_change = windows.get("follow") is not False and stacks.may_change(result, count)
         if many or may_change:
             manifest = _detect_windows(given, folder, windows)
             found = stacks.read_manifest(manifest).detections()

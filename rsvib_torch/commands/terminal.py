@@ -121,7 +121,7 @@ def error_line(message: str, kind: str = "error") -> None:
     Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
     end of a terminal, the command continues.
     """
-    message = on_command_line(shortened(message)) if kind == "warning" else shortened(message)
+    message = on_command_line(shortened(message))
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)

@@ -480,6 +480,7 @@ _NAMES = {
     "frame_rows and row_time, which": "--frame-rate and --row-time, which",
     "check row_time": "check --row-time",
     "increase search": "increase search in [detection]",
+    "pass row_time=(low, high)": "give --row-time twice",
     "scan_axis=": "--scan-axis ",
     "readout_direction=": "--readout-direction ",
     "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",

@@ -235,7 +235,7 @@ class StackJob:
         self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]], steady: DetectedVibration
     ) -> WindowResult | None:
         """The result of a window whose tones may change, if more of its axes are reliable than of a steady one."""
-        if self.follow != "auto" or not may_change(steady):
+        if self.follow != "auto" or not may_change(steady, len(usable)):
             return None
         followed = self._followed(as_taken, usable)
         better = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()

@@ -158,13 +158,16 @@ def frame_fault(
 # Frames before and after a window. Frequencies that differ by a multiple of the frame rate are distinguished by the
 # whole record: of tones that decay with 1.2 s at 10 to 22 frames per second, 32 frames left no wrong one.
 MARGIN = 12
+_LEAST_FRAMES = 4  # that two trackers run through
 # Reasons against an axis whose tones may change within the record
 _CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
 
 
-def may_change(detection: DetectedVibration) -> bool:
-    """Whether tones that change within the record may be why an axis of a steady vibration is not reliable."""
-    return any(not _CHANGES.isdisjoint(one.code for one in of_axis) for of_axis in detection.findings)
+def may_change(detection: DetectedVibration, num_frames: int) -> bool:
+    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable."""
+    return num_frames >= _LEAST_FRAMES and any(
+        not _CHANGES.isdisjoint(one.code for one in of_axis) for of_axis in detection.findings
+    )
 
 
 def restore_followed(

@@ -37,7 +37,6 @@ _BANDS = RegistrationOptions()
 _TONE = ("amplitude", "frequency", "phase")
 _DRIFT = ("image_motion", "image_acceleration")
 _ACROSS = (1.0, -1.0)  # sign of displacements along and across the rows if rows are read backwards
-_REMEDY = "use more frames, or frames at shorter intervals"
 _SIZE_STD, _FREQUENCY_STD = 0.2, 0.2  # of the amplitude, and Hz, of the tones of a record at a frame
 # Largest rms difference of the displacements of the rows by both trackers: px, of the displacement, and standard
 # deviations of the difference.
@@ -196,8 +195,8 @@ def _judged(
         return None, (Reason("not_followed", name),)
     trusted = [one for one in known if not one.against]
     best = min(trusted or known, key=lambda one: one.displacement_std)
-    if best.against:  # the remedies of a steady vibration are none here
-        return best, tuple(replace(one, details={**one.details, "instead": _REMEDY}) for one in best.against)
+    if best.against:
+        return best, best.against
     if len(known) > 1:
         first, second = (one.moved for one in known)
         least, share, deviations = _MAX_APART

@@ -47,7 +47,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
 from rsvib_torch.detection.tones.uncertainty import with_unknown_amplitudes
-from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons
+from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons, with_remedy
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
@@ -356,6 +356,8 @@ class VibrationTracker:
             timing=self._rows,
             max_tones=MAX_TONES,
         )
+        # the tones are followed already
+        findings = tuple(with_remedy(of_axis, "use frames at shorter intervals") for of_axis in findings)
         return TrackedTones(frame.time, fit, measurements, findings)
 
     def _predicted(self, state: TrackerState) -> TrackerState | None:
