@@ -182,6 +182,12 @@ def test_run_and_detect_follow_a_vibration_that_changes_without_an_option(place,
         assert sizes[0] > 4 * sizes[-1]
     restored = rsv.read_stack(tmp_path / "run" / "restored.tif").numpy()
     assert sum(decibel(restored[index], STILL) > 40 for index in range(FRAMES)) >= 36
+    shown = ("--manifest", tmp_path / "run" / "manifest.json")
+    assert rsvib("report", place / "frames.npy", tmp_path / "page", *CAMERA, *shown, "--method", "dewarp") == 0
+    answer = " ".join(capsys.readouterr().out.split())
+    assert f"{FRAMES} frames restored" in answer
+    assert "--follow if" not in answer  # the remedy of a steady vibration
+    assert "The vibration changes." in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
     manifest = tmp_path / "detect" / "manifest.json"
     again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
     assert "repeat rsvib run" in refused(capsys, *again)
