@@ -8,7 +8,7 @@ from pathlib import Path
 
 import lazy_loader
 
-from rsvib_torch.core.higher_packages import register
+from rsvib_torch.results.higher_packages import register
 
 register("figures", lambda: import_module("rsvib_torch.report.plots"))
 register("follow", lambda: import_module("rsvib_torch.tracking.following").follow_vibration)

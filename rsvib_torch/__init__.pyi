@@ -1,69 +1,56 @@
 from . import augmentation as augmentation
-from . import calibration as calibration
+from . import datasets as datasets
 from . import detection as detection
 from . import evaluation as evaluation
+from . import export as export
+from . import gyroscope as gyroscope
 from . import imaging as imaging
 from . import io as io
-from . import live as live
 from . import motion as motion
 from . import registration as registration
 from . import report as report
 from . import restoration as restoration
+from . import row_time as row_time
 from . import stacks as stacks
 from . import tracking as tracking
+from . import video as video
 from .augmentation import RollingShutterVibration
-from .calibration import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
 from .detection import (
-    AccelerometerComparison,
-    ClockAlignment,
     DetectionResult,
     DisplacementSpectrum,
-    MotionCheck,
     MotionDetection,
-    RotationAlignment,
     SweptTone,
     TimingDiagnosis,
     VibrationDetector,
-    align_motion,
-    calibrate_row_time_by_motion,
-    check_motion,
-    compare_accelerometer,
     detect_motion,
     detect_swept_tone,
     detect_vibration,
     diagnose_timing,
 )
-from .evaluation import (
-    MtfCurve,
-    SlantedEdge,
-    find_slanted_edges,
-    offset_endpoint_error,
-    psnr,
-    slanted_edge_mtf,
-    ssim,
+from .evaluation import MtfCurve, SlantedEdge, find_slanted_edges, offset_endpoint_error, psnr, slanted_edge_mtf, ssim
+from .export import camera_isd, sampling_map, write_gcsv, write_isd, write_stmap
+from .gyroscope import (
+    AccelerometerComparison,
+    AngularRates,
+    ClockAlignment,
+    MotionCheck,
+    RotationAlignment,
+    align_motion,
+    check_motion,
+    compare_accelerometer,
+    read_gyroscope,
 )
 from .imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
-from .io import (
-    StackInfo,
-    TimingWarning,
-    open_stack,
-    read_stack,
-    read_stack_info,
-    timing_from_first_frame,
-    write_stack,
-)
-from .io.gyroscope.read_gyroscope import read_gyroscope
+from .io import StackInfo, TimingWarning, open_stack, read_stack, read_stack_info, timing_from_first_frame, write_stack
 from .motion.camera import Camera
 from .motion.cameras import CameraMode, camera_mode, find_cameras
 from .motion.detected_vibration import FollowedVibration
-from .motion.gyroscope_rates import AngularRates
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
 from .motion.timing import SensorTiming
 from .motion.vibration import Vibration, VibrationStd, blind_frequencies
 from .registration import OffsetCurve, register_bands
 from .report import (
-    camera_isd,
     comparison_figure,
     gain_figure,
     motion_figure,
@@ -72,13 +59,9 @@ from .report import (
     psf_figure,
     read_vibration,
     rows_figure,
-    sampling_map,
     save_figure,
     windows_figure,
-    write_gcsv,
-    write_isd,
     write_offsets,
-    write_stmap,
     write_table,
     write_vibration,
 )
@@ -95,16 +78,15 @@ from .restoration import (
     trusted_vibration,
     visible_pixels,
 )
-from .stacks import (
-    StackReport,
-    VibrationCorrector,
-    iterate_stack,
-    process_stack,
-    process_video,
-    read_manifest,
-    restore_block,
+from .row_time import (
+    RowTimeCalibration,
+    calibrate_row_time,
+    calibrate_row_time_by_exposure,
+    calibrate_row_time_by_motion,
 )
-from .tracking import Margins, TrackedFrame, VibrationTracker, VideoBorder
+from .stacks import StackReport, VibrationCorrector, iterate_stack, process_stack, read_manifest, restore_block
+from .tracking import TrackedFrame, VibrationTracker
+from .video import Margins, VideoBorder, process_video
 
 __all__ = [
     "AccelerometerComparison",

@@ -13,8 +13,8 @@ from typing import Any, Self
 
 from pydantic import Field, create_model, model_validator
 
-from rsvib_torch.core.reading import read_toml
-from rsvib_torch.core.validation import Count, Section, checked, validate
+from rsvib_torch.checks.validation import Count, Section, checked, validate
+from rsvib_torch.files.reading import read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, SkipValidation
 
-from rsvib_torch.core.validation import (
+from rsvib_torch.checks.validation import (
     Count,
     Extensible,
     NotNegative,
@@ -26,7 +26,7 @@ from rsvib_torch.core.validation import (
 )
 
 if TYPE_CHECKING:
-    from rsvib_torch.core.arrays import ArrayLike
+    from rsvib_torch.checks.arrays import ArrayLike
 
     Mask = ArrayLike | None
     Curve = tuple[ArrayLike | Sequence[float], ArrayLike | Sequence[float]]

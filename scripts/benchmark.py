@@ -35,17 +35,11 @@ section is measured again with `python scripts/benchmark.py --only NAME --store`
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the benchmark: the module ``benchmarks.NAME``, see ``harness``.
+    """A section of the benchmark: the module ``benchmarks.NAME``, see ``harness``."""
 
-    Attributes:
-        title: Heading on the page.
-        by_default: Whether it runs without ``--only``; sections of more than a quarter of an hour do not.
-        page: Page in docs/ with its tables; between two marks if it is not that of the benchmarks.
-    """
-
-    title: str
-    by_default: bool = True
-    page: str = PAGE
+    title: str  # heading on the page
+    by_default: bool = True  # whether it runs without ``--only``; sections of more than a quarter of an hour do not
+    page: str = PAGE  # page in docs/ with its tables; between two marks if it is not that of the benchmarks
 
 
 SECTIONS: dict[str, Section] = {  # in the order of the page

@@ -17,26 +17,26 @@ from typing import Any, get_args
 
 import torch
 from matplotlib.figure import Figure
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 import rsvib_torch as rsv
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
-from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
+from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.options import DetectionMethod
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import write_offsets, write_vibration
 from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.text import text_table
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 AMPLITUDE, FREQUENCY = (3.1, 5.2), (50.0, 30.0)
 FULL_SCALE, NOISE = 4095, 0.003
 MARGIN = 32  # px of scene around the frame, on every side
 RIM = 32  # px at the border that are not evaluated, because they are partly outside the frame
+QUALITY = {"psnr_before": 2, "psnr_after": 2, "ssim_before": 4, "ssim_after": 4}  # with the digits that are shown
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "chart": lambda height, width, seed: resolution_chart(height, width, seed=seed),
     "city": city_and_fields,
@@ -64,24 +64,17 @@ def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any
 def show(console: Console, name: str, lines: list[dict[str, Any]], quality: dict[str, Any]) -> None:
     """Print both tables of a scene."""
     heads = ("axis", "quantity", "true", "detected", "error")
-    table = Table(*heads, title=f"{name}: vibration", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    cells = []
     for line in lines:
         digits = 4 if line["unit"] == "px" else 3
-        table.add_row(
-            line["axis"],
-            f"{line['quantity']} ({line['unit']})",
-            f"{line['true']:.{digits}f}",
-            f"{line['detected']:.{digits}f}",
-            f"{line['error']:+.4f} {line['error_unit']}",
-        )
-    console.print(table)
+        values = (f"{line[value]:.{digits}f}" for value in ("true", "detected"))
+        error = f"{line['error']:+.4f} {line['error_unit']}"
+        cells.append([line["axis"], f"{line['quantity']} ({line['unit']})", *values, error])
+    console.print(f"{name}: vibration\n{text_table(heads, cells)}\n")
     heads = ("frame", "PSNR before (dB)", "PSNR after", "SSIM before", "SSIM after")
-    table = Table(*heads, title=f"{name}: frames", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for frame, (psnr_before, psnr_after, ssim_before, ssim_after) in enumerate(
-        zip(*(quality[f"{what}_{when}"] for what in ("psnr", "ssim") for when in ("before", "after")), strict=True)
-    ):
-        table.add_row(str(frame), f"{psnr_before:.2f}", f"{psnr_after:.2f}", f"{ssim_before:.4f}", f"{ssim_after:.4f}")
-    console.print(table)
+    columns = [[f"{value:.{digits}f}" for value in quality[key]] for key, digits in QUALITY.items()]
+    cells = [[str(frame), *values] for frame, values in enumerate(zip(*columns, strict=True))]
+    console.print(f"{name}: frames\n{text_table(heads, cells)}\n")
 
 
 def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:

@@ -24,77 +24,16 @@ from pathlib import Path
 import rsvib_torch as rsv
 
 ROOT = Path(__file__).resolve().parents[1]
-# Order of the packages in the reference; others follow in alphabetical order.
-PACKAGES = (
-    "motion",
-    "detection",
-    "restoration",
-    "imaging",
-    "registration",
-    "calibration",
-    "io",
-    "stacks",
-    "evaluation",
-    "augmentation",
-)
-# Names with which the page of a package begins; others follow in alphabetical order.
-FIRST_NAMES = (
-    *("SensorTiming", "Vibration", "VibrationStd", "FreeMotion", "read_motion", "AngularRates"),
-    *(
-        "detect_vibration",
-        "DetectionResult",
-        "VibrationDetector",
-        "DisplacementSpectrum",
-        "detect_motion",
-        "MotionDetection",
-    ),
-    *(
-        "detect_swept_tone",
-        "SweptTone",
-        "align_motion",
-        "ClockAlignment",
-        "RotationAlignment",
-        "check_motion",
-        "MotionCheck",
-        "compare_accelerometer",
-        "AccelerometerComparison",
-    ),
-    *("restore", "VibrationRestorer", "FixedDewarp", "judge_restoration", "RestorationVerdict", "RestorationWarning"),
-    *("simulate_frames", "SensorNoise", "Optics", "row_psf", "RowVaryingBlur"),
-    *("register_bands", "OffsetCurve"),
-    *("calibrate_row_time", "calibrate_row_time_by_exposure", "RowTimeCalibration"),
-    *("read_stack", "write_stack", "read_stack_info", "StackInfo", "open_stack"),
-    *("process_stack", "process_video", "StackReport", "iterate_stack", "restore_block", "read_manifest"),
-    *("slanted_edge_mtf", "MtfCurve", "find_slanted_edges", "SlantedEdge", "psnr", "ssim"),
-    *("read_vibration", "write_vibration", "write_offsets", "write_table", "save_figure"),
-    *("sampling_map", "write_stmap", "write_gcsv", "write_isd", "camera_isd"),
-)
+# Names that the code of these pages uses are first in the reference, in the order of their first use.
+PAGES = ("README.md", "docs/quickstart.md", "docs/tutorials/satellite.md", "docs/tutorials/training.md")
+USED = re.findall(r"\brsv\.(\w+)", "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES))
 # Sections of the site and the order of their pages; pages that are missing here are added to the last section.
 SECTIONS = {
-    "Tutorials": (
-        "tutorials/satellite.md",
-        "tutorials/video.md",
-        "tutorials/training.md",
-        "notebooks/first_vibration.md",
-    ),
-    "Guides": (
-        "quickstart.md",
-        "concepts.md",
-        "tables.md",
-        "your_own_camera.md",
-        "roll_and_zoom.md",
-        "finer_grid.md",
-        "gyroscope.md",
-        "live.md",
-        "stacks.md",
-        "export.md",
-        "reliability.md",
-        "ml_pipeline.md",
-        "measuring.md",
-        "gallery.md",
-    ),
-    "Method": ("method.md", "conventions.md", "verdicts.md", "reasons.md", "bound.md", "accuracy.md", "benchmarks.md"),
-    "Development": ("architecture.md", "ablation.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
+    "Tutorials": "tutorials/satellite tutorials/video tutorials/training notebooks/first_vibration",
+    "Guides": "quickstart concepts tables your_own_camera roll_and_zoom finer_grid gyroscope live stacks export "
+    "reliability ml_pipeline measuring gallery",
+    "Method": "method conventions verdicts reasons bound accuracy benchmarks",
+    "Development": "architecture ablation CONTRIBUTING SECURITY CHANGELOG",
 }
 DOCUMENTATION = ROOT / "scripts" / "documentation"  # extensions of the builder, and files of the site
 STYLE, SEARCH_SHIM = "site.css", "iframe-worker.js"
@@ -102,28 +41,25 @@ BUILDERS = ("mkdocs", "mkdocstrings", "material", "nbconvert", "latex2mathml", "
 OUTSIDE_DOCS = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")  # pages that lie at the top level of the project
 
 
-def ordered(names: Iterable[str], order: Sequence[str]) -> list[str]:
-    """Names in this order, and what it does not hold behind, sorted."""
-    return sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
+def ordered(names: Iterable[str]) -> list[str]:
+    """Names in the order of ``USED``, others behind."""
+    return sorted(names, key=lambda name: (USED.index(name) if name in USED else len(USED), name))
 
 
 def public_names() -> dict[str, list[str]]:
     """Public names with their full paths, by package."""
     found: dict[str, list[str]] = defaultdict(list)
-    for name in rsv.__all__:
+    for name in ordered(rsv.__all__):
         thing = getattr(rsv, name)
         found[thing.__module__.split(".")[1]].append(f"{thing.__module__}.{name}")
-    return {package: found[package] for package in ordered(found, PACKAGES)}
+    return found
 
 
 def reference_page(package: str, paths: list[str]) -> str:
     """Markdown of one page of the reference."""
     module = sys.modules[f"rsvib_torch.{package}"]
     lines = [f"# {package}", "", inspect.getdoc(module) or "", ""]
-    by_name = {path.rsplit(".", 1)[1]: path for path in paths}
-    for name in ordered(by_name, FIRST_NAMES):
-        lines += [f"::: {by_name[name]}", ""]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"::: {path}\n" for path in paths)])
 
 
 def without_outer_links(text: str, folder: Path) -> str:
@@ -170,7 +106,10 @@ def write_sources(folder: Path) -> list[object]:
         reference.append({f"rsvib_torch.{package}": f"api/{package}.md"})
     pages = {str(page.relative_to(folder)) for page in folder.rglob("*.md") if page.parent.name != "api"}
     existing = pages - {"index.md", "commands.md", "configuration.md"}
-    sections = {title: [page for page in pages if page in existing] for title, pages in SECTIONS.items()}
+    sections = {
+        title: [page for name in names.split() if (page := f"{name}.md") in existing]
+        for title, names in SECTIONS.items()
+    }
     sections["Development"] += sorted(existing - {page for pages in sections.values() for page in pages})
     navigation: list[object] = [{"Home": "index.md"}]
     for title, section in sections.items():

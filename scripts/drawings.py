@@ -7,11 +7,13 @@ The curves are computed with the package. Row time and vibration are those of Li
 
 import argparse
 import math
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import torch
+from architecture import LAYERS
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Polygon
@@ -23,27 +25,6 @@ TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=200, frame_rows=2400)
 VIBRATION = rsv.Vibration(amplitude=[3.1, 0.0], frequency=[50.0, 0.0], phase=[0.4, 0.0])
 NUM_ROWS = 2048
 BLUE, ORANGE, GREY = "#1f5fa8", "#d9822b", "#8a8f98"
-# Layers of the architecture from the top: name and content of each package.
-ARCHITECTURE = (
-    (("commands", "the rsvib program: arguments, progress, terminal output"),),
-    (("live", "sources and outputs of a running camera"),),
-    (("report", "results on disk: JSON, CSV, plots, HTML"),),
-    (("config", "TOML files ↔ dataclasses"),),
-    (("stacks", "windows, jobs, journal, resume, memory planning"),),
-    (
-        ("evaluation", "MTF, PSNR, bound, scenes"),
-        ("tracking", "vibration frame by frame"),
-        ("augmentation", "training data"),
-    ),
-    (("detection", "offsets → motion, std, verdict"), ("restoration", "frames + motion → frames, verdict")),
-    (("registration", "offsets of bands and rows"), ("calibration", "row time, exposure")),
-    (("imaging", "PSF, blur, simulator"),),
-    (("frames", "input preparation: files, dtype, masks, orientation"),),
-    (("io", "file formats"),),
-    (("motion", "timing, vibration, spline, recorded motion"),),
-    (("options", "groups of options: types, bounds, defaults, descriptions"),),
-    (("core", "FFT, splines, banded systems, parallel, checks"),),
-)
 
 
 def draw_rolling_shutter() -> Figure:
@@ -124,26 +105,27 @@ def draw_blind_frequencies() -> Figure:
 
 def draw_architecture() -> Figure:
     """Packages in layers; imports go downwards only."""
-    figure = Figure(figsize=(8.4, 6.2))
+    figure = Figure(figsize=(11.0, 11.0))
     axes: Axes = figure.add_axes((0.02, 0.02, 0.96, 0.92))
-    height = 1.0 / len(ARCHITECTURE)
-    for number, packages in enumerate(ARCHITECTURE):
+    height = 1.0 / len(LAYERS)
+    for number, packages in enumerate(LAYERS):
         bottom = 1.0 - (number + 1) * height
         width = 0.94 / len(packages)
-        for place, (name, content) in enumerate(packages):
+        for place, (name, content) in enumerate(packages.items()):
             left = place * width
             box = FancyBboxPatch(
-                (left + 0.006, bottom + 0.012),
+                (left + 0.006, bottom + 0.004),
                 width - 0.012,
-                height - 0.028,
+                height - 0.01,
                 boxstyle="round,pad=0.002,rounding_size=0.008",
                 facecolor="#eef3fa",
                 edgecolor=BLUE,
             )
             axes.add_patch(box)
             centre = left + 0.5 * width
-            axes.text(centre, bottom + 0.62 * height, name, ha="center", va="center", weight="bold", color=BLUE)
-            axes.text(centre, bottom + 0.32 * height, content, ha="center", va="center", fontsize=8.5)
+            text = "\n".join(textwrap.wrap(content, 150 // len(packages)))
+            axes.text(centre, bottom + 0.78 * height, name, ha="center", va="center", weight="bold", color=BLUE)
+            axes.text(centre, bottom + 0.36 * height, text, ha="center", va="center", fontsize=8)
     axes.annotate(
         "", (0.97, 0.03), (0.97, 0.97), arrowprops={"arrowstyle": "-|>", "color": GREY, "linewidth": 1.5}, va="center"
     )

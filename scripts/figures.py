@@ -20,9 +20,9 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
-from rsvib_torch.live import Spectrogram
+from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.report.plots import offset_figure, psf_figure, save_figure
+from rsvib_torch.video import Spectrogram
 
 SEED = 3
 FRAME_ROWS = 2048

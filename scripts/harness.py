@@ -97,15 +97,10 @@ def defaults(section: Any, *, quick: bool = True, **chosen: Any) -> argparse.Nam
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Timed runs of a task.
+    """Timed runs of a task."""
 
-    Attributes:
-        result: Return value of the task.
-        runs: Seconds of each run.
-    """
-
-    result: Any
-    runs: tuple[float, ...]
+    result: Any  # return value of the task
+    runs: tuple[float, ...]  # seconds of each run
 
     @property
     def seconds(self) -> float:
@@ -204,6 +199,12 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     return [*(f"| {' | '.join(map(str, line))} |" for line in lines), ""]
 
 
+def table_of(rows: Iterable[Mapping[str, Any]], *columns: tuple[str, str | Callable[[Any], object]]) -> list[str]:
+    """A table with a line for each row. A column is a head, and a format of the values of a row or a function of it."""
+    cells = [[cell.format(**row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
+    return table([head for head, _ in columns], cells)
+
+
 # The machine
 
 
@@ -260,27 +261,16 @@ def _version(library: str) -> str | None:
 
 @dataclass(frozen=True)
 class StoredResult:
-    """Result of one section.
+    """Result of one section."""
 
-    Attributes:
-        section: Name of the section.
-        version: Version of rsvib_torch.
-        commit: Commit of the working tree, with "+" if it had changes; None outside a repository.
-        date: Date of the run, YYYY-MM-DD.
-        seconds: Duration of the run.
-        machine: Processor, cores, threads and libraries, see ``machine``.
-        options: Options of the run.
-        rows: Measured figures.
-    """
-
-    section: str
-    version: str
-    commit: str | None
-    date: str
-    seconds: float
-    machine: dict[str, Any]
-    options: argparse.Namespace
-    rows: Rows
+    section: str  # name of the section
+    version: str  # version of rsvib_torch
+    commit: str | None  # commit of the working tree, with "+" if it had changes; None outside a repository
+    date: str  # date of the run, YYYY-MM-DD
+    seconds: float  # duration of the run
+    machine: dict[str, Any]  # processor, cores, threads and libraries, see ``machine``
+    options: argparse.Namespace  # options of the run
+    rows: Rows  # measured figures
 
 
 def plain(value: Any) -> Any:

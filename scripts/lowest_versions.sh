@@ -17,5 +17,5 @@ export PYTHONWARNINGS=ignore::DeprecationWarning # of the programs that tests st
 old=(-W ignore::DeprecationWarning -W ignore::PendingDeprecationWarning)
 "$folder/venv/bin/python" -c 'import torch; print("lowest versions: torch", torch.__version__)'
 "$folder/venv/bin/python" -m pytest "${old[@]}" -m "$marker" tests/test_config.py tests/test_start.py tests/commands \
-  tests/io tests/report tests/live tests/registration tests/augmentation tests/evaluation/test_quality.py tests/stacks
+  tests/io tests/report tests/video tests/registration tests/augmentation tests/evaluation/test_quality.py tests/stacks
 "$folder/venv/bin/python" -m pytest "${old[@]}" tests --quick

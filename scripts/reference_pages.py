@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Write docs/configuration.md (all keys of the TOML file), docs/commands.md (all commands) and docs/reasons.md.
+"""Write configuration.md (keys of the TOML file), commands.md, reasons.md and the packages of architecture.md in docs/.
 
 Types, defaults and descriptions come from the groups of options and the parameters of the commands, reasons from their
-table in core/reason.py. A test fails if the pages are out of date.
+table in results/reason.py. A test fails if the pages are out of date.
 """
 
 import argparse
@@ -13,14 +13,16 @@ from typing import Any, get_args
 
 import griffe
 import typer
+from architecture import table_of_packages
+from harness import with_generated_part
 
 import rsvib_torch as rsv
+from rsvib_torch.checks.validation import expected_text, fields_of
 from rsvib_torch.commands.main import app
 from rsvib_torch.config import simulation_section
-from rsvib_torch.core.reason import GROUPS
-from rsvib_torch.core.validation import expected_text, fields_of
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import METHOD_OPTIONS, OpticsOptions, RestorationOptions, ToneOptions, WindowOptions
+from rsvib_torch.results.reason import GROUPS
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTE = "<!-- Written by scripts/reference_pages.py: change the docstrings and help texts, then run make pages. -->"
@@ -80,13 +82,7 @@ def value_text(value: object) -> str:
 
 
 def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] | None = None) -> list[str]:
-    """Table of keys.
-
-    Args:
-        group: Group of options, or section.
-        keys: Keys to list, by default all.
-        meaning: Descriptions of keys whose field has none.
-    """
+    """Table of the keys of a group of options or section, by default of all; ``meaning`` describes fields without."""
     rows = []
     for name in keys or fields_of(group):
         field = fields_of(group)[name]
@@ -174,10 +170,12 @@ def reasons_page() -> str:
 def pages() -> dict[Path, str]:
     """Text of the pages, by path."""
     docs = ROOT / "docs"
+    architecture = docs / "architecture.md"
     return {
         docs / "configuration.md": configuration_page(),
         docs / "commands.md": command_page(),
         docs / "reasons.md": reasons_page(),
+        architecture: with_generated_part(architecture.read_text(encoding="utf-8"), table_of_packages()),
     }
 
 

@@ -30,15 +30,10 @@ sys.path.append(str(PAGE.parents[1] / "tests"))  # attacks share cases with the 
 
 @dataclass(frozen=True)
 class Attack:
-    """One kind of attack.
+    """One kind of attack."""
 
-    Attributes:
-        title: First column of the table.
-        count: Number of trials for the table of the page.
-    """
-
-    title: str
-    count: int
+    title: str  # first column of the table
+    count: int  # number of trials for the table of the page
 
 
 # A new attack is one module in scripts/attacks and one line here. Its ``trials(folder, count, seed)`` runs up to

@@ -46,11 +46,7 @@ def run_commands(lines: str) -> None:
 
 
 def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
-    """Run the code of a page in a folder.
-
-    Returns:
-        The page with the outputs of this run, and the variables of its Python code.
-    """
+    """Run the code of a page in a folder; returns the page with its outputs, and the variables of its Python code."""
     names: dict[str, Any] = {"__name__": "page"}
     text = page.read_text(encoding="utf-8")
     parts, end, output = [], 0, None
@@ -83,13 +79,9 @@ def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
 
 
 def differing_lines(expected: str, found: str, relative: float = 0.1, absolute: float = 0.05) -> list[str]:
-    """Lines that differ by more than spaces and the last digits of numbers; empty if there are none.
+    """Lines of a page and of a run that differ by more than spaces and the last digits of numbers.
 
-    Args:
-        expected: The page.
-        found: The page with the outputs of a run.
-        relative: Largest relative difference of numbers.
-        absolute: Largest difference of numbers; digits of standard deviations differ between processors.
+    Digits of standard deviations differ between processors.
     """
     pairs = [page.splitlines() for page in (expected, found)]
     if len(pairs[0]) != len(pairs[1]):

@@ -3,9 +3,9 @@
 import torch
 
 from rsvib_torch import DetectionResult, OffsetCurve, VibrationStd
-from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.results.reason import Reason
 
 
 def findings_of(texts):

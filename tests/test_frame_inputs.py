@@ -11,8 +11,8 @@ import torch
 from refusals import refuses
 
 import rsvib_torch as rsv
-from rsvib_torch.core.arrays import as_tensor
-from rsvib_torch.evaluation.scenes import city_and_fields
+from rsvib_torch.checks.arrays import as_tensor
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.frames.prepare import prepare_frames
 
 TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)

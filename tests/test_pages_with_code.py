@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.core.reason import REASONS
-from rsvib_torch.evaluation.scenes import resolution_chart
+from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.io import formats
 from rsvib_torch.registration.methods import BAND_METHODS
 from rsvib_torch.restoration.exact.priors import PRIORS
+from rsvib_torch.results.reason import REASONS
 
 DOCS = Path(__file__).parents[1] / "docs"
 

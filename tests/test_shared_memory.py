@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.imaging import blur_rows, blur_rows_adjoint
 
 ROWS, COLUMNS = 128, 128

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation.scenes import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
 VIBRATION = rsv.Vibration([1.2, 0.8], [130.0, 170.0], [0.3, 0.9], image_motion=(5.0, 3.0))

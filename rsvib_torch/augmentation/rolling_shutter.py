@@ -15,12 +15,11 @@ from kornia.geometry.keypoints import Keypoints
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import check_tensor, checks_arguments
-from rsvib_torch.core.arrays import channels_appear_last
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number
-from rsvib_torch.core.precision import full_precision
-from rsvib_torch.core.splines import gauss_legendre, mirrored
-from rsvib_torch.core.text import quoted
+from rsvib_torch.checks.arguments import check_tensor, checks_arguments
+from rsvib_torch.checks.arrays import channels_appear_last
+from rsvib_torch.checks.values import check_choice, check_number, check_whole_number
+from rsvib_torch.execution.precision import full_precision
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging import blur_rows, gauss_node_count, trajectory_psf
@@ -29,6 +28,8 @@ from rsvib_torch.motion.field import ColumnMotion, displacement_at, largest_in_f
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import gauss_legendre, mirrored
+from rsvib_torch.text import quoted
 
 Range = float | Sequence[float] | Sequence[Sequence[float]]
 Parameters = dict[str, Tensor]
@@ -301,12 +302,12 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         step = self._recording_length(params)
         return Vibration(**{name: value[::step] for name, value in drawn.items()}, camera=None)
 
-    def compute_transformation(self, input: Tensor, params: Parameters, flags: dict[str, Any]) -> Tensor:
+    def compute_transformation(self, input: Tensor, params: Parameters, flags: Table) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
         return self.identity_matrix(input)
 
     def apply_transform(
-        self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+        self, input: Tensor, params: Parameters, flags: Table, transform: Tensor | None = None
     ) -> Tensor:
         """Distort and blur images (B, C, H, W)."""
         if channels_appear_last(input.shape):
@@ -320,7 +321,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         return frames_from_row_order(moved, self.timing)
 
     def apply_transform_mask(
-        self, input: Tensor, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+        self, input: Tensor, params: Parameters, flags: Table, transform: Tensor | None = None
     ) -> Tensor:
         """Move masks (B, C, H, W) to the nearest pixel."""
         if input.numel() == 0:
@@ -329,7 +330,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         return frames_from_row_order(self._motion(params, masks).move_masks(masks), self.timing)
 
     def apply_transform_keypoint(
-        self, input: Keypoints, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+        self, input: Keypoints, params: Parameters, flags: Table, transform: Tensor | None = None
     ) -> Keypoints:
         """Move keypoints to their positions in the frame."""
         output = input.clone()
@@ -337,7 +338,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         return output
 
     def apply_transform_box(
-        self, input: Boxes, params: Parameters, flags: dict[str, Any], transform: Tensor | None = None
+        self, input: Boxes, params: Parameters, flags: Table, transform: Tensor | None = None
     ) -> Boxes:
         """Return the smallest upright boxes around the moved content of the boxes."""
         output = input.clone()

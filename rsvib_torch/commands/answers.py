@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from rsvib_torch import detection, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, warn
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import AXES, number_of, printable, wrapped
+from rsvib_torch.files.reading import Table
+from rsvib_torch.text import AXES, number_of, printable, wrapped
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config

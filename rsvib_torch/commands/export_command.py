@@ -6,16 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import rsvib_torch
+from rsvib_torch import export as exports
 from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options, read_json
 from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new, size_of
 from rsvib_torch.commands.terminal import Answer, warn, working
-from rsvib_torch.core.atomic import check_writable
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import AXES
-from rsvib_torch.core.validation import options, read_json
+from rsvib_torch.files.atomic import check_writable
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
+from rsvib_torch.text import AXES
 
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
 
@@ -88,7 +89,7 @@ def export(given: ExportOptions) -> Answer:
         found = read_json(given.camera_isd, "ISD")
         rows = found.get("image_lines")
         motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)
-        written = reports.write_isd(
+        written = exports.write_isd(
             out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
         )
         form = "frame camera with jitter polynomials"
@@ -99,10 +100,10 @@ def export(given: ExportOptions) -> Answer:
     motion = _trusted(given, detected, timing, count, shape[int(timing.scan_axis)])
     data |= {"size": list(shape), "num_frames": count}
     if chosen == "gcsv":
-        reports.write_gcsv(out, motion, timing, shape, count, sample_rate=given.sample_rate)
+        exports.write_gcsv(out, motion, timing, shape, count, sample_rate=given.sample_rate)
         return Answer({"Angular rates": [f"of {count} frames, on the clock of the first row of frame 0"]}, data, [out])
     with working("computing the positions"):
-        files = reports.write_stmap(out, motion, timing, shape, count, convention=given.convention)
+        files = exports.write_stmap(out, motion, timing, shape, count, convention=given.convention)
     text = f"{count} maps of {shape[0]} x {shape[1]} px, convention {given.convention}"
     return Answer({"Sampling maps": [text]}, data | {"convention": given.convention}, files)
 

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 import typer
 from pydantic import Field
 
+from rsvib_torch.checks.validation import fields_of, members_of, options
 from rsvib_torch.commands.terminal import Answer, current_output, error_line, show_answer
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.validation import fields_of, members_of, options
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import COMMAND_LINE
 
 _NOT_RELIABLE = 3  # exit code

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rsvib_torch import io
+from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import next_step
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_rate
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.core.atomic import check_writable, whole_file
-from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import measured_text, printable, text_table
-from rsvib_torch.core.validation import MistakesError, fields_of, options
+from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
+from rsvib_torch.text import measured_text, printable, text_table
 
 if TYPE_CHECKING:
     from rsvib_torch.io.stack_info import StackInfo

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 
 from pydantic import Field
 
-from rsvib_torch import io, live, tracking
+from rsvib_torch import io, tracking, video
+from rsvib_torch.checks.validation import Count, NotNegative, options
 from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
-from rsvib_torch.core.atomic import check_tree, check_writable
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import number_of
-from rsvib_torch.core.validation import Count, NotNegative, options
+from rsvib_torch.files.atomic import check_tree, check_writable
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import BorderName, TrackerOptions, method_options
+from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from rsvib_torch.config import Config
@@ -127,15 +127,15 @@ def live_session(given: LiveOptions) -> Answer:
     source = _source(given, settings)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs = _outputs(given, settings, stream)
-        shown = [output for output in outputs if isinstance(output, live.PageOutput)]
+        shown = [output for output in outputs if isinstance(output, video.PageOutput)]
         spectrogram = None
         if given.spectrogram is not None:
-            spectrogram = live.Spectrogram(settings.timing, max_frequency=given.max_frequency)
+            spectrogram = video.Spectrogram(settings.timing, max_frequency=given.max_frequency)
 
         def save() -> None:
             if spectrogram is not None and given.spectrogram is not None:
                 check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
-                live.save_spectrogram(given.spectrogram, spectrogram)
+                video.save_spectrogram(given.spectrogram, spectrogram)
 
         tracker = tracking.VibrationTracker(
             settings.timing,
@@ -145,11 +145,11 @@ def live_session(given: LiveOptions) -> Answer:
             full_scale=source.full_scale if given.full_scale is None or given.file else given.full_scale,
             channels="first",
         )
-        report = live.run_live(
+        report = video.run_live(
             source,
             tracker,
             outputs,
-            border=tracking.VideoBorder(given.border),
+            border=video.VideoBorder(given.border),
             drops=drops,
             waiting=given.waiting,
             max_frames=given.num_frames,
@@ -169,17 +169,17 @@ def live_session(given: LiveOptions) -> Answer:
     return _answer(given.source, report, [*files, *saved], drops=drops)
 
 
-def _source(given: LiveOptions, settings: Config) -> live.FrameSource:
+def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
     """The source of the frames."""
     if given.is_camera:
-        return live.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
+        return video.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
     if given.file is None:
         size = given.frame_size
         # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
         stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-        return live.PipeSource(stream, size, given.pixel_format, settings.timing)
+        return video.PipeSource(stream, size, given.pixel_format, settings.timing)
     scale = given.full_scale if given.full_scale is not None else settings.full_scale
-    return live.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
+    return video.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
 
 
 def _check_options(given: LiveOptions) -> None:
@@ -196,17 +196,17 @@ def _check_options(given: LiveOptions) -> None:
         raise ValueError(f"{option} needs frames that come later; process a video with {remedy}")
 
 
-def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[live.FrameOutput]:
+def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[video.FrameOutput]:
     """The outputs that the options name."""
-    outputs: list[live.FrameOutput] = []
+    outputs: list[video.FrameOutput] = []
     if given.written is not None:
-        outputs.append(live.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
+        outputs.append(video.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
     if stream is not None:
-        outputs.append(live.PipeOutput(stream))
+        outputs.append(video.PipeOutput(stream))
     if given.preview:
-        outputs.append(live.PreviewOutput())
+        outputs.append(video.PreviewOutput())
     if given.page is not None:  # the last one, because it is the only one that is opened before the first frame
-        served = live.PageOutput(given.page)
+        served = video.PageOutput(given.page)
         outputs.append(served)
         error_line(f"the page is {served.url}", "note")
     return outputs
@@ -228,10 +228,10 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
 class _StateText:
     """Text below the frames of the page, twice per second."""
 
-    def __init__(self, page: live.PageOutput) -> None:
+    def __init__(self, page: video.PageOutput) -> None:
         self._page, self._next, self._lock = page, 0.0, threading.Lock()
 
-    def __call__(self, tracked: tracking.TrackedFrame, report: live.LiveReport) -> None:
+    def __call__(self, tracked: tracking.TrackedFrame, report: video.LiveReport) -> None:
         now = time.perf_counter()
         if now < self._next:
             return
@@ -241,7 +241,7 @@ class _StateText:
         self._page.show_state("\n".join([*lines, *([] if found is None else [found.summary()])]))
 
 
-def _answer(source: str, report: live.LiveReport, files: list[Path], *, drops: bool) -> Answer:
+def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: bool) -> Answer:
     rate = report.frames / report.seconds
     lines = [
         f"{number_of(report.frames, 'frame')} in {report.seconds:.1f} s ({rate:.1f} per second), "

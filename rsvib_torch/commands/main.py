@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 import rsvib_torch
+from rsvib_torch.checks.validation import MistakesError
 from rsvib_torch.commands import motion_commands, stack_commands
 from rsvib_torch.commands.export_command import export
 from rsvib_torch.commands.flat_command import flat_command
@@ -18,7 +19,6 @@ from rsvib_torch.commands.init import cameras, init
 from rsvib_torch.commands.live_command import live_session
 from rsvib_torch.commands.run_stack import run
 from rsvib_torch.commands.terminal import Answer, error_line, print_line, running, warnings_in_one_line
-from rsvib_torch.core.validation import MistakesError
 
 _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "init": init,
@@ -113,11 +113,10 @@ def _options(
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run ``rsvib`` with these arguments.
+    """Run ``rsvib`` with these arguments; the exit code is returned.
 
-    Returns:
-        Exit code: 0; 2 after an error, which is one line on standard error (``--debug`` prints the traceback before
-        it); 3 if an axis of ``--require-reliable`` is not reliable; 130 after Ctrl-C.
+    It is 0; 2 after an error, which is one line on standard error (``--debug`` prints the traceback before it); 3 if an
+    axis of ``--require-reliable`` is not reliable; 130 after Ctrl-C.
     """
     logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damaged files raise an error of this package
     command = typer.main.get_command(app)

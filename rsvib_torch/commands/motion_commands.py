@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import rsvib_torch
-from rsvib_torch import calibration, detection, io
+from rsvib_torch import detection, gyroscope, io, row_time
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import Stack, load, restore_and_save
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.core.atomic import check_writable, whole_file
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import measured_text
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.atomic import check_writable, whole_file
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, TimeUnit
+from rsvib_torch.text import measured_text
 
 if TYPE_CHECKING:
-    from rsvib_torch.core.presentation import Result
+    from rsvib_torch.results.presentation import Result
 
 
 @options
@@ -144,7 +144,7 @@ def known(given: KnownOptions) -> Answer:
     stack = load(given, options)
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
         with working("aligning the recording"):
-            found = detection.align_motion(
+            found = gyroscope.align_motion(
                 stack.frames,
                 stack.timing,
                 recorded,
@@ -157,7 +157,7 @@ def known(given: KnownOptions) -> Answer:
         data["alignment"] = _without_curve(found)
         _refuse(given, found.reasons)
         placed = found.motion
-        if given.fit_row_time and isinstance(found, detection.RotationAlignment):
+        if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):
             stack = replace(stack, timing=_with_row_time(stack.timing, found.row_time))
     else:
         placed = recorded.retimed(given.offset)
@@ -218,7 +218,7 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
         warn(reason)
 
 
-def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMotion) -> detection.MotionCheck | None:
+def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMotion) -> gyroscope.MotionCheck | None:
     """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
 
     If the clock is stated, an error of the comparison is a warning.
@@ -228,7 +228,7 @@ def _check_motion(given: KnownOptions, stack: Stack, motion: rsvib_torch.FreeMot
         return None
     try:
         with working("comparing the motion"):
-            check = detection.check_motion(stack.frames, stack.timing, motion)
+            check = gyroscope.check_motion(stack.frames, stack.timing, motion)
     except ValueError as error:
         if given.offset is None:
             raise
@@ -282,7 +282,7 @@ def compare(given: CompareOptions) -> Answer:
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
     times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
     with working("comparing"):
-        result = detection.compare_accelerometer(
+        result = gyroscope.compare_accelerometer(
             detection.DetectionResult.load(given.vibration),
             times,
             acceleration,
@@ -362,7 +362,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
     with working("measuring the motion" if given.by_motion else "measuring the flicker"):
         if given.by_motion:
-            result = detection.calibrate_row_time_by_motion(
+            result = row_time.calibrate_row_time_by_motion(
                 stack,
                 frame_rate=given.frame_rate or 0.0,
                 row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
@@ -372,9 +372,9 @@ def calibrate(given: CalibrateOptions) -> Answer:
             )
         elif given.flicker_frequency is None:
             exposure = given.exposure or []
-            result = calibration.calibrate_row_time_by_exposure(stack, exposure, scan_axis=axis, gamma=given.gamma)
+            result = row_time.calibrate_row_time_by_exposure(stack, exposure, scan_axis=axis, gamma=given.gamma)
         else:
-            result = calibration.calibrate_row_time(
+            result = row_time.calibrate_row_time(
                 stack,
                 given.flicker_frequency,
                 frame_rate=given.frame_rate,
@@ -430,7 +430,7 @@ def _check_given(given: CalibrateOptions) -> None:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
 
 
-def _calibrated_toml(result: calibration.RowTimeCalibration, scan_axis: str) -> str:
+def _calibrated_toml(result: row_time.RowTimeCalibration, scan_axis: str) -> str:
     """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
     period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {

@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rsvib_torch import detection, io, stacks, tracking
+from rsvib_torch import detection, io, stacks, video
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes
 from rsvib_torch.commands.terminal import Answer, warn, working
-from rsvib_torch.core.atomic import whole_folder
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import number_of
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.atomic import whole_folder
+from rsvib_torch.files.reading import Table
 from rsvib_torch.options import ProcessStackOptions, ProcessVideoOptions, WindowOptions
+from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -228,7 +228,7 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = out / "manifest.json"
     with working(f"restoring {frames.name}", counts=True) as progress:
-        result = stacks.process_video(
+        result = video.process_video(
             frames,
             restored,
             settings.timing,
@@ -267,5 +267,5 @@ def _followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifes
     index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
     raw = _frame(frames, index, manifest.settings["full_scale"])
     if manifest.margins is not None:
-        raw = tracking.Margins(**manifest.margins).cut(raw)
+        raw = video.Margins(**manifest.margins).cut(raw)
     return reports.comparison_figure(raw, _frame(restored, index, None))

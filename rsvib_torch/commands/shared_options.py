@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from rsvib_torch import io
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.text import AXES
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
+from rsvib_torch.text import AXES
 
 if TYPE_CHECKING:
     import torch

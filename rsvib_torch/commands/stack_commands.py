@@ -11,16 +11,16 @@ from pydantic import Field
 import rsvib_torch
 from rsvib_torch import detection, imaging, io, stacks
 from rsvib_torch import report as reports
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
 from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, note, working
-from rsvib_torch.core.atomic import check_writable, whole_folder
-from rsvib_torch.core.reading import Table, check_regular
-from rsvib_torch.core.text import printable
-from rsvib_torch.core.validation import options
+from rsvib_torch.files.atomic import check_writable, whole_folder
+from rsvib_torch.files.reading import Table, check_regular
 from rsvib_torch.options import DetectStackOptions
+from rsvib_torch.text import printable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -303,7 +303,7 @@ def restore_frames(given: RestoreOptions) -> Answer:
 
 def _restore_windows(given: RestoreOptions) -> Answer:
     """Restore a stack with the detections of its windows."""
-    from rsvib_torch.core.result_files import decode  # noqa: PLC0415
+    from rsvib_torch.results.result_files import decode  # noqa: PLC0415
 
     vibration, timing = given.vibration, given.settings.timing
     manifest = stacks.read_manifest(vibration)

@@ -18,10 +18,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.text import Text
 
-from rsvib_torch.core.progress import listening
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.reason import on_command_line
-from rsvib_torch.core.text import json_text, printable, shortened, wrapped
+from rsvib_torch.execution.progress import listening
+from rsvib_torch.files.reading import Table
+from rsvib_torch.results.reason import on_command_line
+from rsvib_torch.text import json_text, printable, shortened, wrapped
 
 
 @dataclass

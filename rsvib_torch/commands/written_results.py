@@ -11,8 +11,8 @@ from rsvib_torch import io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import note, warn, working
-from rsvib_torch.core.atomic import check_writable, write_json
-from rsvib_torch.core.text import number_of
+from rsvib_torch.files.atomic import check_writable, write_json
+from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from rsvib_torch.core.tables import Array
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -26,6 +25,7 @@ from rsvib_torch.frames.orientation import (
 )
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import VibrationStd
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 
 

@@ -20,8 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.tables import table
+from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.detection.assemble import assembled
 from rsvib_torch.detection.diagnosis import other_timings
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
@@ -34,6 +33,7 @@ from rsvib_torch.detection.verdict import rotation_possible
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.numerics.tables import table
 from rsvib_torch.registration.register import fits_frame
 
 

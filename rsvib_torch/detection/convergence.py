@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, split_axis
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, residual_of
 from rsvib_torch.detection.tones.selection import robust_fit
+from rsvib_torch.numerics.tables import Array, split_axis
 
 _KEPT = 4  # steps that are combined; more change results of long exposures by less than their standard deviations
 # A step was inexact if the next round corrects more than this part of it. Without long exposures, 0.1 is corrected
@@ -75,12 +75,9 @@ class Acceleration:
     A wrong motion also blurs the warped frames wrongly. With long exposures, rows therefore measure up to twice their
     residual displacement, or half of it. The measurements are corrected by the combination of the last steps that would
     have left the least change.
-
-    Attributes:
-        steps: The last steps with the same tones.
     """
 
-    steps: list[Step] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)  # the last steps with the same tones
 
     def ratio(self, step: Step) -> Array | None:
         """(B,) length of a step over the length of the last one; None if there is none."""

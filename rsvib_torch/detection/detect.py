@@ -7,12 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, ParamSpec, Protocol, overload
 
-from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.higher_packages import imported
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, without_gradients
-from rsvib_torch.core.validation import fields_of
-from rsvib_torch.core.validation import options as option_group
+from rsvib_torch.checks.validation import fields_of
+from rsvib_torch.checks.validation import options as option_group
+from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection.attempts import FieldOptions, detect_tones, detect_windows, windows_of
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
@@ -20,6 +17,8 @@ from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
 from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.strips import camera_in_row_order
 from rsvib_torch.detection.tones.fit import MotionModel
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import TimedModule, entry_point, module_options
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
@@ -27,6 +26,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import FollowOptions, FreeMotionOptions, SweptToneOptions, VibrationOptions
+from rsvib_torch.results.higher_packages import imported
 
 VibrationModel = Literal["tones", "free", "swept"]
 T = ParamSpec("T")
@@ -127,14 +127,13 @@ def detect_vibration(
         TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too many missing pixels, or an option
             is out of range.
 
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
@@ -215,12 +214,11 @@ class VibrationDetector(TimedModule):
         timing: The sensor.
 
     Raises:
-        TypeError: If an option is unknown.
         ValueError: If another model is given.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> detector = rsv.VibrationDetector(timing, method="bands", tones=1)
         >>> found = detector(frames.expand(2, 1, *frames.shape).transpose(1, 2))  # two stacks (B, T, C, H, W)

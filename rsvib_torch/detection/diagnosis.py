@@ -12,9 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.core.precision import full_precision, without_gradients
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.tables import Array, split_axis, table, take_stacks
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -22,12 +19,15 @@ from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, typical_size
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart
+from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.numerics.tables import Array, split_axis, table, take_stacks
 from rsvib_torch.options import OffsetOptions
 from rsvib_torch.registration.register import fits_frame
+from rsvib_torch.results.reason import Reason
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,11 @@ def diagnose_timing(frames: FramesOrFiles, timing: SensorTiming, options: Offset
         agree with no other one.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If frames are a batch, or too small, see ``detect_vibration``.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=4)
@@ -198,17 +197,12 @@ _MINIMA, _EQUAL = 4, 4.0  # minima that are refined, and their squared residual 
 def period_factor(
     measurements: Measurements, timing: RowTiming, num_frames: int, block_rows: int
 ) -> tuple[float, Array] | None:
-    """Factor of the frame start times with which one tone along each axis explains the measurements best.
+    """Factor c of the frame start times with which one tone along each axis explains the measurements best.
 
-    A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the
-    rows of a frame and the phase from frame to frame must agree with the same frequency, which determines c. Reversed
-    readout is c = -1, because a vibration in reversed time is a vibration.
-
-    Args:
-        measurements: Displacements of one stack (B = 1) of at least three frames, in row order.
-        timing: The sensor.
-        num_frames: Frames of the stack.
-        block_rows: Rows of a measurement, which limit the frequency of the tones.
+    A row ``i`` of frame ``p`` starts its exposure at ``s_p + i row_time``. With the factor c, it is ``c s_p``: the rows
+    of a frame and the phase from frame to frame must agree with the same frequency, which determines c. Reversed
+    readout is c = -1, because a vibration in reversed time is a vibration. The measurements are those of one stack of
+    at least three frames, in row order; ``block_rows`` limit the frequency of the tones.
 
     Returns:
         c, 0.8 to 1.5, or -1, and the frequencies (1, 2, 1) in Hz of the tones; None if none explains the displacements

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, median, take_stacks, valid_mean, without_nan
+from rsvib_torch.numerics.tables import Array, median, take_stacks, valid_mean, without_nan
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.refinement import FittedRows, refine
@@ -38,6 +37,7 @@ from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_r
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
@@ -46,19 +46,12 @@ Status = Literal["converged", "not converged", "abandoned", "not visible"]
 
 @dataclass(frozen=True)
 class DetectionOptions:
-    """Options of all attempts.
+    """Options of all attempts."""
 
-    Attributes:
-        method: How tones are fitted.
-        tones: Number of tones of each axis; None to select it by significance.
-        model: Harmonics and order of the image motion.
-        bands: Registration of the row bands.
-    """
-
-    method: DetectionMethod
-    tones: int | None
-    model: MotionModel
-    bands: RegistrationOptions
+    method: DetectionMethod  # how tones are fitted
+    tones: int | None  # number of tones of each axis; None to select it by significance
+    model: MotionModel  # harmonics and order of the image motion
+    bands: RegistrationOptions  # registration of the row bands
 
     @property
     def max_tones(self) -> float:
@@ -68,77 +61,48 @@ class DetectionOptions:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What an attempt assumes about the motion, and what earlier attempts have found.
+    """What an attempt assumes about the motion, and what earlier attempts have found."""
 
-    Attributes:
-        scale: Components of the motion.
-        is_doubtful: Whether the motion is assumed only because something contradicts a simpler one: roll and zoom
-            because the halves of the rows move apart, another timing because tones do not explain the rows. The
-            attempt is then abandoned early if a large residual remains.
-        has_pattern: Whether the frames have a pattern of columns; None if it is not known.
-        translation: Fit without roll and zoom, from which a fit with roll or zoom starts.
-        known_offsets: Offsets of the row bands of these frames, measured with another timing.
-        frequencies: (B, A, 1) Hz of one tone of each axis.
-    """
-
-    scale: FieldScale
+    scale: FieldScale  # components of the motion
+    # whether the motion is assumed only because something contradicts a simpler one: roll and zoom because the halves
+    # of the rows move apart, another timing because tones do not explain the rows. The attempt is then abandoned early
+    # if a large residual remains.
     is_doubtful: bool = False
-    has_pattern: bool | None = None
-    translation: ToneFit | None = None
-    known_offsets: OffsetCurve | None = None
-    frequencies: Array | None = None
+    has_pattern: bool | None = None  # whether the frames have a pattern of columns; None if it is not known
+    translation: ToneFit | None = None  # fit without roll and zoom, from which a fit with roll or zoom starts
+    known_offsets: OffsetCurve | None = None  # offsets of the row bands of these frames, measured with another timing
+    frequencies: Array | None = None  # (B, A, 1) Hz of one tone of each axis
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Result of a method of detection.
+    """Result of a method of detection."""
 
-    Attributes:
-        fit: The fit of all B stacks, with the covariance of its parameters.
-        measurements: The measurements with the weights of the fit.
-        offsets: The same as offsets (B, P, N, A) between consecutive frames.
-        predicted: (B, P, N, A) px, the offsets that the fit predicts.
-        refined: The complete result of the direct method; None if the fit is to bands.
-    """
-
-    fit: ToneFit
-    measurements: Measurements
-    offsets: OffsetCurve
-    predicted: Array
-    refined: FittedRows | None = None
+    fit: ToneFit  # the fit of all B stacks, with the covariance of its parameters
+    measurements: Measurements  # the measurements with the weights of the fit
+    offsets: OffsetCurve  # the same as offsets (B, P, N, A) between consecutive frames
+    predicted: Array  # (B, P, N, A) px, the offsets that the fit predicts
+    refined: FittedRows | None = None  # the complete result of the direct method; None if the fit is to bands
 
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """What an attempt found, for B stacks in row order.
+    """What an attempt found, for B stacks in row order."""
 
-    Attributes:
-        statuses: For each stack, ``"converged"`` (always for bands); ``"not converged"``: the rounds ended before, and
-            what the last ones changed counts as an error; ``"abandoned"``: the hypothesis is wrong; ``"not visible"``:
-            no row was measured.
-        options: The options.
-        scale: Components of the motion.
-        start: Offsets of the row bands.
-        fitted: Measurements and the fit to them.
-        fit: The same with all uncertainties in its covariance, also those of ``std_if_hidden_tone``.
-        vibration: Its vibration, in px.
-        std: Standard deviations of the vibration, in px, given the tones that were found.
-        std_if_hidden_tone: The same with the allowance for a further tone.
-        findings: For each stack and each axis the reasons against it.
-        interval: Seconds between the first two frames.
-    """
-
+    # for each stack, ``"converged"`` (always for bands); ``"not converged"``: the rounds ended before, and what the
+    # last ones changed counts as an error; ``"abandoned"``: the hypothesis is wrong; ``"not visible"``: no row was
+    # measured
     statuses: tuple[Status, ...]
-    options: DetectionOptions
-    scale: FieldScale
-    start: BandStart
-    fitted: Fitted
-    fit: ToneFit
-    vibration: Vibration
-    std: VibrationStd
-    std_if_hidden_tone: VibrationStd
-    findings: tuple[Findings, ...]
-    interval: float
+    options: DetectionOptions  # the options
+    scale: FieldScale  # components of the motion
+    start: BandStart  # offsets of the row bands
+    fitted: Fitted  # measurements and the fit to them
+    fit: ToneFit  # the same with all uncertainties in its covariance, also those of ``std_if_hidden_tone``
+    vibration: Vibration  # its vibration, in px
+    std: VibrationStd  # standard deviations of the vibration, in px, given the tones that were found
+    std_if_hidden_tone: VibrationStd  # the same with the allowance for a further tone
+    findings: tuple[Findings, ...]  # for each stack and each axis the reasons against it
+    interval: float  # seconds between the first two frames
 
     @property
     def has_pattern(self) -> bool:
@@ -147,14 +111,7 @@ class Attempt:
 
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
-    """Detect the vibration of B stacks under a hypothesis.
-
-    Args:
-        stacks: The frames.
-        timing: The sensor, in row order.
-        options: Options of all attempts.
-        hypothesis: What is assumed.
-    """
+    """Detect the vibration of B stacks under a hypothesis; the sensor is in row order."""
     method, scale = METHODS[options.method], hypothesis.scale
     frames = stacks.images
     num_frames, height = frames.shape[1:3]
@@ -265,16 +222,11 @@ class Method:
     The arguments of ``fit`` are the start with the offset curve (B, P, N) of row bands, the grey frames (B, T, H, W)
     in row order, the sensor in row order, the options, and the hypothesis. Stacks of a batch have the same components
     and groups of frames, and must not affect each other otherwise.
-
-    Attributes:
-        fit: The function.
-        max_group_frames: Number of frames that are compared with each other; it decides which tones have a gain.
-        needs_whole_curve: Whether the accuracy depends on the offset curve, or the curve is only a start.
     """
 
-    fit: Callable[[BandStart, GreyFrames, RowTiming, DetectionOptions, Hypothesis], Fitted]
-    max_group_frames: int
-    needs_whole_curve: bool
+    fit: Callable[[BandStart, GreyFrames, RowTiming, DetectionOptions, Hypothesis], Fitted]  # the function
+    max_group_frames: int  # number of frames that are compared with each other; it decides which tones have a gain
+    needs_whole_curve: bool  # whether the accuracy depends on the offset curve, or the curve is only a start
 
 
 def fit_bands(

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from rsvib_torch.core.tables import Array, median, select_stacks, table, take_stacks, valid_mean, without_nan
 from rsvib_torch.detection.convergence import Acceleration, Step, is_converged
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
@@ -46,39 +45,28 @@ from rsvib_torch.detection.tones.selection import (
     with_best_aliases,
 )
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.numerics.tables import Array, median, select_stacks, table, take_stacks, valid_mean, without_nan
 from rsvib_torch.registration.gradients import RowGradients
 
 
 @dataclass(frozen=True, eq=False)
 class FittedRows:
-    """Displacements of the rows of B stacks, and the motion that was fitted to them.
+    """Displacements of the rows of B stacks, and the motion that was fitted to them."""
 
-    Attributes:
-        measurements: Displacements of blocks of scene rows, measured around the fit, with its weights.
-        fit: The fit to them.
-        other_motion: Motion in the measurements that the fit does not explain, before insignificant tones are left out.
-        robust_weights: (B, N, A) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
-        aliasing: (B,) px, expected size of the bias of the displacements by aliasing.
-        uneven: (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain.
-        frames: The frames; without a pattern of columns if there was one.
-        has_pattern: Whether a pattern of columns was subtracted.
-        unknown: (B, A, P, R) changes of the parameters by the last R rounds, which count as errors; 0 for stacks that
-            converged.
-        converged: (B,) bool, stacks whose next round would change little.
-        abandoned: (B,) bool, stacks whose large residual ended the rounds early.
-    """
-
-    measurements: Measurements
-    fit: ToneFit
+    measurements: Measurements  # displacements of blocks of scene rows, measured around the fit, with its weights
+    fit: ToneFit  # the fit to them
+    # motion in the measurements that the fit does not explain, before insignificant tones are left out
     other_motion: OtherMotion
+    # (B, N, A) weights 0 ... 1 by which the information of each row was multiplied; 0 for outliers.
     robust_weights: Array
-    aliasing: Array
-    uneven: Array
-    frames: GroupedFrames
-    has_pattern: bool
+    aliasing: Array  # (B,) px, expected size of the bias of the displacements by aliasing
+    uneven: Array  # (B, 2) px, differences of the displacements along a row that roll and zoom cannot explain
+    frames: GroupedFrames  # the frames; without a pattern of columns if there was one
+    has_pattern: bool  # whether a pattern of columns was subtracted
+    # (B, A, P, R) changes of the parameters by the last R rounds, which count as errors; 0 for stacks that converged
     unknown: Array
-    converged: Array
-    abandoned: Array
+    converged: Array  # (B,) bool, stacks whose next round would change little
+    abandoned: Array  # (B,) bool, stacks whose large residual ended the rounds early
 
 
 def refine(
@@ -90,18 +78,9 @@ def refine(
     may_abandon: bool = False,
     has_pattern: bool | None = None,
 ) -> FittedRows:
-    """Refine a detected motion on the images.
+    """Refine a motion, found in the offsets of row bands, on the images: the last measurements and the fit to them.
 
-    Args:
-        frames: The frames.
-        intervals: (M,) s, times between the frames that are compared.
-        start: Fit to the offsets of row bands.
-        tones: Number of tones of each axis; None to select it by significance.
-        may_abandon: As in ``Refinement``.
-        has_pattern: As in ``Refinement``.
-
-    Returns:
-        The last measurements and the fit to them.
+    ``intervals`` (M,) are the times in s between the frames that are compared; other arguments as in ``Refinement``.
     """
     # Rounds of measuring and fitting from the given start.
     refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
@@ -439,21 +418,15 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
 def with_unknown_changes(
     fitted: FittedRows, warped_by: ToneFit, around: ToneFit, fits: Sequence[ToneFit], where: Array
 ) -> FittedRows:
-    """The fit of stacks whose rounds did not converge: what the last rounds changed is not known.
+    """The fit of the stacks ``where`` (B,) whose rounds did not converge: what the last rounds changed is not known.
 
-    The change of the displacements by the last round counts as motion that is not explained, for all axes, because the
+    The change of the displacements by the last round, from the fit that the frames were ``warped_by`` to the one that a
+    further round would measure ``around``, counts as motion that is not explained, for all axes, because the
     displacement along one determines which rows are compared along the other. Tones of 10 to 40 px in three frames with
     a long exposure did not converge: they were wrong, with a permitted residual.
 
-    The changes of the parameters by the last rounds count as errors. Tones near blind frequencies with long exposures
-    had errors of 4 to 18 standard deviations without them.
-
-    Args:
-        fitted: The fit of the last round.
-        warped_by: Fit that the frames were warped by.
-        around: Fit that a further round would measure around.
-        fits: Fits of the last rounds with the same tones.
-        where: (B,) bool, stacks that did not converge.
+    The changes of the parameters by the last rounds, of ``fits`` with the same tones, count as errors. Tones near blind
+    frequencies with long exposures had errors of 4 to 18 standard deviations without them.
     """
     measurements, fit, other = fitted.measurements, fitted.fit, fitted.other_motion
     change = Step.between(measurements, warped_by, around).change
@@ -483,13 +456,8 @@ def mirrored_frequencies(measurements: Measurements, fit: ToneFit, start: ToneFi
     """Frequencies of the strongest tones, mirrored at the nearest blind frequency on the axis with the larger residual.
 
     With two frames a time T apart, tones equally far above and below a blind frequency ``j / T`` have the same gain and
-    differ only within a frame.
-
-    Args:
-        measurements: The measurements of the fit.
-        fit: Fit that may be at the wrong side of a blind frequency.
-        start: Fit that it was refined from.
-        tried: (B, A) bool, axes that were mirrored before.
+    differ only within a frame. The fit, refined from ``start``, may be at the wrong side; axes that were ``tried`` (B,
+    A) are not mirrored again.
 
     Returns:
         Frequencies (B, A, 1) in Hz and the axes (B, A) that are mirrored, at most one of each stack: those with a

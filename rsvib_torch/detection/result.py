@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.presentation import Result, axis_head, axis_rows, plain_values
-from rsvib_torch.core.text import measured_text, text_table
 from rsvib_torch.detection.spectrum import DisplacementSpectrum, displacement_spectrum
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.results.presentation import Result, axis_head, axis_rows, plain_values
+from rsvib_torch.text import measured_text, text_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -151,7 +151,7 @@ class DetectionResult(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> detection = rsv.detect_vibration(frames, timing)
         >>> detection.std.amplitude.shape, detection.offsets.offsets.shape[-1]  # (axis, tone); x and y

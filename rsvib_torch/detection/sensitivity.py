@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.tables import pseudo_inverse, split_axis, table, tables
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displacements
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import pseudo_inverse, split_axis, table, tables
+from rsvib_torch.results.presentation import AXIS_NAMES
 
 _STEP = 1e-4  # relative change of the timing, for differences
 

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_single
-from rsvib_torch.core.fourier import fourier_sums
-from rsvib_torch.core.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
-from rsvib_torch.core.tables import Array, table, tensor, unit_wave
-from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.fourier import fourier_sums
+from rsvib_torch.numerics.tables import Array, table, tensor, unit_wave
 from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.results.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
+from rsvib_torch.text import measured_text, text_table
 
 BLIND_GAIN = 0.1  # of the largest response; noise is amplified tenfold, and errors of the timing as well
 _SEARCHED_GAIN = 0.01  # a line in a blind band has ghosts outside, one frame rate away, if it is not subtracted
@@ -60,7 +60,7 @@ class DisplacementSpectrum(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)
         >>> spectrum = rsv.detect_vibration(frames, timing).spectrum()
         >>> spectrum.lines.frequency[:, 0].round().tolist()  # Hz
@@ -134,16 +134,9 @@ class DisplacementSpectrum(
 def displacement_spectrum(
     curve: OffsetCurve, timing: SensorTiming, vibration: Vibration, fitted: Tensor
 ) -> DisplacementSpectrum:
-    """The spectrum of the displacement from the offsets of one stack.
+    """The spectrum of the displacement from the offsets of one stack, at least 8.
 
-    Args:
-        curve: The offsets (not a batch).
-        timing: The sensor.
-        vibration: The tones that were fitted to the offsets: lines that are known.
-        fitted: (P, N, A), the offsets by these tones and the image motion.
-
-    Raises:
-        ValueError: If the curve is a batch, or fewer than 8 offsets were measured.
+    Lines of the ``vibration`` are known; ``fitted`` (P, N, A) are the offsets by its tones and the image motion.
     """
     check_single("result", curve)
     good = curve.good & (curve.quality > 0)
@@ -188,23 +181,14 @@ def displacement_spectrum(
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Offsets of one axis and their times, from which a spectrum is computed.
+    """Offsets of one axis and their times, from which a spectrum is computed."""
 
-    Attributes:
-        earlier: (N,) s, mid-exposures of the rows in the earlier frame, from the middle of the record.
-        later: (N,) s, those in the later frame.
-        values: (N,) px, displacement at ``later`` less that at ``earlier``, without the lines that are known.
-        weights: (N,) px^-2, inverse variances up to a factor.
-        exposure_time: s.
-        band_time: s, time over which the rows of one offset are exposed.
-    """
-
-    earlier: Array
-    later: Array
-    values: Array
-    weights: Array
-    exposure_time: float
-    band_time: float
+    earlier: Array  # (N,) s, mid-exposures of the rows in the earlier frame, from the middle of the record
+    later: Array  # (N,) s, those in the later frame
+    values: Array  # (N,) px, displacement at ``later`` less that at ``earlier``, without the lines that are known
+    weights: Array  # (N,) px^-2, inverse variances up to a factor
+    exposure_time: float  # s
+    band_time: float  # s, time over which the rows of one offset are exposed
 
     def spectrum(
         self, frequency: Array, span: float, known: Array, most_lines: int = _MAX_LINES

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.tables import Array, split_axis, table, tables
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.numerics.tables import Array, split_axis, table, tables
 from rsvib_torch.options import RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.registration.register import check_frame_size, fits_frame, register_rows
@@ -32,15 +32,10 @@ def band_curve(
     *,
     mere_start: bool,
 ) -> OffsetCurve:
-    """Offsets of the row bands of grey frames, NaN for bands with more than half of their pixels missing.
+    """Offsets of the row bands of grey frames (B, T, H, W), NaN for bands with more than half of their pixels missing.
 
-    Args:
-        frames: (B, T, H, W) in row order.
-        valid: (B, T, H, W) bool, False at missing pixels; None if there are none.
-        timing: The sensor, in row order.
-        options: How the bands are registered.
-        mere_start: Whether the offsets are only the start of a fit to rows. Of wide frames, the 320 columns
-            with the most detail are used then, unless a fifth of their bands cannot be registered.
+    A ``mere_start`` is only the start of a fit to rows. Of wide frames, the 320 columns with the most detail are used
+    then, unless a fifth of their bands cannot be registered.
     """
     check_frame_size(frames.shape[-2], frames.shape[-1], options)  # of the user's frames, not of the columns in use
     curve = None
@@ -112,15 +107,8 @@ def field_start(
 ) -> BandStart:
     """Offsets of row bands for a motion with roll or zoom, from two to four parts of the columns.
 
-    Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from a fit
-    without roll and zoom, which has smaller errors.
-
-    Args:
-        stacks: The frames.
-        timing: As in ``band_curve``.
-        options: As in ``band_curve``.
-        scale: Components of the motion.
-        translation: Fit without roll and zoom.
+    Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from the
+    ``translation``, a fit without roll and zoom, which has smaller errors.
 
     Raises:
         ValueError: If the parts are too narrow, see ``strips_fit``.

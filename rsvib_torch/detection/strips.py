@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.tables import Array, split_axis
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, split_axis
 from rsvib_torch.options import ProjectionOptions
 
 

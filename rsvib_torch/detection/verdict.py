@@ -1,24 +1,24 @@
 """The verdict on detected vibrations: the reasons against each axis.
 
-``core/reason.py`` has their texts, docs/verdicts.md the measurements that the limits were chosen with.
+``results/reason.py`` has their texts, docs/verdicts.md the measurements that the limits were chosen with.
 """
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.selection import MIN_OFFSET, MIN_SIGNIFICANCE
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.registration.register import OffsetCurve, similar_share
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 
 Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
 
@@ -52,17 +52,12 @@ def judged(
 ) -> tuple[Findings, ...]:
     """Reasons against the vibrations of B stacks, for each of their A axes in row order.
 
-    Args:
-        vibration: The detected vibrations.
-        std: Their standard deviations.
-        measured: The measurements that they were fitted to: the motion of the rows that they do not explain, or the
-            offsets of row bands.
-        intervals: Times between the frames of the largest groups, s; fast motion and unequal blur permit smaller ones.
-        displacement: (B, A) px, displacement of the rows by the tones without its mean, rms over the rows.
-        known_std: (B, A) px, standard deviation of the displacement if the number of tones is right.
-        timing: The sensor, in row order.
-        max_tones: Largest number of tones that was tried on an axis; an axis with so many may have more.
-        radius: Distance from the centre, in px, at which roll and zoom are displacements in px.
+    ``measured`` is the motion of the rows that they do not explain, or the offsets of row bands. ``intervals`` in s are
+    those between the frames of the largest groups; fast motion and unequal blur permit smaller ones. ``displacement``
+    and ``known_std`` (B, A) in px are the displacement of the rows by the tones without its mean, rms over the rows,
+    and its standard deviation if the number of tones is right. An axis with ``max_tones``, the largest number that was
+    tried, may have more. ``radius`` is the distance from the centre, in px, at which roll and zoom are displacements in
+    px.
     """
     # 1. The compared quantities of all stacks and axes.
     frequency = table(vibration.frequency)
@@ -118,9 +113,7 @@ def _compared_bands(bands: BandOffsets) -> dict[str, Array]:
     }
 
 
-def _reasons_against_stack(
-    stack: dict[str, Any], timing: RowTiming, max_tones: float, least_gain: float
-) -> list[list[Reason]]:
+def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, least_gain: float) -> list[list[Reason]]:
     """Reasons against each axis of one stack, from the numbers of its compared quantities."""
     by_rows, axes = "bands" not in stack, len(stack["amplitude"])
     of_all = _measurement_reasons(stack)
@@ -167,7 +160,7 @@ def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:
     )
 
 
-def _measurement_reasons(stack: dict[str, Any]) -> list[Reason]:
+def _measurement_reasons(stack: Table) -> list[Reason]:
     """Reasons from the fraction of the visible rows or bands that were measured."""
     if stack["measured"] >= _MIN_MEASURED:
         return []
@@ -183,7 +176,7 @@ _MIN_GAIN_OF_TWO = 0.3
 
 
 def _tone_reasons(
-    axis: str, numbers: dict[str, Any], tone: int, num_tones: int, timing: RowTiming, least_gain: float
+    axis: str, numbers: Table, tone: int, num_tones: int, timing: RowTiming, least_gain: float
 ) -> list[Reason]:
     """Reasons against one tone."""
     names = ("amplitude", "amplitude_std", "frequency", "frequency_std", "gain")
@@ -212,7 +205,7 @@ def _tone_reasons(
     return reasons
 
 
-def _displacement_reasons(axis: str, numbers: dict[str, Any], num_tones: int) -> list[Reason]:
+def _displacement_reasons(axis: str, numbers: Table, num_tones: int) -> list[Reason]:
     """Reasons from the displacement of the rows by all tones and its standard deviations, rms over the rows.
 
     ``known_std`` holds if the number of tones is right, ``std`` allows for a further tone. The limits and their effect
@@ -227,7 +220,7 @@ def _displacement_reasons(axis: str, numbers: dict[str, Any], num_tones: int) ->
     return []
 
 
-def _band_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
+def _band_reasons(axis: str, numbers: Table) -> list[Reason]:
     """Reasons from the residual of the bands, and from condition (24)."""
     reasons = []
     residual, size, within = numbers["residual"], numbers["size"], numbers["within_row_time"]
@@ -239,7 +232,7 @@ def _band_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
     return reasons
 
 
-def residual_reasons(axis: str, numbers: dict[str, Any]) -> list[Reason]:
+def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
     """Reasons from motion of the rows along an axis that no vibration explains; ``numbers`` of ``OtherMotion`` in px.
 
     docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.

@@ -14,17 +14,17 @@ from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import check_images, checks_arguments
-from rsvib_torch.core.banded_solver import solve_banded
-from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
-from rsvib_torch.core.validation import Positive
+from rsvib_torch.checks.arguments import check_images, checks_arguments
+from rsvib_torch.checks.validation import Positive
 from rsvib_torch.frames.orientation import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing, simulate_frames
 from rsvib_torch.motion.field import ColumnMotion, displacement_factors
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.banded_solver import solve_banded
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
 
 _DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
@@ -90,16 +90,13 @@ def scale_of_information(recording: Recording) -> Tensor:
 
 
 def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Tensor:
-    """Information of the parameters when the scene is unknown, for unit noise.
+    """Information (P, P) of the parameters when the scene is unknown, for unit noise.
 
-    ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and the
-    part of D that a scene could explain contains no information. The displacement along a row is a phase ramp, so that
-    A is a banded matrix for each frequency along the row and the projection needs no iterations.
-    The scene is periodic along rows, ``margin`` px beyond its ends, without detail above 0.4 cycles/row; only pixels
-    count whose content is visible in another frame.
-
-    Returns:
-        Matrix (P, P).
+    ``J = D' (1 - A (A' A)^-1 A') D``: D are the derivatives of the frames, A takes a scene to its frames, and the part
+    of D that a scene could explain contains no information. The displacement along a row is a phase ramp, so that A is
+    a banded matrix for each frequency along the row and the projection needs no iterations. The scene is periodic along
+    rows, ``margin`` px beyond its ends, without detail above 0.4 cycles/row; only pixels count whose content is visible
+    in another frame.
     """
     place = _Places.of(recording)
     length = fast_length(recording.scene.shape[1] + 2 * margin)
@@ -221,14 +218,11 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     """The information in closed form, row by row, for unit noise.
 
     ``J = sum_s sum_p (d_p - d)' M(s) (d_p - d)``: M(s) sums the gradient products of scene row s, d_p are the
-    derivatives of its displacement in frame p and d their mean. For two frames this is half of what the derivatives
-    of the offset give. Blur within the exposure and the extent of interpolation kernels are neglected.
-
-    Args:
-        recording: The frames and parameters.
-        noise: Standard deviation of the noise, for a random Gaussian scene with the power spectrum S of this one and
-            noise of power N: gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the
-            noise. None for an unknown deterministic scene.
+    derivatives of its displacement in frame p and d their mean. For two frames this is half of what the derivatives of
+    the offset give. Blur within the exposure and the extent of interpolation kernels are neglected. With the standard
+    deviation of the ``noise``, gradients are weighted by ``T S / (T S + N)``, which is small for frequencies below the
+    noise: the scene is a random Gaussian one with the power spectrum S of this one, N is the power of the noise.
+    Without it, the scene is unknown and deterministic.
     """
     timing, count = recording.timing, recording.num_frames
     (top, left), (height, width) = recording.origin, recording.size

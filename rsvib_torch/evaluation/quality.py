@@ -7,9 +7,9 @@ from kornia.metrics import ssim as kornia_ssim
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checks_arguments
-from rsvib_torch.core.arrays import FramesLike, as_tensor
-from rsvib_torch.core.validation import Positive
+from rsvib_torch.checks.arguments import check_broadcast, checks_arguments
+from rsvib_torch.checks.arrays import FramesLike, as_tensor
+from rsvib_torch.checks.validation import Positive
 
 _Rim = Annotated[int, Field(ge=0)]
 
@@ -48,9 +48,9 @@ def _compared(image: FramesLike, reference: FramesLike, rim: int) -> tuple[Tenso
 
 @checks_arguments
 def psnr(image: FramesLike, reference: FramesLike, data_range: Positive, *, rim: _Rim = 0) -> Tensor:
-    """Peak signal-to-noise ratio of each image.
+    """Peak signal-to-noise ratio in dB of each image, float64: shape (), (T,) or (B, T).
 
-    ``10 log10(data_range^2 / mean (image - reference)^2)`` in dB, the mean over the pixels and channels of one image;
+    ``10 log10(data_range^2 / mean (image - reference)^2)``, the mean over the pixels and channels of one image;
     infinite where both are identical.
 
     Args:
@@ -58,9 +58,6 @@ def psnr(image: FramesLike, reference: FramesLike, data_range: Positive, *, rim:
         reference: The truth, same shape, or one that broadcasts: one scene for all frames.
         data_range: Full scale of the values: 1 for frames as ``read_stack`` returns them.
         rim: Pixels to leave out at each border.
-
-    Returns:
-        float64 tensor with one value an image: shape (), (T,) or (B, T).
 
     Example:
         >>> psnr(torch.full((2, 8, 8), 0.6), torch.full((8, 8), 0.5), 1.0)

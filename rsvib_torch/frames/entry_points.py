@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.precision import outside_graphs
-from rsvib_torch.core.validation import fields_of, flat_options
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.validation import fields_of, flat_options
+from rsvib_torch.execution.precision import outside_graphs
 from rsvib_torch.io.stack_reading import FramesOrFiles, PathLike
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
@@ -102,12 +102,7 @@ def module_options(
 
 
 class TimedModule(nn.Module):
-    """A module with a fixed timing and fixed options, which its representation states.
-
-    Attributes:
-        timing: The sensor.
-        options: The options of its function.
-    """
+    """A module with a fixed timing and fixed options of its function, which its representation states."""
 
     def __init__(self, timing: SensorTiming, options: Any) -> None:
         super().__init__()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_choice
+from rsvib_torch.checks.values import check_choice
 from rsvib_torch.frames.pixels import fill_with_means
 from rsvib_torch.options import Mosaic
 

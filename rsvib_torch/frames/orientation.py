@@ -10,9 +10,9 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.reason import Reason
 from rsvib_torch.motion.timing import SensorTiming, row_axes
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 
 Entry = TypeVar("Entry")
 

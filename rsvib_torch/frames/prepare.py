@@ -13,9 +13,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_pixels
-from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.checks.arguments import check_pixels
+from rsvib_torch.checks.arrays import Channels, FramesLike, as_tensor, channel_axis
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.frames.mosaic import check_mosaic, colours_of, fill_by_colour, luminance, mosaic_free
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.frames.pixels import fill_with_means
@@ -114,8 +114,7 @@ def prepare_frames(
             path or a list of paths.
         timing: The sensor. The frame times of a file that is given by its path are used.
         full_scale: Count that means 1.0, for integer frames other than uint8; by default that of the file.
-        channels: ``"last"`` for frames (T, H, W, C) or (B, T, H, W, C); None for channels before the image axes, with a
-            check of the shape; ``"first"`` without this check.
+        channels: As in ``channel_axis``.
         ignore: Boolean mask of the frames' shape, or one that broadcasts to that shape without the channel axis: True
             at pixels without data, which may hold any value. None for no mask; NaN marks missing pixels as well.
         saturation: Level from which pixels are saturated, in the unit of the frames; ``"auto"``: full scale for
@@ -125,17 +124,6 @@ def prepare_frames(
         mosaic: Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1) of raw frames, e.g. ``"RGGB"``; None for frames
             whose pixels measure all channels.
         name: Name of the argument in error messages.
-
-    Returns:
-        The prepared frames.
-
-    Warns:
-        TimingWarning: As ``timing_from_first_frame``, if the file states another frame rate than the sensor has.
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If the shape is not that of a stack, there are too few frames or more rows than the sensor reads,
-            a pixel is infinite, no pixel has data, all are saturated, or the full scale is unknown.
 
     Example:
         >>> timing = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512, scan_axis="x")

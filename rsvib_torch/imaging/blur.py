@@ -12,20 +12,20 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from rsvib_torch.core.arguments import check_broadcast, check_images, checked_methods, checks_arguments
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.splines import (
+from rsvib_torch.checks.arguments import check_broadcast, check_images, checked_methods, checks_arguments
+from rsvib_torch.checks.values import check_choice, check_whole_number
+from rsvib_torch.execution.precision import full_precision, outside_graphs
+from rsvib_torch.files.free_memory import check_fits
+from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming
+from rsvib_torch.numerics.splines import (
     bspline_coefficients,
     bspline_coefficients_adjoint,
     bspline_weights,
     mirrored,
     spread_taps,
 )
-from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
-from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming
 
 Interpolation = Literal["linear", "cubic"]
 SPLINE_DEGREES: dict[str, int] = {"linear": 1, "cubic": 3}
@@ -139,15 +139,9 @@ def row_psf(
 
 
 def trajectory_psf(displacement: Tensor, node_weights: Tensor, *, interpolation: Interpolation = "linear") -> RowPSF:
-    """Point spread function of every row from the displacement at the nodes of its exposure (Eqs. 26-39).
+    """Point spread function of every row from displacements (..., R, N, 2) px at the nodes of exposures (Eqs. 26-39).
 
-    Args:
-        displacement: (..., R, N, 2) px, axes (x, y).
-        node_weights: (N,), sums to 1.
-        interpolation: As in ``row_psf``.
-
-    Returns:
-        The kernels of all rows.
+    The ``node_weights`` (N,) sum to 1; ``interpolation`` as in ``row_psf``.
     """
     check_choice("interpolation", interpolation, tuple(SPLINE_DEGREES))
     degree = SPLINE_DEGREES[interpolation]
@@ -190,14 +184,10 @@ def form_rows(
 ) -> Tensor:
     """Form rows of frames from the spectra of the rows of a scene, which is mirrored beyond its first and last row.
 
-    Args:
-        spectra: (..., S, U) of the B-spline coefficients, of ``degree`` across the rows, of S scene rows.
-        places: (..., R, N) scene rows at the nodes of the exposures of R rows, with ``node_weights`` (N,).
-        along: (..., R, N) displacement along the rows in px.
-        node_weights: They sum to 1.
-        frequencies: (U,) in cycles per px.
-        degree: Degree of the B-spline.
-        num_scenes: B scenes, whose rows follow each other in ``spectra``; places and displacements are then (B, R, N).
+    The ``spectra`` (..., S, U) are those of B-spline coefficients, of ``degree`` across the rows. ``places`` (..., R,
+    N) are scene rows at the nodes of the exposures of R rows, and ``along`` (..., R, N) displacements along the rows in
+    px; ``node_weights`` (N,) sum to 1; frequencies (U,) are in cycles per px. The rows of several scenes follow each
+    other in ``spectra``; places and displacements are then (B, R, N).
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
     source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)
@@ -236,7 +226,7 @@ def _frame_size(
 def blur_rows(
     scene: Tensor, psf: RowPSF, *, frame_width: int | None = None, origin: tuple[int, int] | None = None
 ) -> Tensor:
-    """Form frames: every output row is the scene convolved with that row's kernel (Eq. 38).
+    """Form frames (..., R, W): every output row is the scene convolved with that row's kernel (Eq. 38).
 
     The output row selects the kernel: convolve, then take the row. Beyond its edges the scene is mirrored.
 
@@ -245,9 +235,6 @@ def blur_rows(
         psf: Kernels of R rows.
         frame_width: Width W of the frame, by default that of the scene.
         origin: Scene pixel (row, column) at frame pixel (0, 0) without motion; by default the frame is centred.
-
-    Returns:
-        Frames (..., R, W).
     """
     size = (scene.shape[-2], scene.shape[-1])
     width, origin = _frame_size(psf, size, frame_width, origin)
@@ -272,16 +259,9 @@ def blur_rows(
 def blur_rows_adjoint(
     frames: Tensor, psf: RowPSF, scene_shape: tuple[int, ...], *, origin: tuple[int, int] | None = None
 ) -> Tensor:
-    """Apply the exact adjoint (transpose) of ``blur_rows``.
+    """Apply the exact adjoint (transpose) of ``blur_rows`` to frames (..., R, W).
 
-    Args:
-        frames: (..., R, W).
-        psf: Kernels of R rows.
-        scene_shape: Shape (..., Hs, Ws) of the scene; leading dimensions that were broadcast are summed.
-        origin: As in ``blur_rows``.
-
-    Returns:
-        Tensor of shape ``scene_shape``.
+    Leading dimensions of ``scene_shape`` (..., Hs, Ws) that were broadcast are summed.
     """
     if len(scene_shape) < 2 or min(scene_shape) < 1:
         raise ValueError(f"scene_shape must be (..., height, width), all at least 1, got {tuple(scene_shape)}")

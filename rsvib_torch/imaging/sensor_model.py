@@ -10,9 +10,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, check_broadcast, check_images, check_pixels, checked_methods
-from rsvib_torch.core.checks import check_number, check_whole_number, described
-from rsvib_torch.core.validation import NotNegative, Positive, options
+from rsvib_torch.checks.arguments import as_numbers, check_broadcast, check_images, check_pixels, checked_methods
+from rsvib_torch.checks.validation import NotNegative, Positive, options
+from rsvib_torch.checks.values import check_number, check_whole_number, described
 from rsvib_torch.options import OpticsOptions
 
 _LEAST_RESPONSE = 0.1  # of the camera, below which the gain does not increase: 0.02 and 0.2 lose up to 5 and 3 dB
@@ -54,11 +54,7 @@ class Optics(OpticsOptions):
         return transfer * torch.sinc(self.pixel * u) * torch.sinc(self.pixel * v)
 
     def apply(self, scene: Tensor) -> Tensor:
-        """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype.
-
-        Raises:
-            TypeError: If the scene is not a floating-point tensor.
-        """
+        """Scene (..., H, W) as imaged by the optics, with mirrored boundaries; same shape and dtype."""
         check_images({"scene": scene}, {"scene": "... H W"})
         return filtered(scene, self.transfer)
 
@@ -181,7 +177,6 @@ class SensorNoise:
             generator: Source of randomness, on the device of the frames.
 
         Raises:
-            TypeError: If the frames are not a floating-point tensor.
             ValueError: If a pixel is NaN or infinite.
         """
         patterned = self.gain_spread > 0 or self.column_offset > 0 or self.row_offset > 0

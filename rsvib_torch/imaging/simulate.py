@@ -8,12 +8,10 @@ import math
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_pixels, checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, as_tensor, channels_appear_last
-from rsvib_torch.core.checks import check_single
-from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.splines import bspline_coefficients
+from rsvib_torch.checks.arguments import check_pixels, checks_arguments
+from rsvib_torch.checks.arrays import ArrayLike, as_tensor, channels_appear_last
+from rsvib_torch.checks.values import check_single
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.imaging.blur import form_rows
@@ -22,6 +20,8 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.splines import bspline_coefficients
 
 _DEGREE = 9  # degree of the spline across rows; its error is 2e-5 of the amplitude at a quarter cycle per pixel
 # px between the visible part and the edge of the scene; the prefilter of the spline decays to 4e-4 within it
@@ -62,13 +62,12 @@ def simulate_frames(
         rest, scene pixel ``(r + (H - h) // 2, c + (W - w) // 2)``.
 
     Raises:
-        TypeError: If the scene is not a floating-point tensor.
         ValueError: If the scene is too small for the frame and motion, or is not finite, or the frames do not fit into
             the free memory.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> scene = city_and_fields(320, 240, seed=3)
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_choice, check_whole_number
-from rsvib_torch.core.splines import gauss_legendre
-from rsvib_torch.core.tables import Array, cos_sin, tables, tensor
+from rsvib_torch.checks.values import check_choice, check_whole_number
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.tables import Array, cos_sin, tables, tensor
 
 Quadrature = Literal["midpoint", "gauss"]
 
@@ -71,17 +71,9 @@ def exposure_trajectory(
     quadrature: Quadrature = "midpoint",
     num_nodes: int | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Displacement at the nodes of exposures that begin at ``starts``.
+    """Displacement (S, N, 2) in px at the nodes of exposures from ``starts`` S in s on, and weights (N,) of the nodes.
 
-    Args:
-        vibration: The motion.
-        starts: Exposure starts in seconds, any shape S (batch dimensions of the vibration lead).
-        timing: The sensor.
-        quadrature: ``"midpoint"`` (Eq. 25) or ``"gauss"``.
-        num_nodes: Number of nodes; by default N_e, or ``gauss_node_count``.
-
-    Returns:
-        Displacement (S, N, 2) in px, axes (x, y), and weights (N,), both float64.
+    Batch dimensions of the vibration lead. There are N_e midpoints (Eq. 25) by default, or ``gauss_node_count`` nodes.
 
     Raises:
         ValueError: If the motion has roll or zoom, see ``motion.field``.
@@ -102,21 +94,12 @@ def rows_showing(
     *,
     exposure_time: float | Tensor | None = None,
 ) -> Tensor:
-    """Frame rows r(s) that show scene rows s: the solution of ``r = s + Y(t(r))``.
+    """Frame rows r(s) that show scene rows s of shape S: the solution of ``r = s + Y(t(r))``, float64.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
     Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
-    scan as fast as the rows is never passed.
-
-    Args:
-        scene_rows: Scene rows s, float64, shape S (batch dimensions of the vibration lead).
-        frame_start: Exposure start of the frame's first row in seconds, broadcastable to S.
-        timing: The sensor.
-        vibration: The motion, in row order.
-        exposure_time: Exposure time in seconds, broadcastable to S; by default that of the sensor.
-
-    Returns:
-        Frame rows, float64, broadcast shape of S and ``frame_start``.
+    scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
+    and ``exposure_time`` (by default that of the sensor) in s broadcast to S.
     """
     check_two_axes(vibration, "the displacement of a row")
     exposure_time = timing.exposure_time if exposure_time is None else exposure_time
@@ -142,19 +125,11 @@ def rows_showing(
 def shown_by_tones(
     scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Vibration
 ) -> tuple[Tensor, Tensor]:
-    """``rows_showing`` of a batch of vibrations, with the mean displacement along these rows; without gradients.
+    """``rows_showing`` for vibrations, with displacements along x: rows and px (B, G, S) of scene rows (B, 1, S).
 
-    The displacement of few rows is computed in NumPy, because each step of Newton's method takes 60 operations of
-    PyTorch. Its slope is that of the mean displacement.
-
-    Args:
-        scene_rows: (B, 1, S) scene rows.
-        frame_start: (B, G, 1) s, exposure starts of the first rows of the frames.
-        timing: The sensor.
-        vibration: The motions (B), in row order.
-
-    Returns:
-        Frame rows (B, G, S) and displacements along x (B, G, S) in px, float64.
+    The displacement of few rows by vibrations (B) in row order is computed in NumPy, because each step of Newton's
+    method takes 60 operations of PyTorch; without gradients. Its slope is that of the mean displacement.
+    ``frame_start`` (B, G, 1) are the exposure starts in s of the first rows of the frames.
     """
     values, scene, start = tables(vibration.parameters, scene_rows, frame_start)
     amplitude, frequency, phase = np.split(values[..., :-3], 3, -1)

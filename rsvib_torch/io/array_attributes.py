@@ -5,15 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from rsvib_torch.core.arrays import channels_appear_last
+from rsvib_torch.checks.arrays import channels_appear_last
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.io.time_metadata import orientation_of, times_of_attributes
 
 
-def attributes_of(info: StackInfo) -> dict[str, Any]:
+def attributes_of(info: StackInfo) -> Table:
     """Attributes of an HDF5 dataset or Zarr array that state ``info``; unknown values are omitted."""
-    attributes: dict[str, Any] = {"axes": info.stored_axes}
+    attributes: Table = {"axes": info.stored_axes}
     if info.full_scale is not None:
         attributes["full_scale"] = float(info.full_scale)
     if info.frame_times is not None:
@@ -28,7 +29,7 @@ def attributes_of(info: StackInfo) -> dict[str, Any]:
     return attributes
 
 
-def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype[Any]) -> StackInfo:
+def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
     """Interpret a stored array of (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it, as a stack.
 
     The attributes are those of ``attributes_of``, or times of other programs; all may be missing.
@@ -45,7 +46,7 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
         shape = (1, *shape)
     elif axes == "THWC":
         shape = (shape[0], shape[3], shape[1], shape[2])
-    stated: dict[str, Any] = {}
+    stated: Table = {}
     if attributes.get("frame_times") is not None:
         times = np.asarray(attributes["frame_times"], dtype=np.float64).ravel()
         stated["frame_times"] = tuple(float(time) for time in times)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsvib_torch.checks.arrays import Array
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
 
-Read = Callable[[int, int], NDArray[Any]]
+Read = Callable[[int, int], Array]
 
 
 class BlockReader(FrameReader):
@@ -35,9 +35,9 @@ class BlockReader(FrameReader):
         block_bytes = self._together * info.frame_bytes if self._together > 1 else 0
         self.info = replace(info, decoding_bytes=block_bytes + more_bytes)
         self._first = 0
-        self._block: NDArray[Any] | None = None
+        self._block: Array | None = None
 
-    def frame(self, index: int) -> NDArray[Any]:
+    def frame(self, index: int) -> Array:
         """Pixels of a frame as stored."""
         if self._block is None or not self._first <= index < self._first + len(self._block):
             self._block = None  # before the next block is allocated
@@ -67,14 +67,14 @@ def array_reader(
 ) -> BlockReader:
     """Reader of an array of HDF5 or Zarr, (T, ...) or a single frame, with chunks of ``chunk_frames`` frames."""
 
-    def read(first: int, last: int) -> NDArray[Any]:
+    def read(first: int, last: int) -> Array:
         frames = np.asarray(array[first:last] if array.ndim > 2 else array[...][None])
         return np.moveaxis(frames, -1, 1) if info.stored_axes == "THWC" else frames
 
     return BlockReader(path, info, read, chunk_frames, more_bytes, close)
 
 
-def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype[Any]) -> BlockReader:
+def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype) -> BlockReader:
     """Reader of frames of a ``dtype`` with its byte order that lie one after another in a file from an ``offset`` on.
 
     Files are read instead of mapped into memory: if a mapped file shrinks, the access ends the process. A file that
@@ -86,7 +86,7 @@ def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype[
         raise ValueError(f"truncated: the header states {needed} bytes of pixels, the file holds {held}")
     file = path.open("rb")
 
-    def read(first: int, _: int) -> NDArray[Any]:
+    def read(first: int, _: int) -> Array:
         start, pixels = offset + first * size, np.empty(0, dtype)
         if start + size <= os.fstat(file.fileno()).st_size:  # before memory is allocated
             file.seek(start)

@@ -4,14 +4,13 @@ import json
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from rsvib_torch.core.arrays import channels_appear_last
-from rsvib_torch.core.validation import Section, read_json, validate
+from rsvib_torch.checks.arrays import Array, channels_appear_last
+from rsvib_torch.checks.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
@@ -44,7 +43,7 @@ def open_npy(path: Path) -> BlockReader:
         )
 
 
-def write_npy(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_npy(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a file frame by frame, channels second; arguments as in ``StackFormat.write``."""
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(info.dtype)), "fortran_order": False, "shape": info.shape}
     with path.open("wb") as file:
@@ -95,7 +94,7 @@ def open_raw(path: Path) -> BlockReader:
         return contiguous_reader(path, info, sidecar.offset, dtype.newbyteorder(sidecar.byte_order))
 
 
-def write_raw(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_raw(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a file frame by frame, and its sidecar; arguments as in ``StackFormat.write``."""
     attributes = attributes_of(info)
     if "resolution_unit" in attributes:

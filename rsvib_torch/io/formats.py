@@ -10,17 +10,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from numpy.typing import NDArray
-
-from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.text import quoted
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.files.reading import Table, check_regular
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+from rsvib_torch.text import quoted
 
-Frame = NDArray[Any]
+Frame = Array
 
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
-# folder, which the caller renames when it is complete (``rsvib_torch/core/atomic.py``).
+# folder, which the caller renames when it is complete (``rsvib_torch/files/atomic.py``).
 #
 # Shapes:      frames are (H, W) or (C, H, W), channels RGB or RGBA; ``StackInfo.shape`` is (T, H, W) or (T, C, H, W),
 #              also if the file stores channels last (``StackInfo.from_stored``, ``to_stored``).
@@ -96,7 +95,7 @@ def packaged_format(
         return call
 
     named = {"write": write, "check": check}
-    functions: dict[str, Any] = {use: imported(function) for use, function in named.items() if function is not None}
+    functions: Table = {use: imported(function) for use, function in named.items() if function is not None}
     return StackFormat(name, endings, imported(open), **functions, **stated)
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.text import number_of
+from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming
+from rsvib_torch.text import number_of
 
 _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
 
@@ -25,19 +25,7 @@ _ORIENTATIONS = {
 
 
 class TimingWarning(UserWarning):
-    """The frame rate or the times in a file contradict the timing of the sensor.
-
-    Example:
-        >>> import warnings
-        >>> import rsvib_torch as rsv
-        >>> timing = rsv.SensorTiming(row_time=1 / 30000, exposure_rows=20, frame_rows=1000)  # 30 frames per second
-        >>> info = rsv.StackInfo((8, 256, 256), "uint8", 255, frame_rate=97.0)  # the file states another rate
-        >>> with warnings.catch_warnings(record=True) as caught:
-        ...     warnings.simplefilter("always")
-        ...     timing = rsv.timing_from_first_frame(timing, info)
-        >>> caught[0].category.__name__
-        'TimingWarning'
-    """
+    """The frame rate or the times in a file contradict the timing of the sensor."""
 
 
 @dataclass(frozen=True, eq=False)

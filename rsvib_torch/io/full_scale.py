@@ -1,23 +1,21 @@
 """Conversion between pixels as stored and float frames whose full scale is 1."""
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_number
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.checks.values import check_number
 
 
-def check_dtype(dtype: np.dtype[Any]) -> None:
+def check_dtype(dtype: np.dtype) -> None:
     """Raise a ``ValueError`` unless pixels of ``dtype`` are integers or floats of a supported size."""
     largest_sizes = {"u": 4, "i": 4, "f": 8}  # bytes by kind; other kinds are bool, complex, text, objects
     if dtype.itemsize > largest_sizes.get(dtype.kind, 0):
         raise ValueError(f"pixels are {dtype}; expected integers of up to 32 bits, or floats of up to 64")
 
 
-def known_full_scale(dtype: np.dtype[Any], stated: object = None) -> float | None:
+def known_full_scale(dtype: np.dtype, stated: object = None) -> float | None:
     """Full scale of pixels of ``dtype``: the stated value, or 255 for ``uint8``; None if unknown, and for floats."""
     if dtype.kind == "f":
         return None
@@ -30,7 +28,7 @@ def known_full_scale(dtype: np.dtype[Any], stated: object = None) -> float | Non
     return value
 
 
-def required_full_scale(full_scale: float | None, dtype: np.dtype[Any], name: object) -> float:
+def required_full_scale(full_scale: float | None, dtype: np.dtype, name: object) -> float:
     """The count of integers that corresponds to 1.0; the error names a file or an argument if it is unknown."""
     if full_scale is None:
         raise ValueError(
@@ -47,7 +45,7 @@ def beyond_full_scale(largest: int, full_scale: float) -> str:
     return f"counts reach {largest}, beyond full_scale={full_scale:g}; pass a full_scale of at least the largest count"
 
 
-def full_scale_of_counts(counts: NDArray[Any], full_scale: float | None, name: str) -> float:
+def full_scale_of_counts(counts: Array, full_scale: float | None, name: str) -> float:
     """As ``required_full_scale``; a ``ValueError`` as well if counts exceed the full scale."""
     full_scale = required_full_scale(full_scale, counts.dtype, name)
     largest = int(counts.max())
@@ -56,7 +54,7 @@ def full_scale_of_counts(counts: NDArray[Any], full_scale: float | None, name: s
     return full_scale
 
 
-def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, nodata: float | None = None) -> Tensor:
+def counts_to_frames(counts: Array, full_scale: float | None, name: str, nodata: float | None = None) -> Tensor:
     """Convert pixels as stored to float32 frames; floats keep their values, and pixels of the value ``nodata`` are NaN.
 
     ``name`` is the file or argument, for messages.
@@ -78,9 +76,7 @@ def counts_to_frames(counts: NDArray[Any], full_scale: float | None, name: str, 
     return floats.div_(full_scale).to(torch.float32)
 
 
-def frames_to_counts(
-    frames: Tensor, dtype: np.dtype[Any], full_scale: float | None, nodata: float | None = None
-) -> NDArray[Any]:
+def frames_to_counts(frames: Tensor, dtype: np.dtype, full_scale: float | None, nodata: float | None = None) -> Array:
     """Convert frames of full scale 1 to pixels to store: integers are scaled, rounded and clipped; floats are kept.
 
     NaN is stored as ``nodata``; without it, frames that are not finite cannot be stored as integers.

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rsvib_torch.core.checks import needed_package
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.checks.values import needed_package
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
@@ -70,10 +71,10 @@ def _check_sizes(dataset: Any, file_size: int) -> int:
     return chunk
 
 
-def _times_beside(file: Any, dataset: Any, count: int) -> dict[str, Any]:
+def _times_beside(file: Any, dataset: Any, count: int) -> Table:
     """Times and frame rate in datasets beside the frames, or in attributes of their group or of the file."""
     h5py = _h5py()
-    found: dict[str, Any] = {}
+    found: Table = {}
     for group in (file, dataset.parent):
         members = {
             name: group[name]
@@ -104,7 +105,7 @@ def open_hdf5(path: Path) -> BlockReader:
         return array_reader(path, info, dataset, chunk_frames, chunk, opened.pop_all().close)
 
 
-def write_hdf5(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_hdf5(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a file with a contiguous dataset, frame by frame; arguments as in ``StackFormat.write``.
 
     HDF5 writes the header only: it ends the process if the disk is full when a file with pixels is closed.

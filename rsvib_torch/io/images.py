@@ -15,11 +15,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag, readable_stack
@@ -71,7 +72,7 @@ def _png_info(image: Any, head: bytes, file_size: int) -> StackInfo:
     return StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
 
 
-def decode_image(path: Path) -> NDArray[Any]:
+def decode_image(path: Path) -> Array:
     """Pixels of a PNG or JPEG file as stored, without its orientation: (H, W), or (C, H, W) in RGB or RGBA."""
     is_png = path.suffix.lower() == ".png"
     with readable_stack(path, "PNG" if is_png else "JPEG"):
@@ -88,7 +89,7 @@ def decode_image(path: Path) -> NDArray[Any]:
         return np.moveaxis(pixels[..., (2, 1, 0, 3)[: pixels.shape[-1]]] if is_png else pixels, -1, 0)
 
 
-def encode_png(path: Path, frame: NDArray[Any], info: StackInfo) -> None:
+def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
     """Write one frame (H, W) or (C, H, W).
 
     Full scale, resolution and orientation are stored as chunks ``tEXt``, ``pHYs`` and ``eXIf``.
@@ -169,7 +170,7 @@ def _read_info(file: Path) -> StackInfo:
     return reader.info
 
 
-def _read_frame(file: Path) -> NDArray[Any]:
+def _read_frame(file: Path) -> Array:
     if file.suffix.lower() not in _TIFF:
         return decode_image(file)
     with closing(open_tiff(file)) as reader:
@@ -210,7 +211,7 @@ def open_images(path: Path) -> BlockReader:
     if path.is_dir() and first[1].suffix.lower() in _TIFF:
         stack = replace(stack, files=tuple(files))
 
-    def read(index: int, _: int) -> NDArray[Any]:
+    def read(index: int, _: int) -> Array:
         try:
             if index in damaged:
                 raise damaged[index]
@@ -233,13 +234,13 @@ def _frame_names(info: StackInfo) -> list[str]:
     return [f"frame_{index:0{digits}d}{_ending(info)}" for index in range(info.shape[0])]
 
 
-def _write_file(file: Path, info: StackInfo, frame: NDArray[Any], source: Path | None = None) -> None:
+def _write_file(file: Path, info: StackInfo, frame: Array, source: Path | None = None) -> None:
     """Write one frame of a stack; a TIFF file keeps what that of the input, ``source``, states."""
     one = replace(info.with_frames(1), frame_times=None, frame_rate=None, metadata={})
     if file.suffix.lower() in _PNG:
         encode_png(file, np.asarray(frame, dtype=info.dtype), one)
         return
-    storage: dict[str, Any] = {}
+    storage: Table = {}
     with suppress(ValueError):  # a damaged file, whose frame is written as one without data
         if source is not None:
             like, storage = _read_info(source), storage_of(source)
@@ -249,12 +250,12 @@ def _write_file(file: Path, info: StackInfo, frame: NDArray[Any], source: Path |
     write_tiff(file, one, iter([frame]), None, storage)
 
 
-def write_image(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_image(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a PNG file of one frame; arguments as in ``StackFormat.write``."""
     _write_file(path, info, next(frames))
 
 
-def write_folder(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_folder(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a folder with one file per frame; arguments as in ``StackFormat.write``."""
     path.mkdir()
     sources = info.files or [None] * info.shape[0]

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import check_fields, checked_methods
-from rsvib_torch.core.presentation import Summarised
-from rsvib_torch.core.text import one_line
+from rsvib_torch.checks.arguments import check_fields, checked_methods
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.text import one_line
 
 # Endings of videos: of those that are written with H.264 and FFV1, and of those that are only read.
 H264, FFV1 = (".mp4", ".mov", ".m4v"), (".mkv",)
@@ -196,13 +196,13 @@ class StackInfo(Summarised):
             invalid.add("image")
         return {name: None if tag is None or tag.scope in invalid else tag for name, tag in self.metadata.items()}
 
-    def from_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
+    def from_stored(self, frame: Array) -> Array:
         """Convert a frame from the axis order and byte order of the file to (H, W) or (C, H, W) in native order."""
         if self.stored_axes == "THWC":
             frame = np.moveaxis(frame, -1, 0)
         return frame.astype(frame.dtype.newbyteorder("="), copy=False)
 
-    def to_stored(self, frame: NDArray[Any]) -> NDArray[Any]:
+    def to_stored(self, frame: Array) -> Array:
         """Convert a frame (H, W) or (C, H, W) to the axis order and data type of the file."""
         if self.stored_axes == "THWC":
             frame = np.moveaxis(frame, 0, -1)
@@ -214,7 +214,7 @@ class FrameReader(Protocol):
 
     info: StackInfo
 
-    def frame(self, index: int) -> NDArray[Any]:
+    def frame(self, index: int) -> Array:
         """Pixels of a frame as stored: (H, W) or (C, H, W), in ``info.dtype``; ``FrameError`` if it is damaged."""
 
     def close(self) -> None:
@@ -243,11 +243,9 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
 
 @contextmanager
 def readable_stack(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception of a decoder into a one-line ``ValueError``: a damaged file can raise every type.
+    """Convert any exception of a decoder of a ``kind`` of files, which may have every type, into a ``ValueError``.
 
-    Args:
-        path: The file or folder that is opened. A file without read permission remains an ``OSError``.
-        kind: Name of the format for the message.
+    A file without read permission remains an ``OSError``.
     """
     if not path.is_dir():
         with path.open("rb"):

@@ -5,17 +5,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import FramesLike
-from rsvib_torch.core.free_memory import check_fits
-from rsvib_torch.core.progress import steps
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import Array, FramesLike
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
@@ -38,7 +37,6 @@ def open_stack(path: PathLike) -> FrameReader:
         An object with ``info``, ``frame(index)`` and ``close()``.
 
     Raises:
-        OSError: If the file cannot be opened.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
 
@@ -98,7 +96,6 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
 
     Raises:
-        OSError: If the file cannot be opened.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         ValueError: If it is damaged, its frames differ in size, the full scale is unknown or exceeded, or the frames do
             not fit into the free memory.
@@ -119,7 +116,7 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
 
 def _read_pixels(
     paths: Sequence[PathLike], full_scale: float | None, *, as_counts: bool
-) -> tuple[NDArray[Any], float | None, StackInfo]:
+) -> tuple[Array, float | None, StackInfo]:
     """Frames of all files, (T, H, W) or (T, C, H, W), their full scale, and what the first file states.
 
     Integers are returned as stored if wanted ``as_counts``, and the files have no nodata value: then NaN marks those
@@ -127,7 +124,7 @@ def _read_pixels(
     """
     if not paths:
         raise ValueError("path must contain at least one file, got an empty list")
-    parts: list[NDArray[Any]] = []
+    parts: list[Array] = []
     infos: list[StackInfo] = []
     count = 0  # frames of all files
     for path in paths:

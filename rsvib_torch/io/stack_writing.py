@@ -3,18 +3,16 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Channels, FramesLike, as_tensor, channel_axis
-from rsvib_torch.core.atomic import check_target, check_tree, check_writable, whole
-from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.progress import steps
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import Array, Channels, FramesLike, as_tensor, channel_axis
+from rsvib_torch.checks.values import check_choice
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.files.atomic import check_target, check_tree, check_writable, whole
+from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
@@ -139,7 +137,7 @@ def metadata_not_kept(
 
 
 def write_frames(
-    form: StackFormat, path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None
+    form: StackFormat, path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None
 ) -> None:
     """Write a stack from its frames as stored; it gets its name when it is complete and on the disk."""
     assert form.write is not None
@@ -147,7 +145,7 @@ def write_frames(
         form.write(part, info, frames, compression)
 
 
-def _counted(pixels: NDArray[Any]) -> Iterator[NDArray[Any]]:
+def _counted(pixels: Array) -> Iterator[Array]:
     """The frames of a stack, with a report of the progress."""
     advance = steps(len(pixels), "frames")
     for frame in pixels:
@@ -190,7 +188,6 @@ def write_stack(
 
     Raises:
         OSError: If the file cannot be written.
-        TypeError: If the frames are not a tensor or array of numbers.
         ValueError: If the format does not support them, the full scale is unknown, or ``path`` is the file of ``like``.
 
     Example:

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.array_attributes import attributes_of
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
@@ -98,9 +99,7 @@ def _resolution(tif: Any) -> tuple[float, float, str] | None:
     return (x / per_x, y / per_y, unit) if unit is not None and min(x, per_x, y, per_y) > 0 else None
 
 
-def _info(
-    tif: Any, shape: tuple[int, ...], dtype: np.dtype[Any], photometric: Any, *, channels_last: bool
-) -> StackInfo:
+def _info(tif: Any, shape: tuple[int, ...], dtype: np.dtype, photometric: Any, *, channels_last: bool) -> StackInfo:
     """A stack of that shape, with what the first page states."""
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
@@ -170,7 +169,7 @@ def _page_reader(
     """
     count = len(complete) // info.shape[0]
 
-    def read(first: int, _: int) -> NDArray[Any]:
+    def read(first: int, _: int) -> Array:
         numbers = range(first * count, (first + 1) * count)
         if not all(complete[number] for number in numbers):
             raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
@@ -223,8 +222,8 @@ def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader
     if not all(complete):
         raise ValueError("truncated: its pages are not in the order of the frames")
 
-    def read(*_: int) -> NDArray[Any]:
-        pixels: NDArray[Any] = series.asarray(maxworkers=1)
+    def read(*_: int) -> Array:
+        pixels: Array = series.asarray(maxworkers=1)
         return pixels.reshape(shape).transpose(order).reshape(info.shape)
 
     return BlockReader(path, info, read, T, T * info.frame_bytes, close)  # a copy if axes are reordered
@@ -280,7 +279,7 @@ def open_tiff(path: Path) -> BlockReader:
         return reader
 
 
-def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
+def _layout(info: StackInfo) -> tuple[StackInfo, Table]:
     """The stack as it is stored, and options of ``tifffile.imwrite``: three or four channels are stored last (RGB)."""
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
     stored = replace(info, channels_last=colour)
@@ -298,7 +297,7 @@ def _layout(info: StackInfo) -> tuple[StackInfo, dict[str, Any]]:
     return stored, {"shape": stored.stored_shape, "dtype": info.dtype, **options}
 
 
-def storage_of(path: Path) -> dict[str, Any]:
+def storage_of(path: Path) -> Table:
     """Tiles and compression of a TIFF file as options of ``write_tiff``; zlib replaces a compression with loss."""
     with readable_stack(path, "TIFF"), tifffile.TiffFile(path) as tif:
         page = tif.pages.first
@@ -311,7 +310,7 @@ def storage_of(path: Path) -> dict[str, Any]:
 def write_tiff(
     path: Path,
     info: StackInfo,
-    frames: Iterator[NDArray[Any]],
+    frames: Iterator[Array],
     compression: str | None,
     storage: Mapping[str, Any] = {},
 ) -> None:

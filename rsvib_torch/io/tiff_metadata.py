@@ -11,6 +11,7 @@ from typing import Any
 
 import tifffile
 
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_info import Scope, StackInfo, Tag
 
 _DESCRIPTION, _IMAGEJ_COUNTS, _IMAGEJ = 270, 50838, 50839  # codes of tags
@@ -39,14 +40,14 @@ _STORAGE = {32995, 32996, 32997, 32998, _IMAGEJ_COUNTS, _IMAGEJ}
 _SUBIFDS = 330
 
 
-def json_description(tif: Any) -> dict[str, Any]:
+def json_description(tif: Any) -> Table:
     """What tifffile or this package states in the description of the first page; empty if there is nothing."""
     page = tif.pages.first
     lines = [line for line in page.description.splitlines() if line.startswith(_IMAGEJ_KEY)]
     return _parsed(page.shaped_description or (lines[0].removeprefix(_IMAGEJ_KEY) if lines else ""))
 
 
-def _parsed(text: str) -> dict[str, Any]:
+def _parsed(text: str) -> Table:
     try:
         values = json.loads(text)
     except ValueError:
@@ -132,10 +133,10 @@ def _text(text: str, scope: Scope) -> Tag:
     return Tag(_DESCRIPTION, 2, 0, text, True, scope)
 
 
-def writer_options(info: StackInfo, description: Mapping[str, Any]) -> dict[str, Any]:
+def writer_options(info: StackInfo, description: Mapping[str, Any]) -> Table:
     """Options of ``tifffile.imwrite`` that store the metadata of a stack, and a description as JSON."""
     extratags: list[tuple[Any, ...]] = []
-    options: dict[str, Any] = {"metadata": dict(description), "extratags": extratags}
+    options: Table = {"metadata": dict(description), "extratags": extratags}
     for name, tag in info.metadata.items():
         if tag is None:
             continue

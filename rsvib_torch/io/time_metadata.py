@@ -14,7 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 from PIL import ExifTags, Image
 
-from rsvib_torch.core.text import one_line
+from rsvib_torch.files.reading import Table
+from rsvib_torch.text import one_line
 
 _SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
 
@@ -33,7 +34,7 @@ _DESCRIBED_TIME = re.compile(
 )
 
 
-def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> dict[str, Any]:
+def _time_fields(times: Iterable[float | None], count: int, error: float, source: str) -> Table:
     """Fields of ``count`` times in seconds; none unless all are known and strictly increasing."""
     known = [time for time in times if time is not None and np.isfinite(time)]
     if len(known) != count or any(later <= earlier for earlier, later in pairwise(known)):
@@ -58,7 +59,7 @@ def camera_name(make: object, model: object) -> str | None:
     return None if not name else name if repeated else f"{maker} {name}"
 
 
-def time_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+def time_attributes(attributes: Mapping[str, Any]) -> Table:
     """Those attributes whose names are used for times, their unit, and the frame rate."""
     return {
         name: value
@@ -67,13 +68,13 @@ def time_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def times_of_attributes(attributes: Mapping[str, Any], count: int) -> dict[str, Any]:
+def times_of_attributes(attributes: Mapping[str, Any], count: int) -> Table:
     """Times of ``count`` frames, and frame rate, of HDF5 and Zarr attributes such as ``timestamps_ms``, ``frame_rate``.
 
     The unit of times is that of the attribute with ``_unit`` or ``_units`` appended, or the ending of the name;
     otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second. Other attributes are ignored.
     """
-    fields: dict[str, Any] = {}
+    fields: Table = {}
     for name, value in attributes.items():
         if _RATE_NAME.fullmatch(name) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
             rate = float(np.asarray(value).item())
@@ -112,7 +113,7 @@ def _seconds_of_date(text: object, fraction: object = "") -> float | None:
     return moment.replace(tzinfo=UTC).timestamp() if "." in date else None
 
 
-def exif_fields(data: bytes) -> dict[str, Any]:
+def exif_fields(data: bytes) -> Table:
     """Orientation, camera and time of one image from its EXIF metadata."""
     exif = Image.Exif()
     try:
@@ -134,7 +135,7 @@ def exif_fields(data: bytes) -> dict[str, Any]:
     return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 
-def merged_times(infos: Iterable[Any]) -> dict[str, Any]:
+def merged_times(infos: Iterable[Any]) -> Table:
     """Times of a folder from the times of its files: the ``StackInfo`` of each, None for those that are damaged."""
     infos = list(infos)
     times = [info.frame_times[0] if info is not None and info.frame_times else None for info in infos]
@@ -151,7 +152,7 @@ def _described_time(text: str) -> float | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _ome_fields(text: str, count: int) -> dict[str, Any]:
+def _ome_fields(text: str, count: int) -> Table:
     """Times of the planes (``DeltaT``) or their interval (``TimeIncrement``) in the OME-XML of an image."""
     pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
     if pixels is None:
@@ -169,7 +170,7 @@ def _ome_fields(text: str, count: int) -> dict[str, Any]:
     return fields
 
 
-def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> dict[str, Any]:
+def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> Table:
     """Times of ``count`` frames or frame rate of a TIFF file.
 
     They are stated by the ``metadata`` that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
@@ -185,7 +186,7 @@ def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> dict[str, A
         return {}
 
 
-def _times_of_other_programs(tif: Any, count: int) -> dict[str, Any]:
+def _times_of_other_programs(tif: Any, count: int) -> Table:
     if tif.ome_metadata:
         return _ome_fields(tif.ome_metadata, count)
     interval = (tif.imagej_metadata or {}).get("finterval")

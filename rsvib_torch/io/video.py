@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.checks import needed_package
-from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.checks.values import needed_package
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.stack_info import H264, VIDEO, FrameError, StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import camera_name
 

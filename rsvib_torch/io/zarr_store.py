@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rsvib_torch.core.checks import needed_package
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.checks.values import needed_package
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
@@ -78,7 +78,7 @@ def open_zarr(path: Path) -> BlockReader:
 _DIMENSIONS = {"T": "frame", "C": "channel", "H": "y", "W": "x"}
 
 
-def write_zarr(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_zarr(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a group with the array ``frames``, one chunk per frame, as ``xarray.open_zarr`` reads it.
 
     Arguments as in ``StackFormat.write``.

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checked_methods
-from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.core.text import quoted
+from rsvib_torch.checks.arguments import check_broadcast, checked_methods
+from rsvib_torch.checks.values import check_number, check_whole_number
+from rsvib_torch.text import quoted
 
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees
 
@@ -182,11 +182,6 @@ class Camera:
 
     def factors(self, x: Tensor, y: Tensor, axes: int) -> Tensor:
         """Displacement (S, 2, A) by unit components at positions (S) in px from the centre, for small angles.
-
-        Args:
-            x: px, position at rest.
-            y: The same along y.
-            axes: Number A of components, 2 to 4.
 
         Example:
             >>> Camera(1000.0).factors(torch.tensor(500.0), torch.tensor(0.0), 3).tolist()

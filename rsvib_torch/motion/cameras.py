@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
-from rsvib_torch.core.checks import check_number, check_whole_number, described
-from rsvib_torch.core.text import measured_text, number_of, quoted
+from rsvib_torch.checks.values import check_number, check_whole_number, described
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.text import measured_text, number_of, quoted
 
 # Ratio of heights; of pairs of modes in the table with equal aspect and rate, 21 of 24 up to this ratio have the same
 # readout within 10 %, and 13 of 24 above it. Of pairs of one size at different rates, only 99 of 151 do.

@@ -8,8 +8,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import described
-from rsvib_torch.core.presentation import (
+from rsvib_torch.checks.values import described
+from rsvib_torch.files.reading import Table
+from rsvib_torch.motion.vibration import (
+    Vibration,
+    VibrationStd,
+    image_motion_line,
+    tone_head,
+    tone_places,
+    tone_rows,
+)
+from rsvib_torch.results.presentation import (
     AXIS_NAMES,
     PHYSICAL_HEAD,
     JudgedResult,
@@ -20,15 +29,7 @@ from rsvib_torch.core.presentation import (
     plain_values,
     verdict_table,
 )
-from rsvib_torch.core.text import measured_text, text_table, wrapped
-from rsvib_torch.motion.vibration import (
-    Vibration,
-    VibrationStd,
-    image_motion_line,
-    tone_head,
-    tone_places,
-    tone_rows,
-)
+from rsvib_torch.text import measured_text, text_table, wrapped
 
 _UNITS_OF_AXES = ("px", "px", "rad", "relative")  # in names of columns
 
@@ -44,17 +45,7 @@ class DetectedVibration(
 ):
     """A detection without its offset curve: everything that restoration needs. A batch leads all tensors.
 
-    Attributes:
-        vibration: The vibration in image axes; an axis without a significant tone has amplitude 0.
-        std: Standard deviations of its parameters, given the tones that were found; infinite where unknown.
-        std_if_hidden_tone: The same if the record may contain a further tone, which few frames cannot exclude; None:
-            not larger.
-        gain: (..., 2, K) offset gain of Eq. (7) from displacement to offset between the first two frames.
-        residual: (..., 2) px, mean absolute difference of measured and fitted offsets.
-        reliable: (..., 2) bool, verdict for each axis (x, y).
-        findings: Each ``Reason`` against each axis that is not reliable; a tuple of those for a batch. ``reasons`` has
-            their texts.
-        assumptions: What the frames cannot contradict, one sentence for each; a tuple of those for a batch.
+    The fields are those of ``DetectionResult``.
     """
 
     _MADE_BY: ClassVar[str] = "from detect_vibration; of other results, pass .motion"  # for errors about arguments
@@ -118,7 +109,7 @@ class DetectedVibration(
 
         Example:
             >>> import rsvib_torch as rsv
-            >>> from rsvib_torch.evaluation import example_frames
+            >>> from rsvib_torch.datasets import example_frames
             >>> frames, timing, _ = example_frames()
             >>> table = rsv.detect_vibration(frames, timing).table(pixel_size=5e-6)
             >>> table["axis"], table["tone"], [round(value, 1) for value in table["amplitude_um"]]
@@ -126,15 +117,15 @@ class DetectedVibration(
         """
         return joined_columns(self.tone_lines(pixel_size))
 
-    def tone_lines(self, pixel_size: float | None = None) -> list[dict[str, Any]]:
+    def tone_lines(self, pixel_size: float | None = None) -> list[Table]:
         """Lines of ``table``."""
         pixel_size = check_pixel_size(pixel_size)
         vibration, hidden = self.vibration, self.std_if_hidden_tone or self.std
-        lines: list[dict[str, Any]] = []
+        lines: list[Table] = []
         for at, _ in tone_places(vibration):
             *batch, axis, tone = at
             found, unit = float(vibration.amplitude[at]) > 0, _UNITS_OF_AXES[axis]
-            line: dict[str, Any] = {"index": ", ".join(map(str, batch))} if batch else {}
+            line: Table = {"index": ", ".join(map(str, batch))} if batch else {}
             middle = self._middle_time(tuple(batch))
             line |= {} if middle is None else {"middle_time_s": middle}
             line |= {"axis": AXIS_NAMES[axis], "tone": found * (tone + 1)}

@@ -9,11 +9,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_broadcast, checked_methods
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.presentation import Result
+from rsvib_torch.checks.arguments import check_broadcast, checked_methods
+from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
+from rsvib_torch.results.presentation import Result
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,25 +44,13 @@ class Motion(Result, ABC):
 
     @abstractmethod
     def displacement(self, times: Tensor) -> Tensor:
-        """Displacement D(t) in px.
-
-        Args:
-            times: Seconds, any shape S; for a batch the batch dimensions (or 1) lead: (B, ...).
-
-        Returns:
-            float64 tensor of shape (S, axes).
-        """
+        """Displacement D(t) in px, (S, axes), at times S in seconds."""
 
     @abstractmethod
     def mean_displacement(self, starts: Tensor, exposure_time: float | Tensor) -> Tensor:
-        """Mean displacement over exposures [start, start + T_e] in px (Eq. 2 of Liu et al. 2023).
+        """Mean displacement (S, axes) over exposures [start, start + T_e] in px (Eq. 2 of Liu et al. 2023).
 
-        Args:
-            starts: Exposure starts in seconds, shape S as in ``displacement``.
-            exposure_time: T_e in seconds, a number or a tensor that broadcasts against ``starts``.
-
-        Returns:
-            float64 tensor of shape (S, axes).
+        The exposure time in s is a number or a tensor that broadcasts against the starts S.
         """
 
     @abstractmethod
@@ -112,10 +100,7 @@ class Motion(Result, ABC):
         return self.num_axes == 2 and self.camera is None
 
     def attitude(self, times: Tensor) -> Tensor:
-        """Rotation of the camera in rad, see ``Camera``; times as in ``displacement``.
-
-        Returns:
-            (S, 3) float64: pitch, yaw and roll, right-handed about x (right), y (down) and z (forward).
+        """Rotation (S, 3) of the camera in rad at times S: pitch, yaw and roll, see ``Camera``.
 
         Raises:
             ValueError: If the motion has no camera.
@@ -131,29 +116,14 @@ class Motion(Result, ABC):
         return self.camera.attitude(self.displacement(times))
 
     def path(self, starts: Tensor, delays: Tensor) -> Tensor:
-        """Displacement during exposures in px.
-
-        Args:
-            starts: Exposure starts in seconds, shape S as in ``displacement``.
-            delays: (N,) s, times from the start of an exposure.
-
-        Returns:
-            float64 tensor of shape (S, N, axes).
-        """
+        """Displacement (S, N, axes) in px at delays (N,) in s from the starts S of exposures."""
         return self.displacement(starts.to(dtype=torch.float64, device=self.device)[..., None] + delays)
 
     def offset(self, starts: Tensor, later_starts: Tensor, exposure_time: float) -> Tensor:
-        """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4).
+        """Offset: mean displacement of the later exposure minus that of the earlier one, in px (Eq. 4), (S, axes).
 
-        Eq. (4) as printed gives this sign on its right-hand side, and the opposite one on its left-hand side.
-
-        Args:
-            starts: Exposure starts in frame p, seconds, shape S.
-            later_starts: Exposure starts of the same scene rows in frame p + 1, shape S.
-            exposure_time: T_e in seconds.
-
-        Returns:
-            float64 tensor of shape (S, axes).
+        Eq. (4) as printed gives this sign on its right-hand side, and the opposite one on its left-hand side. Starts S
+        in s are those of the same scene rows in frames p and p + 1.
         """
         check_broadcast(starts=starts, later_starts=later_starts)
         return self.mean_displacement(later_starts, exposure_time) - self.mean_displacement(starts, exposure_time)

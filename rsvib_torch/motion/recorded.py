@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.number_table import rows_of_numbers, text_lines
-from rsvib_torch.core.reading import check_regular
-from rsvib_torch.core.text import one_line
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.values import check_number
+from rsvib_torch.files.number_table import rows_of_numbers, text_lines
+from rsvib_torch.files.reading import check_regular
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.options import AccelerationUnit, MotionUnit, TimeUnit
+from rsvib_torch.text import one_line
 
 _RADIANS = {
     "rad": 1.0,
@@ -58,7 +58,6 @@ def read_motion(
         The motion without its mean, with the times of the file in seconds.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If a column is missing, a value is not a number, times do not increase or have gaps, or values or
             time steps indicate another unit; the message names the line of the file.
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from rsvib_torch.checks.arrays import Array
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
@@ -24,8 +24,6 @@ _KNOT_STEP = 0.05  # of the time between the knots of a free motion; white noise
 _BESIDE = 16  # rows beyond half of the frame on each side, for which the motion is known; the sensor has none there
 _CLOSE = 1e-6  # px, change of a position in the last round
 _ROUNDS = 60  # at most; 5 suffice for 5 px at 100 Hz and 20 us per row
-
-Array = NDArray[Any]
 
 
 def recorded_offsets(

@@ -9,15 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers, checked_methods
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.presentation import axis_head, axis_rows
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, gauss_legendre
-from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.checks.arguments import as_numbers, checked_methods
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME
 from rsvib_torch.motion.vibration import TensorLike, Vibration
+from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, gauss_legendre
+from rsvib_torch.results.presentation import axis_head, axis_rows
+from rsvib_torch.text import measured_text, text_table
 
 MAX_DISPLACEMENT = 1e9  # px; image motion of 1e5 px/s for three hours
 MAX_KNOTS = 100_000_000  # 1.6 GB of coefficients; a gyroscope with 8 kHz for three hours
@@ -30,8 +30,7 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
     """A free spline with tones: ``D(t) = sum_k A_k sin(2 pi f_k t + phi_k) + v t + a t^2 / 2 + R(t)``.
 
     ``R(t) = sum_n c_n B((t - start) / spacing - n + 1)`` is a cubic B-spline; before its first and after its last knot
-    it keeps its end values. It is accepted wherever a ``Vibration`` is accepted. ``amplitude``, ``frequency``,
-    ``period``, ``phase``, ``image_motion`` and ``image_acceleration`` are those of ``tones``.
+    it keeps its end values. It is accepted wherever a ``Vibration`` is accepted.
 
     Args:
         coefficients: c in px, (2, N) or (..., 2, N), N >= 4, axes (x, y); 3 or 4 instead of 2 for (x, y, roll) and
@@ -43,7 +42,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
 
     Raises:
         ValueError: If shapes do not fit or a value is not finite.
-        TypeError: If ``start`` or ``spacing`` is not a number.
 
     Example:
         >>> times = torch.linspace(0, 0.1, 41, dtype=torch.float64)
@@ -201,36 +199,6 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         return self.coefficients.device
 
     @property
-    def amplitude(self) -> Tensor:
-        """Amplitude of the tones in px, (..., 2, K)."""
-        return self.tones.amplitude
-
-    @property
-    def frequency(self) -> Tensor:
-        """Frequency of the tones in Hz, (..., 2, K)."""
-        return self.tones.frequency
-
-    @property
-    def period(self) -> Tensor:
-        """Period of the tones in seconds, (..., 2, K)."""
-        return self.tones.period
-
-    @property
-    def phase(self) -> Tensor:
-        """Phase of the tones in rad, (..., 2, K)."""
-        return self.tones.phase
-
-    @property
-    def image_motion(self) -> Tensor:
-        """Velocity of the image motion in px/s, (..., 2)."""
-        return self.tones.image_motion
-
-    @property
-    def image_acceleration(self) -> Tensor:
-        """Acceleration of the image motion in px/s^2, (..., 2)."""
-        return self.tones.image_acceleration
-
-    @property
     def end(self) -> float:
         """Time of the last knot in seconds."""
         return self.start + (self.coefficients.shape[-1] - 3) * self.spacing
@@ -251,17 +219,17 @@ class FreeMotion(Motion, units={"coefficients": "px", "start": "s", "spacing": "
         """
         check_number("offset", offset)
         check_number("scale", scale, above=0.0)
-        size = self.coefficients.new_tensor(gain)
+        size, old = self.coefficients.new_tensor(gain), self.tones
         tones = replace(
-            self.tones,
-            amplitude=self.amplitude * size[:, None],
-            frequency=self.frequency * scale,
-            phase=self.phase + 2 * math.pi * self.frequency * offset,
-            image_motion=size * (self.image_motion + self.image_acceleration * offset) * scale,
-            image_acceleration=size * self.image_acceleration * scale**2,
-            image_shift=size * self.tones.image_shift,
+            old,
+            amplitude=old.amplitude * size[:, None],
+            frequency=old.frequency * scale,
+            phase=old.phase + 2 * math.pi * old.frequency * offset,
+            image_motion=size * (old.image_motion + old.image_acceleration * offset) * scale,
+            image_acceleration=size * old.image_acceleration * scale**2,
+            image_shift=size * old.image_shift,
         )
-        moved = self.image_motion * offset + 0.5 * self.image_acceleration * offset**2
+        moved = old.image_motion * offset + 0.5 * old.image_acceleration * offset**2
         rest = (self.coefficients + moved[..., None]) * size[:, None]
         return FreeMotion(rest, (self.start - offset) / scale, self.spacing / scale, tones, self.camera)
 

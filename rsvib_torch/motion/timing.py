@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import model_validator
 
-from rsvib_torch.core.checks import check_choice, check_number, check_whole_number, described
-from rsvib_torch.core.reading import read_toml
-from rsvib_torch.core.validation import Section, checked, validate
+from rsvib_torch.checks.validation import Section, checked, validate
+from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
+from rsvib_torch.files.reading import read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -59,7 +59,6 @@ class SensorTiming:
     Raises:
         ValueError: If a value is out of range, or indicates another unit (a row time over 10 ms, a frame period
             over 10 s).
-        TypeError: If a value is not a number.
 
     Example:
         >>> timing = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -115,7 +114,7 @@ class SensorTiming:
         object.__setattr__(self, "frame_rows", frame_rows)
         object.__setattr__(self, "scan_axis", _SCAN_AXES[self.scan_axis])
         if self.frame_start_times is not None:
-            from rsvib_torch.core.arguments import as_numbers  # noqa: PLC0415
+            from rsvib_torch.checks.arguments import as_numbers  # noqa: PLC0415
 
             times = as_numbers("frame_start_times", self.frame_start_times).flatten().tolist()
             starts = tuple(check_number("frame_start_times", start) for start in times)
@@ -138,18 +137,9 @@ class SensorTiming:
         readout_direction: Literal["forward", "reverse"] = "forward",
         frame_start_times: Sequence[float] | Tensor | None = None,
     ) -> SensorTiming:
-        """The timing from the exposure time and the frame rate: ``N_e = T_e / T_row``, ``m = 1 / (rate T_row)``.
+        """The timing from the exposure time in s and the frame rate: ``N_e = T_e / T_row``, ``m = 1 / (rate T_row)``.
 
-        Args:
-            row_time: As in ``SensorTiming``.
-            exposure_time: T_e in seconds.
-            frame_rate: Frames per second of the sensor.
-            scan_axis: As in ``SensorTiming``.
-            readout_direction: As in ``SensorTiming``.
-            frame_start_times: As in ``SensorTiming``.
-
-        Raises:
-            ValueError: As ``SensorTiming``.
+        Other arguments and errors are those of ``SensorTiming``.
 
         Example:
             >>> timing = SensorTiming.from_seconds(row_time=20e-6, exposure_time=1 / 500, frame_rate=30)
@@ -165,11 +155,7 @@ class SensorTiming:
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
         """The timing in the table ``[sensor]`` of a configuration file, as ``rsvib init`` writes it.
 
-        Args:
-            path: The TOML file; other tables are not read.
-
         Raises:
-            OSError: If the file cannot be opened.
             ValueError: If it is not TOML, or a key of ``[sensor]`` is missing, unknown or has a wrong type or value.
 
         Example:
@@ -231,17 +217,14 @@ class SensorTiming:
         return 1.0 / self.frame_period
 
     def frame_starts(self, num_frames: int, device: torch.device | str | None = None) -> Tensor:
-        """Exposure start of the first row of the first ``num_frames`` frames, in seconds.
-
-        Returns:
-            float64 tensor of shape (num_frames,).
+        """Exposure start (num_frames,) of the first row of the first frames, in seconds, float64.
 
         Raises:
             ValueError: If ``frame_start_times`` has fewer than ``num_frames`` entries.
         """
         import torch  # noqa: PLC0415
 
-        from rsvib_torch.core.arguments import check_device  # noqa: PLC0415
+        from rsvib_torch.checks.arguments import check_device  # noqa: PLC0415
 
         count = check_whole_number("num_frames", num_frames, at_least=0, at_most=MAX_FRAMES)
         device = check_device("device", "cpu" if device is None else device)
@@ -252,11 +235,7 @@ class SensorTiming:
         return torch.tensor(self.frame_start_times[:num_frames], dtype=torch.float64, device=device)
 
     def row_starts(self, num_frames: int, num_rows: int, device: torch.device | str | None = None) -> Tensor:
-        """Exposure start of every row of every frame, in seconds.
-
-        Returns:
-            float64 tensor of shape (num_frames, num_rows); row 0 is the row read first.
-        """
+        """Exposure start (num_frames, num_rows) of every row, in seconds, float64; row 0 is the row read first."""
         import torch  # noqa: PLC0415
 
         starts = self.frame_starts(num_frames, device)
@@ -388,10 +367,6 @@ class RowTiming(SensorTiming):
 
     ``SensorTiming.in_row_order`` returns it. Functions that work on frames, offsets or motions in row order take it
     instead of a ``SensorTiming``, so that a type checker refuses a timing whose frames have not been turned.
-
-    Raises:
-        ValueError: If ``scan_axis`` is not -2 or ``readout_direction`` is not ``"forward"``, in addition to the errors
-            of ``SensorTiming``.
     """
 
     def __post_init__(self) -> None:

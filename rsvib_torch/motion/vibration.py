@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.arguments import as_numbers, check_broadcast, checked_methods, checks_arguments
-from rsvib_torch.core.checks import check_number, check_whole_number
-from rsvib_torch.core.presentation import Result, axis_head, axis_rows
-from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.checks.arguments import as_numbers, check_broadcast, checked_methods, checks_arguments
+from rsvib_torch.checks.values import check_number, check_whole_number
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
+from rsvib_torch.results.presentation import Result, axis_head, axis_rows
+from rsvib_torch.text import measured_text, text_table
 
 _UNITS = {
     "amplitude": "px; of roll rad, of zoom 1",
@@ -418,7 +418,7 @@ class VibrationStd(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> std = rsv.detect_vibration(frames, timing).std
         >>> bool((std.frequency < 0.1).all())  # Hz

@@ -22,23 +22,14 @@ def template_margin(search: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class BandTask:
-    """Bands of frame pairs to be registered.
+    """Bands of frame pairs to be registered."""
 
-    Attributes:
-        first: (L, H, W) earlier frames, float32 or float64, of about zero mean.
-        second: (L, H, W) later frames.
-        coarse: (L, 2) int64 px, whole-frame offsets, axes (x, y).
-        tops: (N,) int64, first row of each band in the earlier frame.
-        height: Rows of a band.
-        search: Search range in px around the coarse offset.
-    """
-
-    first: Tensor
-    second: Tensor
-    coarse: Tensor
-    tops: Tensor
-    height: int
-    search: int
+    first: Tensor  # (L, H, W) earlier frames, float32 or float64, of about zero mean
+    second: Tensor  # (L, H, W) later frames
+    coarse: Tensor  # (L, 2) int64 px, whole-frame offsets, axes (x, y)
+    tops: Tensor  # (N,) int64, first row of each band in the earlier frame
+    height: int  # rows of a band
+    search: int  # search range in px around the coarse offset
 
     @property
     def width(self) -> int:
@@ -63,17 +54,9 @@ class BandTask:
 
 
 def take_windows(images: Tensor, tops: Tensor, lefts: Tensor, height: int, width: int) -> Tensor:
-    """Cut windows out of images; rows beyond the edge repeat the edge row, columns are clamped to the image.
+    """Windows (L, N, height, width) of images (L, H, W) from rows ``tops`` and columns ``lefts`` (L, N) int64 on.
 
-    Args:
-        images: (L, H, W).
-        tops: (L, N) int64, first row of each window.
-        lefts: (L, N) int64, first column of each window.
-        height: Rows of a window.
-        width: Columns of a window, at most W.
-
-    Returns:
-        (L, N, height, width).
+    Rows beyond the edge repeat the edge row; columns are clamped to the image.
     """
     batch, num_rows, num_columns = images.shape
     rows = (tops[..., None] + torch.arange(height, device=images.device)).clamp(0, num_rows - 1)
@@ -123,11 +106,8 @@ def whole_pixel_peak(surface: Tensor, factor: int) -> tuple[Tensor, Tensor]:
 def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """Offsets (L, N, 2) and quality (L, N) from correlation surfaces at the lags around whole-pixel shifts.
 
-    Args:
-        task: The bands.
-        shift: (L, N, 2) px, whole-pixel shifts at which the surfaces are centred.
-        surface: (L, N, 2 LAGS + 1, 2 LAGS + 1).
-        valid: (L, N) bool, bands whose whole-pixel shift is known.
+    The ``shift`` (L, N, 2) in px is the centre of each ``surface`` (L, N, 2 LAGS + 1, 2 LAGS + 1); bands (L, N) are
+    ``valid`` if it is known.
     """
     flat = surface.flatten(0, 1)
     place, _ = integer_peak(flat)
@@ -159,18 +139,13 @@ def _derivative_terms(size: int) -> tuple[Tensor, Tensor]:
 
 
 def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum of the polynomial through all samples of a surface, by Newton's method from its centre.
+    """Maximum of the polynomial through all samples of surfaces (M, A, B), by Newton's method from the centre.
 
-    The correlation of band-limited images is band limited, so that its samples at whole pixels determine it. For
-    images smoothed by a Gaussian of 1 px, the polynomial through 9 samples per axis errs by less than 0.001 px, a
-    three-point parabola by 0.05 px.
-
-    Args:
-        surface: (M, A, B) with A and B odd, the integer peak at the centre. An axis of length 1 is not searched.
-
-    Returns:
-        Position (M, 2) as (row, column) relative to the centre, NaN where no maximum lies within one pixel of it, and
-        the value there (M,); float64.
+    The correlation of band-limited images is band limited, so that its samples at whole pixels determine it. For images
+    smoothed by a Gaussian of 1 px, the polynomial through 9 samples per axis errs by less than 0.001 px, a three-point
+    parabola by 0.05 px. A and B are odd, the integer peak is at the centre; an axis of length 1 is not searched. The
+    result is the position (M, 2) as (row, column) relative to the centre, NaN where no maximum lies within one pixel of
+    it, and the value there (M,); float64.
     """
     count, rows, columns = surface.shape
     device = surface.device

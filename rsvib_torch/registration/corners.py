@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.motion.field import displacement_factors
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array, table, tensor
 
 Grey = NDArray[np.uint8]
 Points = NDArray[np.float64]  # (N, 2) px, (x, y) from the middle of the first pixel
@@ -71,11 +71,8 @@ class CornerFollower:
     def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
         """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
 
-        There are none where the mask (H, W) is 0. A mask is for corners that are not ``consistent``: frames are reduced
-        otherwise, and masks are not.
-
-        Returns:
-            The corners; None for the first frame, and if too few move together.
+        None for the first frame, and if too few move together. There are none where the mask (H, W) is 0; a mask is for
+        corners that are not ``consistent``: frames are reduced otherwise, and masks are not.
         """
         # 1. Follow corners.
         (height, width), timing = grey.shape, self._timing

@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks
-from rsvib_torch.core.fourier import fast_length
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.execution.chunking import chunks
+from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.registration.row_spectra import (
     combined,
     differences,
@@ -62,27 +62,21 @@ class _WarpedRows(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class RowGradients:
-    """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences.
+    """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences."""
 
-    Attributes:
-        images: (B, S, A + 1, L) weight times the derivatives of the scene by the A components of the motion, x and y
-            first, and the detail of the scene, less their means.
-        products: (B, S, A + 1, A + 1) float64 sums of their products.
-        residual_products: (B, S, A + 1, G) float64 sums of their products with the differences of the frames; of two
-            frames (B, S, A + 1, 1), of the first.
-        variance: (B, S) float64, noise variance of a pixel in a frame.
-        quarters: (B, S, 4, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the quarters of each row from left
-            to right, with e the residual difference between the last and the first frame. A displacement that depends
-            on the row only is equal in all of them.
-        aliasing: (B,) float64 px, expected size of the bias of displacements by aliasing (``_aliasing_bias``).
-    """
-
+    # (B, S, A + 1, L) weight times the derivatives of the scene by the A components of the motion, x and y first, and
+    # the detail of the scene, less their means
     images: Tensor
-    products: Tensor
+    products: Tensor  # (B, S, A + 1, A + 1) float64 sums of their products
+    # (B, S, A + 1, G) float64 sums of their products with the differences of the frames; of two frames (B, S, A + 1,
+    # 1), of the first
     residual_products: Tensor
-    variance: Tensor
+    variance: Tensor  # (B, S) float64, noise variance of a pixel in a frame
+    # (B, S, 4, 5) float64, sums gx gx, gx gy, gy gy, gx e and gy e over the quarters of each row from left to right,
+    # with e the residual difference between the last and the first frame. A displacement that depends on the row only
+    # is equal in all of them.
     quarters: Tensor
-    aliasing: Tensor
+    aliasing: Tensor  # (B,) float64 px, expected size of the bias of displacements by aliasing (``_aliasing_bias``)
 
     def stacks(self, index: Tensor) -> "RowGradients":
         """The gradients of some stacks; they are copied."""
@@ -115,9 +109,6 @@ def row_gradients(
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
         factors: Displacements (B, s, L, 2, A) of the pixels of some rows by unit components of the motion, x and y
             first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
-
-    Returns:
-        The gradients.
     """
     length, width = spectra.length, spectra.width
     compared = FrameComparison.of(warp, runs, visible)
@@ -184,11 +175,7 @@ def residual_products(
 ) -> Tensor:
     """Products (B, S, A + 1, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
 
-    Args:
-        warp: As in ``row_gradients``.
-        runs: As in ``row_gradients``.
-        gradients: Gradients of the scene, from a similar motion.
-        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+    The gradients are those of a similar motion; other arguments as in ``row_gradients``.
     """
     length = gradients.images.shape[-1]
 
@@ -202,13 +189,9 @@ def residual_products(
 def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) -> tuple[Tensor, Tensor]:
     """Normal equations ``H d = b`` of the residual displacement d of every scene row in each frame.
 
-    With the products P of the gradients g and the detail q, the detail is eliminated (Schur complement):
-    ``H = (P_gg - P_gq P_qg / P_qq) / sigma^2``, and b likewise.
-
-    Args:
-        products: ``gradients.residual_products``, or those of other frames from ``residual_products``.
-        gradients: Gradients of the scene.
-        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+    With the ``products`` P of the gradients g and the detail q (``gradients.residual_products``, or those of other
+    frames), the detail is eliminated (Schur complement): ``H = (P_gg - P_gq P_qg / P_qq) / sigma^2``, and b likewise.
+    ``visible`` (B, G, S) is 1 where a scene row is visible in a frame.
 
     Returns:
         H (B, S, A, A) in px^-2 and b (B, G, S, A) in px^-1, float64. ``H^-1 b`` is the displacement in px
@@ -228,32 +211,21 @@ def row_equations(products: Tensor, gradients: RowGradients, visible: Tensor) ->
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Some rows of the scene as pixels.
+    """Some rows of the scene as pixels."""
 
-    Attributes:
-        planes: (B, s, A + 1 + G, L) derivatives, detail, and the differences of the frames (``differences``).
-        weight: (B, s, L) of the pixels.
-        visible: (B, G, s), 1 where a row is visible in a frame.
-        regressors: Number A + 1 of derivatives and detail.
-    """
-
-    planes: Tensor
-    weight: Tensor
-    visible: Tensor
-    regressors: int
+    planes: Tensor  # (B, s, A + 1 + G, L) derivatives, detail, and the differences of the frames (``differences``)
+    weight: Tensor  # (B, s, L) of the pixels
+    visible: Tensor  # (B, G, s), 1 where a row is visible in a frame
+    regressors: int  # number A + 1 of derivatives and detail
 
 
 def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Least-squares fit of the differences of the frames by gradients, detail and a constant, row by row.
 
-    Args:
-        rows: The rows.
-        edges: First columns of the parts of the rows but the first.
-        out: (B, s, A + 1, L), filled with the images of ``RowGradients``.
-
-    Returns:
-        Products from ``_sums_of_parts``, the coefficients (B, s, G, A + 2) of the fit and the weighted sum (B, s) of
-        its squared residuals in one frame; and the arguments of ``_block_weight``.
+    ``edges`` are the first columns of the parts of the rows but the first. The images of ``RowGradients`` are written
+    into ``out`` (B, s, A + 1, L). The result has the products from ``_sums_of_parts``, the coefficients (B, s, G, A +
+    2) of the fit and the weighted sum (B, s) of its squared residuals in one frame; and the arguments of
+    ``_block_weight``.
     """
     images, residual = rows.planes[:, :, : rows.regressors], rows.planes[:, :, rows.regressors :]
     weighted = torch.mul(images, rows.weight[:, :, None], out=out)
@@ -289,10 +261,7 @@ def _means(products: Tensor) -> Tensor:
 def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
     """Products (B, s, parts, A + 2, A + 2 + G) float64 of weighted images and ones with images, differences and ones.
 
-    Args:
-        weighted: (B, s, A + 1, L) weight times images.
-        rows: The rows they belong to.
-        edges: As in ``_fit_rows``.
+    ``weighted`` (B, s, A + 1, L) is weight times images; ``edges`` as in ``_fit_rows``.
     """
     count, parts = weighted.shape[2], len(edges) + 1
     sums = weighted.new_empty(*weighted.shape[:2], parts, count + 1, 1 + rows.planes.shape[2], dtype=torch.float64)
@@ -311,9 +280,7 @@ def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
 def _solve(products: Tensor, right: Tensor) -> Tensor:
     """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail.
 
-    Args:
-        products: (B, s, A + 2, A + 2) of the images and ones.
-        right: (B, s, G, A + 2) of the differences of the frames with them.
+    ``products`` (B, s, A + 2, A + 2) are those of images and ones, ``right`` (B, s, G, A + 2) those with differences.
     """
     diagonal = products.diagonal(dim1=-2, dim2=-1)
     usable = (diagonal > 0).all(-1)[..., None]
@@ -341,13 +308,9 @@ def _sum_of_blocks(values: Tensor) -> Tensor:
 def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     """Weight (B, N, M) in 0 ... 1 of blocks, small where the residual exceeds noise and a small shift.
 
-    Objects that move by themselves, clouds and parallax leave such residuals. The weight is ``1 / (1 + (r - 1)^2)``
-    for r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``.
-
-    Args:
-        energy: (B, N, M) weighted sum of squared residuals over each block.
-        slope: The same of the squared gradient.
-        share: Sum of the weights.
+    Objects that move by themselves, clouds and parallax leave such residuals. The weight is ``1 / (1 + (r - 1)^2)`` for
+    r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``. ``energy`` and ``slope`` (B, N,
+    M) are weighted sums of the squared residual and gradient over each block, ``share`` is that of the weights.
     """
     used = share > 0
     mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
@@ -357,13 +320,7 @@ def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
 
 
 def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
-    """Sums over the parts of each row, as in ``RowGradients.quarters``.
-
-    Args:
-        sums: From ``_sums_of_parts``.
-        solution: (B, s, G, A + 2) coefficients of the fit.
-        visible: (B, G, S), 1 where a scene row is visible in a frame.
-    """
+    """Sums over the parts of each row, as in ``RowGradients.quarters``; the ``solution`` is (B, s, G, A + 2)."""
     count = solution.shape[-1] - 1
     images, ones = solution[:, :, None].transpose(-2, -1).split((count, 1), dim=-2)
     right = sums[..., :2, count:-1] - sums[..., :2, :count] @ images - sums[..., :2, -1:] @ ones  # (B, s, parts, 2, G)
@@ -374,28 +331,17 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class FrameComparison:
-    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows.
+    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows."""
 
-    Attributes:
-        mean: (B, R, U), over the frames in which a row is visible. R - S rows of zeros follow, so that transforms
-            across rows are fast.
-        noise: (B, R, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency.
-        differences: (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``.
-    """
-
+    # (B, R, U), over the frames in which a row is visible. R - S rows of zeros follow, so that transforms across rows
+    # are fast.
     mean: Tensor
-    noise: Tensor
-    differences: Tensor
+    noise: Tensor  # (B, R, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency
+    differences: Tensor  # (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``
 
     @classmethod
     def of(cls, warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> "FrameComparison":
-        """Compare frames warped to the scene.
-
-        Args:
-            warp: As in ``row_gradients``.
-            runs: As in ``row_gradients``.
-            visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
-        """
+        """Compare frames warped to the scene; arguments as in ``row_gradients``."""
 
         def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
             warped, part_visible = warp(rows), visible[:, :, rows]
@@ -421,15 +367,9 @@ def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, 
     """Detail of the scene and its gradient across rows, by a Wiener filter ``1 - N / P`` of the mean of the frames.
 
     P is the power spectrum of the mean and N that of its noise, both smoothed over 16 x 16 frequencies. The pass band
-    excludes shading (below 1/64 cycles/px) and the frequencies that interpolation attenuates.
-
-    Args:
-        compared: The frames of a group.
-        u: (U,) frequencies along rows, cycles/px.
-
-    Returns:
-        Spectra (B, R, U) of the detail and of its derivative in px^-1, neighbours in memory belong to one frequency;
-        and the size of the bias (B,) in px by aliasing.
+    excludes shading (below 1/64 cycles/px) and the frequencies that interpolation attenuates. ``u`` (U,) are the
+    frequencies along rows in cycles/px. The result has spectra (B, R, U) of the detail and of its derivative in px^-1,
+    neighbours in memory belong to one frequency; and the size of the bias (B,) in px by aliasing.
     """
     # transforms across rows leave the rows contiguous in memory, and all later loops run along them
     whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (compared.mean, compared.noise))
@@ -443,13 +383,9 @@ def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _wiener_filter(total: Tensor, noise_power: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Wiener filter (B, U, S) times the pass band.
+    """Wiener filter (B, U, S) times the pass band, from powers (B, U / 16, S / 16) of the mean and its noise.
 
-    Args:
-        total: (B, U / 16, S / 16) smoothed power of the mean of the frames.
-        noise_power: The part of it by noise.
-        u: Frequencies along rows, cycles/px.
-        v: Frequencies across rows, cycles/px.
+    The frequencies u along and v across rows are in cycles/px.
     """
     share = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
     along, across = _pass_bands(u, v)
@@ -473,14 +409,9 @@ def _pass_bands(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
 def _aliasing_bias(scene_power: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Expected size (B,) in px of the bias of displacements by aliasing, that of the scene itself.
 
-    An aliased part of power A(u) in frames of power P(u) biases a displacement of a quarter of a pixel by
-    ``sum 2 pi u A / sum (2 pi u)^2 P`` over the pass band of the gradients. At u = 1/2, A is the power of the scene; it
-    falls quickly towards lower u.
-
-    Args:
-        scene_power: (B, U / 16, S / 16) smoothed power of the scene.
-        u: Frequencies along rows, cycles/px.
-        v: Frequencies across rows, cycles/px.
+    An aliased part of power A(u) in frames of power P(u) biases a displacement of a quarter of a pixel by ``sum 2 pi u
+    A / sum (2 pi u)^2 P`` over the pass band of the gradients. At u = 1/2, A is the power of the scene (B, U / 16, S /
+    16, smoothed); it falls quickly towards lower u. Frequencies u along and v across rows in cycles/px.
     """
     power = scene_power.to(torch.float64)
     of_blocks = [functional.avg_pool1d(f.abs()[None], _SMOOTH, ceil_mode=True)[0] for f in (u, v)]

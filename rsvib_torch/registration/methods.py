@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.execution.chunking import chunks
+from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.registration.bands import (
     BINNING,
     LAGS,
@@ -69,21 +69,13 @@ def _correlate_bands(
     size: tuple[int, int],
     reach: tuple[int, int],
 ) -> Tensor:
-    """Zero-mean normalised cross-correlation of windows of one image with windows of another.
+    """Zero-mean normalised cross-correlation of windows of one image (L, H, W) with windows of another (L, H, V).
 
     For one lag along the columns, the correlation at all lags across the rows consists of the diagonal sums of the
     matrix product of template and search rows. Means and energies of the search windows come from running sums.
-
-    Args:
-        first: (L, H, W) images the templates are cut from, roughly of zero mean.
-        second: (L, H, V) images that are searched.
-        places: (L, N, 2) int64, column and row of the first pixel of each template.
-        later_places: (L, N, 2) int64, the same for the window at lag zero.
-        size: Rows and columns of a template.
-        reach: Lags -reach ... reach across the rows and along the columns.
-
-    Returns:
-        (L, N, 2 reach[0] + 1, 2 reach[1] + 1) in -1 ... 1; 0 where a window is constant or leaves the image.
+    Templates of ``size`` (rows, columns) begin at ``places`` (L, N, 2) int64 (column, row), the window at lag zero at
+    ``later_places``. Lags are -reach ... reach across the rows and along the columns. The result (L, N, 2 reach[0] + 1,
+    2 reach[1] + 1) is in -1 ... 1; 0 where a window is constant or leaves the image.
     """
     height, width = size
     pixels = height * width
@@ -220,12 +212,8 @@ def _phase_surface(
 ) -> Tensor:
     """Phase correlation of windows (L, N, h, w) at the lags -reach ... reach: (L, N, lags_y, lags_x).
 
-    Args:
-        first: Windows of the earlier frames.
-        second: Windows of the later frames.
-        fraction: (L, N, 2) px, shift (x, y) of the Hann window of the second.
-        reach: Lags across the rows and along the columns.
-        pixel: Size of the windows' pixels across the rows and along the columns, in px.
+    ``fraction`` (L, N, 2) px is the shift (x, y) of the Hann window of the second; ``pixel`` is the size of the
+    windows' pixels across the rows and along the columns, in px.
     """
     shape = first.shape[:2]
     first, second, fraction = first.flatten(0, 1), second.flatten(0, 1), fraction.flatten(0, 1)
@@ -350,11 +338,10 @@ def _differences(profile: Tensor) -> Tensor:
 
 
 def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
-    """Sub-pixel lag of the peaks of correlations, NaN where there is none, and quality.
+    """Sub-pixel lag of the peaks of correlations (L, N, 2 reach + 1), NaN where there is none, and quality.
 
-    Args:
-        surface: (L, N, 2 reach + 1) where the search range is ``reach - LAGS + 1``; -infinity at lags that leave the
-            frame. A peak at the edge of the search range, or next to a lag of -infinity, gives NaN and quality 0.
+    The search range is ``reach - LAGS + 1``, and -infinity marks lags that leave the frame. A peak at the edge of the
+    search range, or next to a lag of -infinity, gives NaN and quality 0.
     """
     flat = surface.flatten(0, 1)[..., None]
     place, _ = integer_peak(flat)
@@ -369,15 +356,7 @@ def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _correlate_profiles(template: Tensor, search: Tensor) -> Tensor:
-    """Zero-mean normalised cross-correlation of profiles at all lags.
-
-    Args:
-        template: (..., w).
-        search: (..., w + b).
-
-    Returns:
-        (..., b + 1) in -1 ... 1; 0 where a window is constant.
-    """
+    """Zero-mean normalised cross-correlation (..., b + 1) of (..., w) with (..., w + b); 0 where one is constant."""
     template = template.to(torch.float64)
     template = template - template.mean(-1, keepdim=True)
     windows = search.to(torch.float64).unfold(-1, template.shape[-1], 1)

@@ -16,19 +16,19 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.chunking import at_once, chunks, runs
-from rsvib_torch.core.fourier import fast_length
-from rsvib_torch.core.presentation import Result
-from rsvib_torch.core.progress import steps
+from rsvib_torch.checks.values import check_choice
+from rsvib_torch.execution.chunking import at_once, chunks, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.numerics.fourier import fast_length
 from rsvib_torch.options import BandRegistrationOptions, RegistrationOptions
 from rsvib_torch.registration.bands import BandTask, template_margin
 from rsvib_torch.registration.methods import BAND_METHODS
+from rsvib_torch.results.presentation import Result
 
 # Correlation of bands of independent noise times the root of their pixels: medians of 12.6 (32 x 128 px), 10.4 (32 x
 # 256 px) and 10.6 (32 x 320 px) were measured, of the bands that count as registered.
@@ -124,7 +124,6 @@ def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandReg
         The offset curve, axes (x, y) of the image, rows in readout order.
 
     Raises:
-        TypeError: If an argument has the wrong type.
         ValueError: If there are fewer than two frames, a pixel is NaN or infinite, an option is out of range, or the
             frames are too small for the bands and the search range.
 
@@ -169,11 +168,7 @@ def _needed_size(options: RegistrationOptions) -> tuple[int, int]:
 
 
 def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) -> None:
-    """Refuse frames that are smaller than a band and its search range.
-
-    Raises:
-        ValueError: If there are too few rows in readout order, or too few px in a row.
-    """
+    """Refuse frames that are smaller than a band and its search range."""
     needed = _needed_size(options)
     if not fits_frame(num_rows, width, options):
         raise ValueError(
@@ -184,16 +179,7 @@ def check_frame_size(num_rows: int, width: int, options: RegistrationOptions) ->
 
 
 def register_rows(grey: Tensor, timing: RowTiming, options: RegistrationOptions) -> OffsetCurve:
-    """``register_bands`` of prepared frames.
-
-    Args:
-        grey: (B, T, H, W) float32 or float64 in row order.
-        timing: The sensor.
-        options: How bands are registered.
-
-    Returns:
-        A batch of B offset curves, axes (x, y) in row order.
-    """
+    """``register_bands`` of grey frames (B, T, H, W) in row order; the result has axes (x, y) in row order."""
     check_choice("registration", options.registration, tuple(BAND_METHODS))
     band_rows = options.band_rows
     batch, num_frames, num_rows, width = grey.shape
@@ -266,19 +252,13 @@ def _without_row_means(images: Tensor) -> Tensor:
 
 
 def _coarse_offsets(frames: Tensor) -> Tensor:
-    """Offsets of whole frames of any size, to about two pixels of reduced frames.
+    """Offsets (B, T - 1, 2) int64 px, axes (x, y), of frames (B, T, H, W) from those before, to two reduced pixels.
 
     Frames of 1024 px and more are reduced to 256 px along the longer side, smaller ones by up to 4 to at least 128 px:
     of 448 pairs of photographs of 256 to 900 px as many are wrong as with 256 px, in half the time.
 
-    The phase correlation of the reduced frames gives four candidates, each with its periodic images. The candidate
-    with the largest correlation of the overlapping parts is taken, up to shifts of 70 % of the frame.
-
-    Args:
-        frames: (B, T, H, W).
-
-    Returns:
-        (B, T - 1, 2) int64 px, axes (x, y): displacement in each frame minus that in the one before.
+    The phase correlation of the reduced frames gives four candidates, each with its periodic images. The candidate with
+    the largest correlation of the overlapping parts is taken, up to shifts of 70 % of the frame.
     """
     height, width = frames.shape[-2:]
     longer = max(height, width)
@@ -328,13 +308,7 @@ def _standardised(images: Tensor) -> Tensor:
 
 
 def _overlap_correlation(images: Tensor, shift_x: Tensor, shift_y: Tensor) -> Tensor:
-    """Correlation (B, T - 1, C) of frames with the next ones moved back, over their overlap; -1 if it is below 30 %.
-
-    Args:
-        images: (B, T, H, W).
-        shift_x: (B, T - 1, C) px.
-        shift_y: (B, T - 1, C) px.
-    """
+    """Correlation (B, T - 1, C) of frames with the next ones moved back, over their overlap; -1 if it is below 30 %."""
     rows, columns = images.shape[-2:]
     size = [fast_length(2 * length) for length in (rows, columns)]  # no shift is periodic
     spectra = torch.fft.rfft2(images, s=size)

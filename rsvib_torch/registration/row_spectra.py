@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import at_once, chunks, gathered, runs
-from rsvib_torch.core.fourier import (
+from rsvib_torch.execution.chunking import at_once, chunks, gathered, runs
+from rsvib_torch.numerics.fourier import (
     extend_rows,
     fast_length,
     phase_products,
@@ -21,20 +21,17 @@ from rsvib_torch.core.fourier import (
     shift_phases,
     squared_modulus,
 )
-from rsvib_torch.core.splines import bspline_coefficient_rows, bspline_weights
+from rsvib_torch.numerics.splines import bspline_coefficient_rows, bspline_weights
 
 DEGREE = 7  # of the B-spline across rows: its smoothing and the noise it correlates lie above the pass band in use
 MARGIN = 8  # px; rows and columns this close to an edge have no weight: they are interpolated from extended values
 
 
 class RowSpectra:
-    """Fourier transforms along the rows of frames, of their B-spline coefficients across rows.
+    """Fourier transforms along the rows of frames (B, T, H, W) in row order, of their splines across rows.
 
-    Args:
-        frames: (B, T, H, W) in row order.
-        valid: (B, T, H, W) bool, pixels with weight; None for all.
-        level: (B, T, 1, 1) to subtract from each frame.
-        contrast: (B, T, 1, 1) to divide the difference by.
+    ``valid`` pixels have weight. The level (B, T, 1, 1) is subtracted from each frame, and the difference divided by
+    the contrast.
     """
 
     def __init__(
@@ -209,12 +206,8 @@ def mean_over_frames(spectra: Tensor, visible: Tensor) -> Tensor:
 def differences(spectra: Tensor, visible: Tensor) -> Tensor:
     """Differences (B, G, S, U) of the rows of each frame from their mean over the frames in which they are visible.
 
-    Of two frames, only the difference of the first, (B, 1, S, U): that of the second is its negative. The difference
-    is 0 where a row is not visible.
-
-    Args:
-        spectra: (B, G, S, U).
-        visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+    Of two frames, only the difference of the first, (B, 1, S, U): that of the second is its negative. The difference is
+    0 where a row is not visible.
     """
     if spectra.shape[1] == 2:
         half = 0.5 * visible.prod(1, keepdim=True)
@@ -240,21 +233,16 @@ _Group = tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]
 
 
 def column_pattern(groups: list[_Group]) -> Tensor | None:
-    """Spectrum of a pattern that is added to every row of every frame at the same columns.
+    """Spectrum (B, U), shrunk by its noise, of a pattern that is added to every row of every frame at the same columns.
 
     Such a pattern is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion,
-    the pattern p appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of
-    the frames d are therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene:
-    ``p(u) = sum conj(r) d / sum |r|^2``.
+    the pattern p appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of the
+    frames d are therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene: ``p(u) =
+    sum conj(r) d / sum |r|^2``. None if no pattern is significant, or if it is too weak to bias displacements.
 
-    Args:
-        groups: Spectra of groups of frames, M of each stack, with the rows, shifts and visibility (B M, G, S each) that
-            warp some of their rows, and the residual variance (B M, S) of these rows. Rows whose variance exceeds three
-            times the median (objects that move by themselves) are left out.
-
-    Returns:
-        (B, U) spectrum of the pattern, shrunk by its noise; None if none is significant, or if it is too weak to bias
-        displacements.
+    The groups are spectra of frames, M of each stack, with the rows, shifts and visibility (B M, G, S each) that warp
+    some of their rows, and the residual variance (B M, S) of these rows. Rows whose variance exceeds three times the
+    median (objects that move by themselves) are left out.
     """
     # half of the rows are enough to find out that there is no pattern
     return None if _pattern_of(groups, 2) is None else _pattern_of(groups, 1)

@@ -1,6 +1,3 @@
-from .export.angular_rates import write_gcsv
-from .export.community_sensor_model import camera_isd, write_isd
-from .export.pixel_map import sampling_map, write_stmap
 from .html.page import Box, Report, write_report_page
 from .plots import (
     comparison_figure,
@@ -28,7 +25,6 @@ from .results import (
 __all__ = [
     "Box",
     "Report",
-    "camera_isd",
     "check_same_timing",
     "comparison_figure",
     "gain_figure",
@@ -40,16 +36,12 @@ __all__ = [
     "read_vibration",
     "restoration_data",
     "rows_figure",
-    "sampling_map",
     "save_figure",
     "windows_figure",
     "write_columns",
-    "write_gcsv",
-    "write_isd",
     "write_offsets",
     "write_report_page",
     "write_restoration",
-    "write_stmap",
     "write_table",
     "write_vibration",
 ]

@@ -13,24 +13,19 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch import detection
-from rsvib_torch.calibration import RowTimeCalibration
-from rsvib_torch.core.arguments import check_shapes, checks_arguments
-from rsvib_torch.core.checks import check_single
-from rsvib_torch.core.figures import FIGURES
-from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.result_files import figure_png, write_figure
-from rsvib_torch.core.text import measured_text
-from rsvib_torch.core.validation import Count
+from rsvib_torch import detection, gyroscope
+from rsvib_torch.checks.arguments import check_shapes, checks_arguments
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.checks.validation import Count
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.spectrum import SMALLEST_SHOWN
 from rsvib_torch.evaluation import MtfCurve
+from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
@@ -40,6 +35,11 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
+from rsvib_torch.results.figures import FIGURES
+from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.results.result_files import figure_png, write_figure
+from rsvib_torch.row_time import RowTimeCalibration
+from rsvib_torch.text import measured_text
 
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
 _X_COLOUR, _Y_COLOUR = "#14487a", "#c8102e"
@@ -53,7 +53,7 @@ _OFFSET_TIME = "exposure start of the rows in the earlier frame (ms)"
 _QUALITY_COLOURS = LinearSegmentedColormap.from_list("quality", ["#f0a030", "#9cc3e0", _X_COLOUR])  # poor ... good
 
 
-Panels = NDArray[Any]  # (rows, columns) of ``Axes``
+Panels = Array  # (rows, columns) of ``Axes``
 
 
 class _Drawing(Figure):
@@ -112,7 +112,7 @@ def _two_panels() -> tuple[Figure, list[tuple[int, str, Axes]]]:
 
 
 def _plot_axes(
-    panel: Axes, x: NDArray[Any] | Tensor, values: Tensor, std: Tensor | None = None, *, legend: bool = True
+    panel: Axes, x: Array | Tensor, values: Tensor, std: Tensor | None = None, *, legend: bool = True
 ) -> None:
     """Draw values (N, 2) of x and y in their colours, with bands of two standard deviations."""
     for axis, (name, colour) in enumerate(_AXIS_COLOURS.items()):
@@ -221,7 +221,7 @@ def offset_figure(result: DetectionResult) -> Figure:
     13 frames, the upper panels have the 9 neighbouring frames with the largest residual, and the lower ones all.
 
     Example:
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> from rsvib_torch.detection import detect_vibration
         >>> frames, timing, _ = example_frames()
         >>> [panel.get_ylabel() for panel in offset_figure(detect_vibration(frames, timing, method="bands")).axes]
@@ -258,7 +258,7 @@ def windows_figure(
         time_label: Label of the horizontal axis.
 
     Example:
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> from rsvib_torch.detection import detect_vibration
         >>> frames, timing, _ = example_frames(num_frames=4)
         >>> parts = [detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
@@ -395,7 +395,7 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     et al. 2023). Blind frequencies are dashed lines.
 
     Example:
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> from rsvib_torch.detection import detect_vibration
         >>> frames, timing, _ = example_frames()
         >>> gain_figure(detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
@@ -698,7 +698,7 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
     return figure
 
 
-def _check_figure(result: detection.MotionCheck) -> Figure:
+def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
     figure, panels = _two_panels()
     for axis, name, panel in panels:
@@ -714,7 +714,7 @@ def _check_figure(result: detection.MotionCheck) -> Figure:
     return figure
 
 
-def _accelerometer_figure(result: detection.AccelerometerComparison) -> Figure:
+def _accelerometer_figure(result: gyroscope.AccelerometerComparison) -> Figure:
     """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
     figure, panels = _two_panels()
     times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
@@ -730,7 +730,7 @@ def _accelerometer_figure(result: detection.AccelerometerComparison) -> Figure:
     return figure
 
 
-def _rotation_figure(result: detection.RotationAlignment) -> Figure:
+def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
     times = result.times.cpu()
@@ -758,10 +758,10 @@ FIGURES.update(
         (detection.MotionDetection, 0): free_motion_figure,
         (detection.SweptTone, 0): _swept_figure,
         (RowTimeCalibration, 0): _calibration_figure,
-        (detection.ClockAlignment, 0): lambda result: motion_figure(result.motion),
-        (detection.RotationAlignment, 0): _rotation_figure,
-        (detection.MotionCheck, 0): _check_figure,
-        (detection.AccelerometerComparison, 0): _accelerometer_figure,
+        (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
+        (gyroscope.RotationAlignment, 0): _rotation_figure,
+        (gyroscope.MotionCheck, 0): _check_figure,
+        (gyroscope.AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(

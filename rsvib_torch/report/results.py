@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.atomic import whole_file, write_json
-from rsvib_torch.core.checks import check_single
-from rsvib_torch.core.presentation import Result, plain_values
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.result_files import result_of
-from rsvib_torch.core.text import quoted
-from rsvib_torch.core.validation import read_json
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.validation import read_json
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.files.atomic import whole_file, write_json
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.results.presentation import Result, plain_values
+from rsvib_torch.results.result_files import result_of
 from rsvib_torch.stacks import RestoredFrames
+from rsvib_torch.text import quoted
 
 
 @checks_arguments
@@ -49,13 +49,12 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
         timing: The sensor of the frames to be restored, which must be that of the file; None not to compare them.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> path = tempfile.mkdtemp() + "/vibration.json"
         >>> rsv.write_vibration(path, rsv.detect_vibration(frames, timing))
@@ -147,7 +146,7 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> path = tempfile.mkdtemp() + "/tones.csv"
         >>> rsv.write_table(path, rsv.detect_vibration(frames, timing, tones=1))

@@ -10,12 +10,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extend_rows, extended_length
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.splines import bspline_weights, mirrored
+from rsvib_torch.checks.values import check_whole_number
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
+from rsvib_torch.numerics.fourier import extend_rows, extended_length
+from rsvib_torch.numerics.splines import bspline_weights, mirrored
 from rsvib_torch.options import BandedOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
@@ -63,11 +63,7 @@ def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
 def _filters(
     displacement: Tensor, node_weights: Tensor, grid: tuple[Tensor, Tensor], weight: Tensor, interpolation: str
 ) -> Tensor:
-    """Wiener filters of slabs with displacement (n, N, 2) during the exposure, by lag and frequency.
-
-    Returns:
-        Real and imaginary parts, (n, 2, V, U).
-    """
+    """Real and imaginary parts (n, 2, V, U) of Wiener filters of slabs, of displacement (n, N, 2) in the exposure."""
     u, v = grid
     along_rows, degree, _ = _TRANSFERS[interpolation]
     along = along_rows(displacement[..., 0], u)
@@ -113,10 +109,9 @@ def restore_banded(
     Scene row k appears at frame row r(k). The slab of rows r(k) - l ... r(k) + l, l = ``half_rows``, is assumed to have
     the PSF of that row. It is deconvolved by the Wiener filter ``H* / (|H|^2 + w (4 sin^2 pi u + 4 sin^2 pi v))``, w =
     ``noise_to_signal``, and its central rows are kept. Whole pixels of the displacement shift the slab, so that a low
-    slab suffices. The prior penalises image gradients, which preserves the mean. Rows are transformed once per frame,
-    and the filter is evaluated at the central rows only. Rows are extended smoothly at their ends and mirrored above
-    and below. All pixels count: ``restore`` replaces those without data by local means, and saturated ones count at
-    their level.
+    slab suffices. The prior penalises image gradients, which preserves the mean. Rows are extended smoothly at their
+    ends and mirrored above and below. All pixels count: ``restore`` replaces those without data by local means, and
+    saturated ones count at their level.
     """
     half_rows = check_whole_number("half_rows", options.half_rows, at_least=1, at_most=max(16, frames.shape[-2]))
     stride = check_whole_number("stride", options.stride, at_least=1, at_most=max(2, frames.shape[-2]))

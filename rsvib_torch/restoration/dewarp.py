@@ -10,15 +10,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_single, check_whole_number, described
-from rsvib_torch.core.chunking import gathered, runs
-from rsvib_torch.core.fourier import extend_rows, extended_length, phase_tables, spline_spectra
-from rsvib_torch.core.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.values import check_single, check_whole_number, described
+from rsvib_torch.execution.chunking import gathered, runs
 from rsvib_torch.frames.orientation import frames_from_row_order, frames_to_row_order
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_ROWS, SensorTiming, check_timing
+from rsvib_torch.numerics.fourier import extend_rows, extended_length, phase_tables, spline_spectra
+from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored
 from rsvib_torch.options import DewarpOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion
 
@@ -111,7 +111,7 @@ class FixedDewarp(nn.Module):
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> dewarp = rsv.FixedDewarp(timing, vibration, frames.shape[-2:], num_frames=2)
         >>> program = torch.export.export(dewarp, (frames,))

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.free_memory import check_fits
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.values import check_whole_number
+from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
@@ -124,11 +124,7 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
 
 
 def motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
-    """The vibration in row order on the frames' device, batch shape (B,).
-
-    Raises:
-        ValueError: If there is neither one vibration nor one for each stack of a batch.
-    """
+    """The vibration in row order on the frames' device, batch shape (B,); one of another batch is refused."""
     batch = frames.images.shape[0]
     if vibration.batch_shape not in ((), (batch,)) or (vibration.batch_shape and not frames.batched):
         raise ValueError(
@@ -223,8 +219,7 @@ _MARGIN = 8
 def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) -> tuple[ColumnStrips, float]:
     """Strips for frames of (height, width), for a motion (B) between two times in seconds.
 
-    Returns:
-        The strips, and the standard deviation in px of the displacement of their columns about that of their middle.
+    Also the standard deviation in px of the displacement of their columns about that of their middle.
     """
     reached = motion.largest_displacement(first, last)
     slope = float(largest_slope(reached, size[1], size[0], motion.camera).amax())
@@ -241,18 +236,10 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
 def restore_in_strips(
     method: Callable[..., Tensor], images: Tensor, motion: Motion, timing: RowTiming, options: Mapping[str, Any]
 ) -> Tensor:
-    """Frames restored by a method, in strips of columns if the motion has roll or zoom.
+    """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom.
 
-    Args:
-        method: A restoration method, see the contract above ``METHODS``.
-        images: (B, T, C, H, W) in row order.
-        motion: (B) in row order.
-        timing: The sensor.
-        options: Options of the method. Masks shaped like the images are cut as well, and ``strips`` becomes the number
-            of strips, if the method has that option.
-
-    Returns:
-        Restored frames as from the method.
+    Options that are shaped like the images are cut as well, and ``strips`` becomes the number of strips, if the method
+    has that option.
     """
     count, (height, width) = images.shape[1], images.shape[-2:]
     if motion.same_for_all_columns:

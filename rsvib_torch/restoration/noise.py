@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import squared_modulus, waves
+from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts
+from rsvib_torch.numerics.fourier import squared_modulus, waves
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
 from rsvib_torch.restoration.scene_model.observation import row_kernels
@@ -139,26 +139,17 @@ def noise_of_blurred_frames(
     min_share: float = 0.02,
     row_step: int = 8,
 ) -> Tensor:
-    """Noise power of each frame from its motion blur.
+    """Noise power (B, T) of each frame from its motion blur.
 
     At frequency k, square p of a frame has the power ``a_p T_pk S_k + noise``: T is the power transfer of the blur of
     its rows, S the spectrum of the scene, and a the strength of the texture in the square. Where T is near zero, the
     power is that of the noise, whatever the texture. Fisher scoring estimates a, S and the noise together, for powers
     with exponential distributions about their means (Whittle 1953).
 
-    Args:
-        frames: As in ``ESTIMATORS``, and likewise the next three.
-        motion: Motion of the frames.
-        ignore: Pixels that were not measured; squares with many of them do not count.
-        high_pass: Not used.
-        min_frequency: Cycles per px; below, scenes are too strong to be informative about noise.
-        max_transfer: T below which the blur counts as blocking the scene.
-        min_share: Share of such values of T in a stack below which the estimator does not apply to it.
-        row_step: T is computed for one of so many rows.
-
-    Returns:
-        (B, T), float64; NaN for a frame with fewer than four usable squares, for all frames of a stack to which the
-        estimator does not apply.
+    Frequencies below ``min_frequency`` cycles per px are not used: scenes are too strong to be informative about noise
+    there. The blur blocks the scene where T is below ``max_transfer``. NaN for a frame with fewer than four usable
+    squares, and for a stack with a share of such values of T below ``min_share``. T is computed for one of ``row_step``
+    rows. Other arguments as above ``ESTIMATORS``.
     """
     num_stacks, num_frames = frames.shape[:2]
     shape, device = frames.shape[-2:], frames.device
@@ -204,13 +195,10 @@ def fit_noise(
 ) -> Tensor:
     """Noise power (T,) by Fisher scoring of ``texture_p transfer_pk scene_k + noise``.
 
-    Args:
-        power: (T, P, K) of P squares at K frequencies.
-        transfer: (T, P, K).
-        usable: (T, P) bool, squares that count.
-        iterations: Scoring steps, each for scene and noise first, then for the texture. Six reach the noise power of
-            60 to 0.1 to 0.4 %; it has a standard deviation of about 1 %.
-        max_decrease: Largest relative decrease of a parameter in one step; keeps the powers positive.
+    ``power`` and ``transfer`` are (T, P, K) of P squares at K frequencies; squares that count are ``usable`` (T, P).
+    Each step is for scene and noise first, then for the texture: six reach the noise power of 60 to 0.1 to 0.4 %, which
+    has a standard deviation of about 1 %. ``max_decrease`` is the largest relative one of a parameter in a step; it
+    keeps the powers positive.
     """
     share = usable.to(power.dtype)[..., None]
     share = share / share.sum(-2, keepdim=True)
@@ -280,20 +268,12 @@ _MIN_SIDE = 64  # px that two frames must share along each axis, or the whole fr
 def noise_of_frame_pair(
     frames: Tensor, motion: FrameMotion, ignore: Tensor | None, high_pass: Tensor, *, max_missing: float = 0.1
 ) -> Tensor:
-    """Noise power of each frame from the two middle ones of its stack that have content.
+    """Noise power (B, T) of each frame from the two middle ones of its stack that have content.
 
     The least-squares scene of both frames leaves a residual without texture. What texture adds to ``high_pass`` is
-    measured as the difference between that estimate and the residual, and assumed equal in all frames.
-
-    Args:
-        frames: As in ``ESTIMATORS``, and likewise the next three.
-        motion: Motion of the frames.
-        ignore: Pixels that were not measured.
-        high_pass: (B, T) noise power, texture included.
-        max_missing: Share of the compared pixels that may be missing.
-
-    Returns:
-        (B, T); NaN for stacks in which fewer than two frames have content, or share too few pixels.
+    measured as the difference between that estimate and the residual, and assumed equal in all frames. NaN for stacks
+    in which fewer than two frames have content, or miss more than ``max_missing`` of the compared pixels. Other
+    arguments as above ``ESTIMATORS``.
     """
     result = torch.full_like(high_pass, math.nan)
     size = frames.shape[-2], frames.shape[-1]
@@ -397,19 +377,11 @@ def noise_of_spectral_floor(
     max_reduction: float = 9.0,
     min_reduction: float = 1.25,
 ) -> Tensor:
-    """Noise power of each frame from ``noise_floor``, within bounds.
+    """Noise power (B, T) of each frame from ``noise_floor``; NaN if it is not clearly lower than ``high_pass``.
 
-    Args:
-        frames: As in ``ESTIMATORS``, and likewise the next three.
-        motion: Not used.
-        ignore: Pixels that were not measured.
-        high_pass: (B, T) noise power, texture included.
-        max_reduction: Largest factor between ``high_pass`` and the result; a noise level that is far too low amplifies
-            noise more than one that is too high blurs.
-        min_reduction: Factor below which ``high_pass`` is kept, because the floor is the less accurate of the two.
-
-    Returns:
-        (B, T); NaN for a frame whose floor is not clearly lower than ``high_pass``.
+    ``max_reduction`` is the largest factor between ``high_pass`` and the result; a noise level that is far too low
+    amplifies noise more than one that is too high blurs. Below ``min_reduction``, ``high_pass`` is kept, because the
+    floor is the less accurate of the two. Other arguments as above ``ESTIMATORS``.
     """
     floor = noise_floor(frames, ignore).mean(-1).to(high_pass.dtype)
     bounded = torch.maximum(floor, high_pass / max_reduction)
@@ -418,20 +390,13 @@ def noise_of_spectral_floor(
 
 @torch.no_grad()
 def noise_floor(frames: Tensor, ignore: Tensor | None = None, *, min_frequency: float = 0.2) -> Tensor:
-    """Power of the white noise below the texture of each image, from its power spectrum.
+    """Power (...) of the white noise below the texture of each image (..., H, W), from its power spectrum.
 
     At frequency f in direction d the power is ``n + c_d f^(-a_d) exp(-b f^2)``: a power law for the scene in every
     direction, Gaussian optics, and one floor. Fisher scoring estimates all of them, for powers with exponential
     distributions about their means (Whittle 1953). The floor is uncertain if texture exceeds it up to the highest
-    frequencies.
-
-    Args:
-        frames: (..., H, W).
-        ignore: Boolean mask of the same shape; squares with many such pixels do not count.
-        min_frequency: Cycles per px; below, spectra are steeper than the power law.
-
-    Returns:
-        Power, shape (...), float64; NaN for an image of less than one square, or without a usable one.
+    frequencies. Below ``min_frequency`` cycles per px, spectra are steeper than the power law. Squares with many pixels
+    to ``ignore`` do not count. NaN for an image of less than one square, or without a usable one.
     """
     height, width = frames.shape[-2:]
     images = frames.reshape(-1, height, width)
@@ -530,19 +495,12 @@ ESTIMATORS: dict[str, Estimator] = {
 
 @torch.no_grad()
 def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = None) -> Tensor:
-    """Standard deviation of the noise of each frame of B stacks.
+    """Standard deviation (B, T) of the noise of each frame of B stacks, in its unit; 0 without any content.
 
     ``estimate_noise`` counts fine texture as noise, which makes it an upper bound. The first estimator of
     ``ESTIMATORS`` that applies to a stack lowers it. A frame without content, or with too few measured pixels, is
-    assigned the median noise power of the others of its stack.
-
-    Args:
-        frames: (B, T, C, H, W) in row order; ignored pixels hold local means.
-        motion: Motion of the frames.
-        ignore: Boolean mask shaped like the frames of pixels that were not measured.
-
-    Returns:
-        (B, T), in the dtype and unit of the frames; 0 if no frame of a stack has content.
+    assigned the median noise power of the others of its stack. The frames (B, T, C, H, W) are in row order, with local
+    means at pixels to ``ignore``.
     """
     high_pass = estimate_noise(frames, ignore).square().nanmean(-1).masked_fill(_constant(frames), math.nan)
     power, waiting = high_pass, torch.ones_like(high_pass[:, :1], dtype=torch.bool)

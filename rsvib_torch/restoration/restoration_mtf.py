@@ -8,9 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.fourier import waves
-from rsvib_torch.core.presentation import AXIS_NAMES, Result
-from rsvib_torch.core.text import text_table
 from rsvib_torch.frames.entry_points import vibration_options
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.trajectory import exposure_trajectory
@@ -19,11 +16,14 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import check_two_axes
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.fourier import waves
 from rsvib_torch.options import RestorationMtfOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, motion_in_row_order
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
+from rsvib_torch.results.presentation import AXIS_NAMES, Result
+from rsvib_torch.text import text_table
 
 # Waves of neighbouring frequencies are in different probes: uneven sampling mixes them
 _GROUPS = 2
@@ -144,7 +144,7 @@ def restoration_mtf(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> scene = city_and_fields(164, 164, seed=3)

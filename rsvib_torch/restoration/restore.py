@@ -3,16 +3,15 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arrays import ArrayLike
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, outside_graphs
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.reason import Reason
+from rsvib_torch.checks.arrays import ArrayLike
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, outside_graphs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import TimedModule, module_options, vibration_options
 from rsvib_torch.frames.mosaic import interpolated_colours
 from rsvib_torch.frames.pixels import enlarged
@@ -33,22 +32,20 @@ from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
 from rsvib_torch.restoration.verdict.trust import trusted_vibration, vibration_to_undo
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 
 
 @dataclass(frozen=True)
 class RestorationMethod:
-    """An entry of ``METHODS``.
+    """An entry of ``METHODS``."""
 
-    Attributes:
-        function: The method, see the contract above ``METHODS``.
-        masks: Masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels).
-        strips: Whether it takes ``strips``, and estimates once what strips of the same frames have in common.
-        mosaic: The method for colour mosaics, which has the same options and takes ``colours``; None for none.
-    """
-
-    function: Callable[..., Tensor]
+    function: Callable[..., Tensor]  # the method, see the contract above ``METHODS``
+    # masks that it takes: ``"ignore"`` (pixels without data), ``"clipped"`` (saturated pixels)
     masks: tuple[Literal["ignore", "clipped"], ...] = ()
+    # whether it takes ``strips``, and estimates once what strips of the same frames have in common
     strips: bool = False
+    # the method for colour mosaics, which has the same options and takes ``colours``; None for none
     mosaic: "RestorationMethod | None" = None
 
 
@@ -140,7 +137,7 @@ def restore(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=2)
@@ -200,7 +197,7 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
     chosen = method if frames.colours is None else method.mosaic
     assert chosen is not None, "methods without mosaic have no option mosaic"
     masks = {"ignore": frames.missing, "clipped": frames.saturated}
-    more: dict[str, Any] = {name: masks[name] for name in chosen.masks if masks[name] is not None}
+    more: Table = {name: masks[name] for name in chosen.masks if masks[name] is not None}
     if frames.colours is not None:
         more["colours"] = frames.colours
     if chosen.strips:
@@ -309,7 +306,7 @@ class VibrationRestorer(TimedModule):
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
         >>> model = torch.nn.Conv2d(1, 4, 3)  # any network

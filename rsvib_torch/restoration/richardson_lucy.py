@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.progress import steps
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
 from rsvib_torch.options import RichardsonLucyOptions
 from rsvib_torch.restoration.dewarp import restore_dewarp
@@ -22,22 +22,13 @@ def restore_richardson_lucy(
     *,
     ignore: Tensor | None = None,
 ) -> Tensor:
-    """Restore frames by Richardson-Lucy iterations on the row-varying blur.
+    """Restore frames by Richardson-Lucy iterations on the row-varying blur; negative values count as 0.
 
     ``c <- c K^T(m g / K c) / K^T m`` increases the likelihood of the scene for Poisson counts g of the measured pixels
     m (Richardson 1972; Lucy 1974). The unknowns c are cubic B-spline coefficients of the scene: B-splines are positive,
     hence the scene is non-negative, and they do not add the blur of linear interpolation. Every step preserves the
     total intensity. The initial scene is the result of ``restore_dewarp``; fewer iterations amplify less noise. For
     several frames of one scene, ``sum K^T(m g / K c) / sum K^T m`` is used, and their mean is the initial scene.
-
-    Args:
-        frames: (B, T, C, H, W) in row order, with local means at missing pixels; negative values count as 0.
-        motion: Motion of the frames.
-        options: Options of the method.
-        ignore: Boolean mask shaped like the frames of pixels that do not count.
-
-    Returns:
-        Non-negative restored frames of the same shape, or (B, 1, C, H, W).
     """
     iterations = options.iterations
     B, T, _, _, W = frames.shape

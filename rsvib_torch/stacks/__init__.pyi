@@ -2,7 +2,6 @@ from .corrector import CorrectedFrames, VibrationCorrector
 from .job import WindowResult, restore_block
 from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
-from .process_video import process_video
 from .run_folder import StackReport
 from .window_restoration import RestoredFrames, may_change, restore_followed, restore_trusted, without_data
 from .windows import Window, cut_windows
@@ -20,7 +19,6 @@ __all__ = [
     "iterate_stack",
     "may_change",
     "process_stack",
-    "process_video",
     "read_manifest",
     "restore_block",
     "restore_followed",

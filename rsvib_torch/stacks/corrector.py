@@ -35,13 +35,9 @@ class VibrationCorrector(nn.Module):
         detection: Options of ``detect_vibration``.
         restoration: Options of ``restore``.
 
-    Raises:
-        TypeError: If an option is unknown.
-        ValueError: If an option is out of range.
-
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> corrector = rsv.VibrationCorrector(timing, restoration={"method": "dewarp"})
         >>> corrector

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from rsvib_torch.core.checks import needed_package
-from rsvib_torch.core.prefetch import in_order, in_threads
+from rsvib_torch.checks.values import needed_package
+from rsvib_torch.execution.prefetch import in_order, in_threads
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows
 from rsvib_torch.stacks.windows import Window

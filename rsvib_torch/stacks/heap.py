@@ -12,11 +12,8 @@ def share_one_heap(*, keep_freed: bool = False) -> None:
     """Let all threads that start from now on allocate from one heap; other C libraries are left as they are.
 
     Frames are read, computed and written by different threads, whose own heaps would grow for hundreds of windows
-    (after 1000 frames 1.55 GB instead of 1.36 GB, ``docs/stacks.md``).
-
-    Args:
-        keep_freed: Whether to keep freed memory for the next frames. Dask workers return it to the system at once,
-            which takes 40 % of the CPU time of a run.
+    (after 1000 frames 1.55 GB instead of 1.36 GB, ``docs/stacks.md``). Freed memory is kept for the next frames, or
+    returned to the system at once, as Dask workers do, which takes 40 % of the CPU time of a run.
     """
     settings = {_ARENA_MAX: 1}
     if keep_freed:

@@ -12,10 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import Channels, channel_axis
-from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.presentation import Summarised
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import Channels, channel_axis
+from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
@@ -40,6 +39,7 @@ from rsvib_torch.options import (
     StackOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
+from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
     MARGIN,

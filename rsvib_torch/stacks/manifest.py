@@ -14,15 +14,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.presentation import AXIS_NAMES, PHYSICAL_HEAD, Result, joined_columns, physical_tone, plain_values
-from rsvib_torch.core.result_files import decode
-from rsvib_torch.core.text import json_text, measured_text, number_of, text_table, wrapped
+from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.results.presentation import (
+    AXIS_NAMES,
+    PHYSICAL_HEAD,
+    Result,
+    joined_columns,
+    physical_tone,
+    plain_values,
+)
+from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import WindowRecord
+from rsvib_torch.text import json_text, measured_text, number_of, text_table, wrapped
 
 
 def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[str, tuple[float, ...]]:
@@ -371,7 +378,6 @@ def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
         path: The ``manifest.json``.
 
     Raises:
-        OSError: If the file cannot be opened.
         ValueError: If it is not a complete manifest.
 
     Example:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.outputs import check_outputs
+from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
@@ -43,8 +43,6 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
         One ``WindowResult`` per window, in order.
 
     Raises:
-        OSError: If the stack cannot be read.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
 
     Example:
@@ -69,7 +67,6 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
 
     Raises:
         OSError: If the stack cannot be read, or the manifest cannot be written.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
             ``sink`` is a file of the stack.
 
@@ -111,7 +108,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         FileExistsError: If there is an interrupted run and ``resume`` is False.
         ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
-        TypeError: If an option is unknown.
         ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
             detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
             or versions differ from those of the run to resume, or its journal is damaged.
@@ -119,7 +115,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
         >>> rsv.write_stack(f"{folder}/frames.npy", frames)

@@ -29,8 +29,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rsvib_torch.core.arguments import check_fields
-from rsvib_torch.core.atomic import (
+from rsvib_torch.checks.arguments import check_fields
+from rsvib_torch.files.atomic import (
     PART,
     error_of_full_disk,
     make_folder,
@@ -39,14 +39,14 @@ from rsvib_torch.core.atomic import (
     sync,
     whole_file,
 )
-from rsvib_torch.core.free_memory import size_text
-from rsvib_torch.core.outputs import check_outputs
-from rsvib_torch.core.presentation import Summarised
-from rsvib_torch.core.text import number_of, one_line
+from rsvib_torch.files.free_memory import size_text
+from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.options import RunOptions
+from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.stacks.job import WindowResult
 from rsvib_torch.stacks.manifest import manifest_text, read_manifest
+from rsvib_torch.text import number_of, one_line
 
 _JOURNAL = "journal"
 _NAMES = re.compile(rf"{_JOURNAL}|\d{{6,}}\.(npy|mkv|mp4|mov|m4v)")  # of the files that a run makes

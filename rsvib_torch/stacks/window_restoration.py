@@ -10,9 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.checks import MAX_NUMBER
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.reason import Reason
+from rsvib_torch.checks.values import MAX_NUMBER
 from rsvib_torch.frames.grey import constant_frame
 from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
@@ -27,6 +25,8 @@ from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import check_optics, restore_each, restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 
 _JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 

@@ -7,12 +7,12 @@ from typing import Any, Literal
 
 import torch
 
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.presentation import plain_values
-from rsvib_torch.core.reason import Reason
+from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.results.presentation import plain_values
+from rsvib_torch.results.reason import Reason
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,4 @@
 from .tracked_frame import TrackedFrame
 from .tracker import VibrationTracker
-from .video_border import Margins, VideoBorder
 
-__all__ = ["Margins", "TrackedFrame", "VibrationTracker", "VideoBorder"]
+__all__ = ["TrackedFrame", "VibrationTracker"]

@@ -13,12 +13,12 @@ from functools import cached_property
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, table
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 from rsvib_torch.detection.verdict import scene_reasons
 from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.numerics.tables import Array, table
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 
 _KNOT_FRAMES = 8  # frame periods between knots: a tone that decays to a third within them is straight to 5 % of it

@@ -16,19 +16,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.tables import Array, table, tensor
 from rsvib_torch.detection.tones.fit import displacement_std, residual_of, vibration_of_fit
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.detected_vibration import FollowedVibration
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FollowOptions, RegistrationOptions
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones
 from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker

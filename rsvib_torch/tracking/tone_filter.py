@@ -18,9 +18,9 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import softmax
 
-from rsvib_torch.core.tables import Array, median, split_axis, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
+from rsvib_torch.numerics.tables import Array, median, split_axis, without_nan
 
 # Random walk of g and 2 pi f in rad/s per square root of a second, and of a in px/s^2 per square root of a second.
 # A tone that sweeps by 2 Hz/s changes by 12.6 rad/s in a second; a tone that grows to twice its amplitude has 0.7 / s.
@@ -31,35 +31,22 @@ _STAY = 0.95  # probability that the process noise of the next frame is the same
 
 @dataclass(frozen=True, eq=False)
 class ToneFilter:
-    """State of the filters of both axes (A), for M values of the process noise and K tones, in row order.
+    """State of the filters of both axes (A), for M values of the process noise and K tones, in row order."""
 
-    Attributes:
-        time: Reference time in s.
-        values: (A, M, P) float64, the P = 4 K + 2 parameters [Re C, Im C, g, 2 pi f of each tone, v, a].
-        covariance: (A, M, P, P) float64 of the parameters.
-        probability: (A, M) float64 of each process noise.
-        exposure_time: T_e in s.
-    """
-
-    time: float
-    values: Array
-    covariance: Array
-    probability: Array
-    exposure_time: float
+    time: float  # reference time in s
+    values: Array  # (A, M, P) float64, the P = 4 K + 2 parameters [Re C, Im C, g, 2 pi f of each tone, v, a]
+    covariance: Array  # (A, M, P, P) float64 of the parameters
+    probability: Array  # (A, M) float64 of each process noise
+    exposure_time: float  # T_e in s
 
     @classmethod
     def started(
         cls, time: float, coefficients: Array, frequencies: Array, drift: Array, std: Array, exposure_time: float
     ) -> Self:
-        """Filter from tones at a time.
+        """Filter from tones at a time, in s.
 
-        Args:
-            time: s.
-            coefficients: (A, K) complex128 px; 0 for tones that do not exist.
-            frequencies: (A, K) float64 Hz.
-            drift: (A, 2) float64 px/s and px/s^2.
-            std: (A, 4 K + 2) float64, standard deviations of the parameters; 0 for those that are fixed.
-            exposure_time: T_e in s.
+        Coefficients (A, K) complex128 px are 0 for tones that do not exist; frequencies (A, K) are in Hz, the drift (A,
+        2) in px/s and px/s^2. The standard deviations (A, 4 K + 2) of the parameters are 0 for those that are fixed.
         """
         models = len(PROCESS_NOISE)
         probability = np.full((len(std), models), (1 - _STAY) / (models - 1))
@@ -87,12 +74,7 @@ class ToneFilter:
     # Prediction
 
     def predicted(self, time: float, *, mixed: bool = True) -> Self:
-        """The filter at another reference time, with the process noise added.
-
-        Args:
-            time: s.
-            mixed: Whether the process noise may change in between.
-        """
+        """The filter at another time, with the process noise added, which may change in between if ``mixed``."""
         before, step = self._mixed() if mixed else self, time - self.time
         factor = np.exp(before.rates * step)
         moved = before.coefficients * factor
@@ -143,12 +125,9 @@ class ToneFilter:
     # Update
 
     def updated(self, measurements: Measurements, origin: float, noise_factor: Array) -> Self:
-        """The filter after the offsets between two frames, measured around the prediction.
+        """The filter after displacements (1, N, 2, 2) of the rows of two frames, measured around the prediction.
 
-        Args:
-            measurements: Displacements (1, N, 2, 2) of the rows of two frames.
-            origin: Time origin of the measurements in s.
-            noise_factor: (A,) factor of the variance of the offsets, because neighbouring pairs share a frame.
+        Their time origin is in s. The variance has a factor (A,), because neighbouring pairs share a frame.
         """
         # 1. The offsets, linear in the parameters, with robust weights.
         jacobian, residual = self._linearised(measurements, origin)

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.tables import table, tensor
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.detection.assemble import assembled, offset_curve
 from rsvib_torch.detection.measurements import Measurements
@@ -19,6 +18,7 @@ from rsvib_torch.frames.orientation import frames_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import table, tensor
 from rsvib_torch.options import TrackerOptions
 from rsvib_torch.restoration.frame_motion import visible_pixels
 from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
@@ -33,20 +33,13 @@ def time_to_middle(height: int, timing: RowTiming) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TrackedTones:
-    """The tones at one frame, in row order.
+    """The tones at one frame, in row order."""
 
-    Attributes:
-        time: s, exposure start of the frame.
-        fit: The tones; the time origin is ``time``.
-        measurements: Displacements of the rows of the last frame that was measured and of the one before, with the
-            same time origin.
-        findings: Reasons against each axis.
-    """
-
-    time: float
-    fit: ToneFit
+    time: float  # s, exposure start of the frame
+    fit: ToneFit  # the tones; the time origin is ``time``
+    # displacements of the rows of the last frame that was measured and of the one before, with the same time origin
     measurements: Measurements
-    findings: Findings
+    findings: Findings  # reasons against each axis
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,11 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import as_numbers
-from rsvib_torch.core.arrays import ArrayLike, as_tensor
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, outside_graphs, without_gradients
-from rsvib_torch.core.tables import Array, table, tables, tensor
+from rsvib_torch.checks.arguments import as_numbers
+from rsvib_torch.checks.arrays import ArrayLike, as_tensor
 from rsvib_torch.detection.measurements import Measurements, OtherMotion
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import (
@@ -48,6 +45,8 @@ from rsvib_torch.detection.tones.fit import (
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
 from rsvib_torch.detection.tones.uncertainty import with_unknown_amplitudes
 from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons, with_remedy
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
@@ -55,6 +54,7 @@ from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import Array, table, tables, tensor
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions, TrackerOptions
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.register import fits_frame
@@ -167,12 +167,11 @@ class VibrationTracker:
         timing: The sensor, without ``frame_start_times``.
 
     Raises:
-        TypeError: If the method does not have an option.
         ValueError: If a value is out of range, or the timing has frame start times.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
         >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=10)
@@ -215,7 +214,6 @@ class VibrationTracker:
             The restored frame with the vibration.
 
         Raises:
-            TypeError: If the frame is not numbers.
             ValueError: If the frame has another shape than the frames before, or its time is not later.
         """
         # 1. Input. Frames that show nothing new do not count, except for the time of the next one.
@@ -444,14 +442,9 @@ class VibrationTracker:
     def _started(
         self, state: TrackerState, found: Attempt, chosen: Tensor, middle: float, record: float
     ) -> TrackerState:
-        """Start the filter with tones of a detection, and measure the last frame.
+        """Start the filter with the ``chosen`` (2, K) tones of a detection from the last frames; measure the last one.
 
-        Args:
-            state: The state.
-            found: The detection from the last frames.
-            chosen: (2, K) bool, the tones.
-            middle: s, the time origin of the detection.
-            record: s, from the first to the last frame of it.
+        The ``middle`` of these frames is the time origin of the detection, the ``record`` their duration (s).
         """
         vibration, std, curve = found.vibration[0], found.std_if_hidden_tone[0], found.fitted.offsets[0].to("cpu")
         # 1. Image motion. A record does not distinguish a tone of less than one period from a drift, and its amplitude

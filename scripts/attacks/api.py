@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from attacks.files import BANDS, DETECTION
 from attacks.trial import Trial
-from attacks.warm import in_warm_child, tried
+from attacks.warm import in_warm_child
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -31,7 +31,7 @@ __all__ = ["calls", "trials"]
 
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
-_OF_THE_PACKAGE = {"codes", "mapped"}  # methods that only the package calls
+_OF_THE_PACKAGE = {"codes", "from_parameters", "mapped"}  # methods that only the package calls
 
 
 @dataclass(frozen=True)
@@ -125,12 +125,22 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     figure = rsv.motion_figure(vibration)
     tracker = rsv.VibrationTracker(rsv.SensorTiming(1e-4, 6, 104), window=2)
     tracked = [tracker.update(frame) for frame in frames][-1]
+    tones = [torch.full((1,), 0.1, dtype=torch.float64)] * 8
+    record = (torch.tensor([True]), 5e-6, 1e-9, 0.0, 1e-6, (), times, path, path)
+    accelerometer = rsv.AccelerometerComparison(("x",), *tones, *record)
     isd = rsv.camera_isd(rsv.Camera(2e6), (96, 64), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
     camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
     components = torch.zeros(2, 3, dtype=torch.float64)
     # values of the parameters of all functions and methods, by name
     pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **BANDS}
-    pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info, "manifest": manifest}
+    pool |= {
+        "recorded": recorded,
+        "acceleration": path,
+        "offsets": (-0.001, 0.001),
+        "camera": camera,
+        "info": info,
+        "manifest": manifest,
+    }
     pool |= {
         "detected": detected,
         "detection": detected,
@@ -257,7 +267,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
-    described += (tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
+    described += (accelerometer, tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     described += (rsv.TimingDiagnosis("frame_rows", 104.0, 110.0, timing),)
     described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
@@ -276,119 +286,73 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     return result
 
 
-_NUMBERS: dict[str, Any] = {
-    "0": 0, "-1": -1, "nan": math.nan, "inf": math.inf, "-inf": -math.inf, "1e300": 1e300, "-1e300": -1e300,
-    "5e-324": 5e-324, "1e-40": 1e-40, "1e308": 1e308, "1e9": 1e9, "10**9": 10**9, "10**30": 10**30, "2**63": 2**63,
-    "-10**30": -(10**30), "0.5": 0.5, "True": True, "numpy int": np.int64(3), "numpy nan": np.float32(np.nan),
-}  # fmt: skip
-_OTHERS: dict[str, Callable[[], Any]] = {
-    "None": lambda: None,
-    "text": lambda: "nonsense",
-    "empty text": lambda: "",
-    "NUL": lambda: "a\0b",
-    "long text": lambda: "x" * 100_000,
-    "bytes": lambda: b"\xff\x00",
-    "complex": lambda: 1 + 2j,
-    "object": object,
-    "list": lambda: [],
-    "nested list": lambda: [[1, [2, 3]], "x"],
-    "dict": lambda: {"a": 1},
-    "set": lambda: {1, 2},
-    "function": lambda: len,
-    "class": lambda: rsv.Vibration,
-    "ragged": lambda: [[1.0], [1.0, 2.0]],
-    "list of None": lambda: [None, None],
-    "list of nan": lambda: [math.nan, math.nan],
-    "list of 1e300": lambda: [1e300, 1e300],
-    "list of 0": lambda: [0, 0],
-    "list of -1": lambda: [-1, -1],
-    "list of 10**9": lambda: [10**9, 10**9],
-    "three sizes": lambda: [2, 2, 2],
-    "five sizes": lambda: (2, 3, 4, 5, 6),
-    "generator": lambda: (number for number in (1.0, 2.0)),
-    "empty tensor": lambda: torch.zeros(0),
-    "scalar tensor": lambda: torch.tensor(2.0),
-    "meta scalar": lambda: torch.zeros((), device="meta"),
-    "timing of 1e-9 s": lambda: rsv.SensorTiming(1e-9, 1.0, 104.0),
-    "timing of few rows": lambda: rsv.SensorTiming(1e-4, 1.0, 10.0),
-    "timing with one start": lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0]),
-    "timing of 1e9 s": lambda: rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[1e9, 1e9 + 1, 1e9 + 2]),
-    "timing along columns": lambda: rsv.SensorTiming(1e-4, 6, 104, scan_axis="x", readout_direction="reverse"),
-    "vibration of 1e5 px": lambda: rsv.Vibration(1e5, 50.0),
-    "vibration of 1e8 Hz": lambda: rsv.Vibration(1.0, 1e8),
-    "vibration batch": lambda: rsv.Vibration.still((4,)),
-    "vibration of 1e5 px/s": lambda: rsv.Vibration(1.0, 50.0, image_motion=(1e5, 1e5)),
-    "vibration with gradient": lambda: rsv.Vibration(torch.tensor([1.0, 1.0], requires_grad=True), 50.0),
-    "still": rsv.Vibration.still,
-    "folder": lambda: "/",
-    "device file": lambda: "/dev/zero",
-    "long name": lambda: "/tmp/" + "x" * 5000,
-    "bytes of a name": lambda: b"/tmp/x",
-}  # fmt: skip
-_TENSORS: dict[str, Callable[[Tensor], Any]] = {
-    "meta": lambda t: t.to("meta"),
-    "sparse": lambda t: t.to_sparse(),
-    "csr": lambda t: t.flatten(0, -2).to_sparse_csr() if t.ndim > 1 else t.to_sparse(),
-    "nested": lambda t: torch.nested.nested_tensor([t.float(), t.float()[:1]]),
-    "jagged": lambda t: torch.nested.nested_tensor([t.float(), t.float()[:1]], layout=torch.jagged),
-    "quantised": lambda t: torch.quantize_per_tensor(t.float(), 0.01, 0, torch.quint8),
-    "complex": lambda t: t.to(torch.complex64),
-    "bool": lambda t: t > 0.5,
-    "int64": lambda t: (100 * t).nan_to_num().to(torch.int64),
-    "uint32": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint32),
-    "uint16": lambda t: (100 * t.abs()).nan_to_num().to(torch.uint16),
-    "half": lambda t: t.half(),
-    "bfloat16": lambda t: t.bfloat16(),
-    "float8": lambda t: t.float().to(torch.float8_e4m3fn),
-    "float64": lambda t: t.double(),
-    "gradient": lambda t: t.detach().clone().float().requires_grad_(),
-    "inf": lambda t: torch.full_like(t, math.inf, dtype=torch.float32),
-    "nan": lambda t: torch.full_like(t, math.nan, dtype=torch.float32),
-    "one nan": lambda t: t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.nan).reshape(t.shape),
-    "one inf": lambda t: t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.inf).reshape(t.shape),
-    "1e38": lambda t: t.float() * 1e38,
-    "3e38": lambda t: torch.full_like(t, 3e38, dtype=torch.float32),
-    "1e300": lambda t: t.double() * 1e300,
-    "1e-40": lambda t: t.float() * 1e-40,
-    "1e-300": lambda t: t.double() * 1e-300,
-    "zeros": torch.zeros_like,
-    "negative": lambda t: -t.float(),
-    "no first": lambda t: t[:0],
-    "no last": lambda t: t[..., :0],
-    "one": lambda t: t[:1],
-    "narrow": lambda t: t[..., :1],
-    "more axes": lambda t: t[None, None, None],
-    "fewer axes": lambda t: t[0] if t.ndim else t,
-    "transposed": lambda t: t.transpose(0, -1) if t.ndim else t,
-    "expanded": lambda t: t[:1].expand(t.shape),
-    "flipped array": lambda t: t.numpy()[..., ::-1],
-    "object array": lambda t: t.numpy().astype(object),
-    "masked array": lambda t: np.ma.masked_invalid(t.numpy()),
-    "text array": lambda t: t.numpy().astype(str),
-    "date array": lambda t: (1000 * t.numpy()).astype("datetime64[s]"),
-    "record array": lambda t: np.zeros(tuple(t.shape), dtype=[("a", "f4"), ("b", "f4")]),
-    "half array": lambda t: t.numpy().astype(np.float16),
-    "long double array": lambda t: t.numpy().astype(np.longdouble),
-    "big-endian array": lambda t: t.numpy().astype(">f8"),
-    "read-only array": lambda t: np.broadcast_to(t.numpy()[:1], t.shape),
-    "list of tensors": list,
-    "list of unequal": lambda t: [t, t[:1]],
-    "parameter": lambda t: torch.nn.Parameter(t.detach().clone().float()),
-}  # fmt: skip
+# Hostile values: expressions, which are evaluated for each trial and name it; ``t`` is the valid tensor.
+_VALUES = (
+    *("0", "-1", "math.nan", "math.inf", "-math.inf", "1e300", "-1e300", "5e-324", "1e-40", "1e308", "1e9", "10**9"),
+    *("10**30", "2**63", "-10**30", "0.5", "True", "np.int64(3)", "np.float32(np.nan)", "None", "'nonsense'", "''"),
+    *(
+        r"'a\0b'",
+        "'x' * 100_000",
+        r"b'\xff\x00'",
+        "1 + 2j",
+        "object()",
+        "[]",
+        "[[1, [2, 3]], 'x']",
+        "{'a': 1}",
+        "{1, 2}",
+    ),
+    *(
+        "len",
+        "rsv.Vibration",
+        "[[1.0], [1.0, 2.0]]",
+        "[None, None]",
+        "[math.nan, math.nan]",
+        "[1e300, 1e300]",
+        "[0, 0]",
+    ),
+    *("[-1, -1]", "[10**9, 10**9]", "[2, 2, 2]", "(2, 3, 4, 5, 6)", "(number for number in (1.0, 2.0))"),
+    *("torch.zeros(0)", "torch.tensor(2.0)", "torch.zeros((), device='meta')", "'/'", "'/dev/zero'", "b'/tmp/x'"),
+    *("'/tmp/' + 'x' * 5000", "rsv.Vibration.still()", "rsv.Vibration.still((4,))", "rsv.Vibration(1e5, 50.0)"),
+    *("rsv.Vibration(1.0, 1e8)", "rsv.Vibration(1.0, 50.0, image_motion=(1e5, 1e5))"),
+    "rsv.Vibration(torch.tensor([1.0, 1.0], requires_grad=True), 50.0)",
+    *("rsv.SensorTiming(1e-9, 1.0, 104.0)", "rsv.SensorTiming(1e-4, 1.0, 10.0)"),
+    "rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0])",
+    "rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[1e9, 1e9 + 1, 1e9 + 2])",
+    "rsv.SensorTiming(1e-4, 6, 104, scan_axis='x', readout_direction='reverse')",
+)
+_TENSORS = (
+    *("t.to('meta')", "t.to_sparse()", "t.flatten(0, -2).to_sparse_csr() if t.ndim > 1 else t.to_sparse()"),
+    "torch.nested.nested_tensor([t.float(), t.float()[:1]])",
+    "torch.nested.nested_tensor([t.float(), t.float()[:1]], layout=torch.jagged)",
+    "torch.quantize_per_tensor(t.float(), 0.01, 0, torch.quint8)",
+    *("t.to(torch.complex64)", "t > 0.5", "(100 * t).nan_to_num().to(torch.int64)"),
+    *("(100 * t.abs()).nan_to_num().to(torch.uint32)", "(100 * t.abs()).nan_to_num().to(torch.uint16)"),
+    *("t.half()", "t.bfloat16()", "t.float().to(torch.float8_e4m3fn)", "t.double()"),
+    *("t.float().requires_grad_()", "torch.full_like(t, math.inf, dtype=torch.float32)"),
+    "torch.full_like(t, math.nan, dtype=torch.float32)",
+    "t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.nan).reshape(t.shape)",
+    "t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.inf).reshape(t.shape)",
+    *("t.float() * 1e38", "torch.full_like(t, 3e38, dtype=torch.float32)", "t.double() * 1e300", "t.float() * 1e-40"),
+    *("t.double() * 1e-300", "torch.zeros_like(t)", "-t.float()", "t[:0]", "t[..., :0]", "t[:1]", "t[..., :1]"),
+    *("t[None, None, None]", "t[0] if t.ndim else t", "t.transpose(0, -1) if t.ndim else t", "t[:1].expand(t.shape)"),
+    *("t.numpy()[..., ::-1]", "t.numpy().astype(object)", "np.ma.masked_invalid(t.numpy())", "t.numpy().astype(str)"),
+    *("(1000 * t.numpy()).astype('datetime64[s]')", "np.zeros(tuple(t.shape), dtype=[('a', 'f4'), ('b', 'f4')])"),
+    *("t.numpy().astype(np.float16)", "t.numpy().astype(np.longdouble)", "t.numpy().astype('>f8')"),
+    *("np.broadcast_to(t.numpy()[:1], t.shape)", "list(t)", "[t, t[:1]]", "torch.nn.Parameter(t.float())"),
+)
 
 
 def _candidates(value: Any) -> list[str]:
-    """Names of the hostile values for an argument with this valid value."""
-    names = list(_OTHERS) + list(_NUMBERS)
-    if isinstance(value, (Tensor, np.ndarray)):
-        names += [f"as {name}" for name in _TENSORS] * 2  # most likely to pass the first checks
-    return names
+    """The hostile values for an argument with this valid value."""
+    of_tensor = isinstance(value, (Tensor, np.ndarray))  # damaged tensors are most likely to pass the first checks
+    return [*_VALUES, *(_TENSORS * 2 if of_tensor else ())]
 
 
-def _hostile(name: str, value: Any) -> Any:
-    if name.startswith("as "):
-        return _TENSORS[name[3:]](torch.as_tensor(value).detach().clone())
-    return _OTHERS[name]() if name in _OTHERS else _NUMBERS[name]
+def _hostile(expression: str, value: Any) -> Any:
+    names = {"math": math, "np": np, "rsv": rsv, "torch": torch}
+    if expression in _TENSORS:
+        names["t"] = torch.as_tensor(value).detach().clone()
+    return eval(expression, names)
 
 
 def _nan_without_reason(result: Any) -> bool:
@@ -408,15 +372,17 @@ def _name(item: Item) -> str:
     return f"{item[0]}({', '.join(f'{argument}={hostile}' for argument, hostile in item[1])})"
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:
-    """One call with hostile arguments."""
+def prepare(folder: Path) -> None:
+    """Hostile relative paths must not reach the working directory of the program."""
     folder.mkdir(parents=True, exist_ok=True)
-    os.chdir(folder)  # hostile relative paths must not reach the working directory of the program
-    known = calls(folder / "valid")
-    if item is None:
-        return Trial("", "completed")
+    os.chdir(folder)
+    calls(folder / "valid")
+
+
+def attempt(folder: Path, item: Item) -> str:
+    """One call with hostile arguments."""
     name, changes = item
-    call = known[name]
+    call = calls(folder / "valid")[name]
     place = folder / "trial"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
@@ -429,19 +395,15 @@ def attempt(folder: Path, item: Item | None) -> Trial:
     try:
         arguments |= {argument: _hostile(kind, call.arguments[argument]) for argument, kind in changes}
     except Exception as error:  # PyTorch or the package cannot make this value
-        return Trial(_name(item), "refused", f"not made: {error}")
+        raise ValueError(f"not made: {type(error).__name__}") from error
     torch.manual_seed(0)
     before = {key: copy.deepcopy(value) for key, value in arguments.items() if isinstance(value, np.ndarray)}
-
-    def work() -> str:
-        result = call.of(**arguments)
-        str(result) if type(result).__module__.startswith("rsvib_torch") else None
-        if _nan_without_reason(result):
-            return "reliable, but not finite"
-        changed = (key for key, value in before.items() if not _equal(value, arguments[key]))
-        return next((f"{key} was changed" for key in changed), "")
-
-    return tried(_name(item), work)
+    result = call.of(**arguments)
+    str(result) if type(result).__module__.startswith("rsvib_torch") else None
+    if _nan_without_reason(result):
+        return "reliable, but not finite"
+    changed = (key for key, value in before.items() if not _equal(value, arguments[key]))
+    return next((f"{key} was changed" for key in changed), "")
 
 
 def _equal(before: np.ndarray, after: np.ndarray) -> bool:
@@ -475,4 +437,5 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Trials of hostile calls, three quarters of them with one hostile argument."""
     torch.set_num_threads(1)
     chosen = items(calls(folder / "listed" / "valid"), count, seed)
-    yield from in_warm_child(attempt, chosen, _name, folder / "child", limit=SECONDS, memory=MEMORY)
+    named = [(_name(item), item) for item in chosen]
+    yield from in_warm_child(attempt, named, folder / "child", limit=SECONDS, memory=MEMORY, prepare=prepare)

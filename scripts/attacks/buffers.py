@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from attacks.trial import Trial
-from attacks.warm import in_warm_child, tried
+from attacks.warm import in_warm_child
 from test_shared_memory import CASES, FRAMES, ONLY_TENSORS, TIMING, test_results_share_no_memory_with_arguments
 
 import rsvib_torch as rsv
@@ -30,28 +30,22 @@ def _tracked(buffers: int) -> list[rsv.tracking.TrackedFrame]:
     return results
 
 
-def attempt(folder: Path, item: Item | None) -> Trial:
+def attempt(folder: Path, item: Item) -> str:
     """One case: a call, or a tracker whose frames are in buffers of the caller."""
-    if item is None:
-        return Trial("", "completed")
     name, number = item
-
-    def work() -> str:
-        if name != "tracker":
-            try:
-                test_results_share_no_memory_with_arguments(name, bool(number))
-            except AssertionError as error:
-                return str(error)[:300] or "memory is shared"
-            return ""
-        pairs = zip(_tracked(0), _tracked(number), strict=True)
-        changed = [i for i, two in enumerate(pairs) if not torch.equal(two[0].restored, two[1].restored)]
-        return f"frames {changed} differ" if changed else ""
-
-    return tried(f"{name}, {number}", work)
+    if name != "tracker":
+        try:
+            test_results_share_no_memory_with_arguments(name, bool(number))
+        except AssertionError as error:
+            return str(error)[:300] or "memory is shared"
+        return ""
+    pairs = zip(_tracked(0), _tracked(number), strict=True)
+    changed = [i for i, two in enumerate(pairs) if not torch.equal(two[0].restored, two[1].restored)]
+    return f"frames {changed} differ" if changed else ""
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     """Trackers with up to four buffers, and the calls in random order."""
     calls = [(name, kind) for name, kind in itertools.product(CASES, (0, 1)) if not (kind and name in ONLY_TENSORS)]
     items = [*(("tracker", number) for number in range(1, 5)), *random.Random(seed).sample(calls, len(calls))]
-    yield from in_warm_child(attempt, items[:count], str, folder, limit=60.0, memory=2**31)
+    yield from in_warm_child(attempt, [(str(item), item) for item in items[:count]], folder, memory=2**31)

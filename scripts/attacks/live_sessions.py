@@ -33,24 +33,14 @@ _CAMERA = ("--row-time", "200us", "--exposure", "0.8ms", "--frame-rate", str(_RA
 
 
 class _Camera(ThreadingHTTPServer):
-    """Motion JPEG over HTTP.
-
-    Args:
-        frames: Number of frames after which the camera ends.
-        disappears: Whether it then closes the connection, instead of sending nothing.
-
-    Attributes:
-        url: Address.
-        viewers: Released when a viewer has connected.
-        begin: The first frame waits for this event.
-        end: Set when the camera is no longer needed.
-    """
+    """Motion JPEG over HTTP; after its frames it ``disappears``, or keeps the connection and sends nothing."""
 
     def __init__(self, frames: int, *, disappears: bool = True) -> None:
         scene = cv2.blur(np.random.default_rng(0).integers(0, 256, (_SIZE, _SIZE), np.uint8), (5, 5))
         self.parts = [cv2.imencode(".jpg", np.roll(scene, (n // 3, n), (0, 1)))[1].tobytes() for n in range(8)]
         self.frames, self.disappears = frames, disappears
-        self.viewers, self.begin, self.end = threading.Semaphore(0), threading.Event(), threading.Event()
+        self.viewers = threading.Semaphore(0)  # released when a viewer has connected
+        self.begin, self.end = threading.Event(), threading.Event()  # of the first frame, and of the need for a camera
         super().__init__(("127.0.0.1", 0), _Stream)
         self.daemon_threads = True
         self.url = f"http://127.0.0.1:{self.server_address[1]}/video.mjpg"
@@ -195,21 +185,13 @@ def _judged(
 
 @dataclass(frozen=True)
 class _Ending:
-    """How a session ends while it records.
+    """How a session ends while it records."""
 
-    Attributes:
-        act: What ends it.
-        expected: Its outcome.
-        message: Part of what it prints; {out} is the recording.
-        output: See ``_start``.
-        spectrogram: Whether one is saved.
-    """
-
-    act: Callable[[_Session], None]
-    expected: Outcome = "completed"
-    message: str = ""
-    output: str = "file"
-    spectrogram: bool = False
+    act: Callable[[_Session], None]  # what ends it
+    expected: Outcome = "completed"  # its outcome
+    message: str = ""  # part of what it prints; {out} is the recording
+    output: str = "file"  # see ``_start``
+    spectrogram: bool = False  # whether one is saved
 
     def __call__(self, name: str, out: Path, frames: int) -> Trial:
         """A trial."""

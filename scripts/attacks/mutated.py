@@ -26,7 +26,7 @@ from attacks.files import (
     write_zarr,
 )
 from attacks.trial import Trial
-from attacks.warm import in_warm_child, tried
+from attacks.warm import in_warm_child
 from gpmf_file import mp4, packets_of
 
 import rsvib_torch as rsv
@@ -72,35 +72,16 @@ read_noise = 0.003
 window = 4
 bad_frames = "skip"
 """
-_TOKENS = (
-    b"-1",
-    b"0",
-    b"99999999999999999999",
-    b"1e999",
-    b"nan",
-    b"null",
-    b"[]",
-    b"{}",
-    b'""',
-    b"true",
-    b"\xff",
-    b"[" * 60,
-)
+_TOKENS = (*b'-1 0 99999999999999999999 1e999 nan null [] {} "" true \xff'.split(), b"[" * 60)
 
 
 @dataclass(frozen=True)
 class Original:
-    """A file to damage.
+    """A file to damage."""
 
-    Attributes:
-        target: What is read, the file or the folder it belongs to.
-        read: How it is read.
-        text: Whether it is text.
-    """
-
-    target: str
-    read: Callable[[Path], Any]
-    text: bool = False
+    target: str  # what is read, the file or the folder it belongs to
+    read: Callable[[Path], Any]  # how it is read
+    text: bool = False  # whether it is text
 
 
 def _read_stack(path: Path, most: int = 50) -> None:
@@ -120,25 +101,14 @@ def _read_manifest(path: Path) -> None:
     str(manifest)
 
 
+_STACKS = ("pages.tif", "packed.tif", "tiles.tif", "own.tif", "frames.npy", "frames.png", "colour.png", "frames.jpg")
+_STACKS += ("plain.h5", "packed.h5", "frames.raw", "frames.mkv", "frames.mp4")
 # Files to damage, by the name of the file.
-ORIGINALS = {
-    "pages.tif": Original("pages.tif", _read_stack),
-    "packed.tif": Original("packed.tif", _read_stack),
-    "tiles.tif": Original("tiles.tif", _read_stack),
-    "own.tif": Original("own.tif", _read_stack),
-    "frames.npy": Original("frames.npy", _read_stack),
-    "frames.png": Original("frames.png", _read_stack),
-    "colour.png": Original("colour.png", _read_stack),
+ORIGINALS = {name: Original(name, _read_stack) for name in _STACKS} | {
     "pngs/frame_0001.png": Original("pngs", _read_stack),
-    "frames.jpg": Original("frames.jpg", _read_stack),
-    "plain.h5": Original("plain.h5", _read_stack),
-    "packed.h5": Original("packed.h5", _read_stack),
-    "frames.raw": Original("frames.raw", _read_stack),
     "frames.raw.json": Original("frames.raw", _read_stack, text=True),
     "frames.zarr/zarr.json": Original("frames.zarr", _read_stack, text=True),
     "frames.zarr/c/1/0/0": Original("frames.zarr", _read_stack),
-    "frames.mkv": Original("frames.mkv", _read_stack),
-    "frames.mp4": Original("frames.mp4", _read_stack),
     "camera.toml": Original("camera.toml", read_config, text=True),
     "motion.csv": Original("motion.csv", lambda path: str(rsv.read_motion(path, unit="px")), text=True),
     "clip.gcsv": Original("clip.gcsv", lambda path: str(rsv.read_gyroscope(path)), text=True),
@@ -245,32 +215,22 @@ def _run(folder: Path, target: Path) -> str:
 Item = tuple[int, str, bool]  # seed, name of the file, whether the program is run on it
 
 
-def _name(item: Item) -> str:
-    return f"{item[1]}, seed {item[0]}{', rsvib run' if item[2] else ''}"
-
-
-def attempt(folder: Path, item: Item | None) -> Trial:
+def attempt(folder: Path, item: Item) -> str:
     """Read one damaged file, or run the program on it."""
     contents = write_originals(folder)
-    if item is None:
-        return Trial("", "completed")
     seed, name, runs = item
     original, path = ORIGINALS[name], folder / name
     path.write_bytes(damage(contents[name], seed, original.text))
-
-    def work() -> str:
+    try:
         if runs:
             return _run(folder, folder / original.target)
         original.read(folder / original.target)
         return ""
-
-    def unclear(text: str) -> str:
-        lines = text.splitlines()  # a configuration has one line per mistake
-        clear = len(lines) == 1 or (lines and all(str(folder) in line for line in lines))
-        return "" if clear else f"message {text}"
-
-    try:
-        return tried(_name(item), work, unclear)
+    except (ValueError, TypeError, OSError) as error:
+        lines = str(error).splitlines()  # a configuration has one line per mistake
+        if len(lines) > 1 and not all(str(folder) in line for line in lines):
+            return f"message {error}"
+        raise
     finally:
         shutil.rmtree(folder / "results", ignore_errors=True)
         path.write_bytes(contents[name])
@@ -281,9 +241,11 @@ def trials(
 ) -> Iterator[Trial]:
     """Damaged files in turn; the program is run on every twelfth stack, the other files are read."""
     stacks = [name for name, original in ORIGINALS.items() if original.read is _read_stack]
-    items = []
+    items: list[tuple[str, Item]] = []
     for index in range(count):
         runs = bool(run_every) and index % run_every == 0
         chosen = stacks[index // run_every % len(stacks)] if runs else names[index % len(names)]
-        items.append((1_000_003 * seed + index, chosen, runs))
-    yield from in_warm_child(attempt, items, _name, folder / "files", limit=SECONDS, memory=MEMORY)
+        number = 1_000_003 * seed + index
+        items.append((f"{chosen}, seed {number}{', rsvib run' * runs}", (number, chosen, runs)))
+    place = folder / "files"
+    yield from in_warm_child(attempt, items, place, limit=SECONDS, memory=MEMORY, prepare=write_originals)

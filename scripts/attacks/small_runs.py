@@ -132,11 +132,10 @@ def _call(function: Callable[..., Any], arguments: tuple[Any, ...], options: dic
 def fork(
     function: Callable[..., Any], *arguments: Any, seconds: float | None = None, **options: Any
 ) -> tuple[Any, Any]:
-    """Call a function in a child process.
+    """Call a function in a child process; returns its exit code, and its result or message.
 
-    Returns:
-        Exit code (None if it was killed after ``seconds``), and the result or message; 0 and the result after a
-        success, 2 and the message after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another exception.
+    The code is 0 after a success, 2 after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another exception,
+    and None if the process was killed after ``seconds``.
     """
     receiving, sending = server().Pipe(duplex=False)
     child = server().Process(target=_call, args=(function, arguments, options, sending))
@@ -157,9 +156,7 @@ def fork(
 def count_file_calls(die_at: int, after: Callable[[str, Any], None] | None = None) -> list[int]:
     """Kill this process at its n-th call that changes a file (0: never); returns the number of calls so far.
 
-    Args:
-        die_at: Number of the call.
-        after: Called with the name of a call and its arguments after it has succeeded.
+    ``after`` is called with the name of a call and its arguments after it has succeeded.
     """
     numbers, lock, done = itertools.count(1), threading.RLock(), [0]
     inside = threading.local()

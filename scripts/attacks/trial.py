@@ -19,21 +19,16 @@ FAILURES = OUTCOMES[2:]
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial.
+    """One trial."""
 
-    Attributes:
-        name: What was tried, precise enough to repeat it.
-        outcome: ``completed``: correct result. ``refused``: a one-line error, and nothing was changed. ``lost``: a file
-            of the user, or a finished part of the result, is damaged or missing. ``wrong``: success was reported, but
-            the result is wrong or incomplete. ``traceback``: an exception that is neither ValueError, TypeError nor
-            OSError in Python, or a traceback or another exit code than 0 and 2 on the command line. ``hang``: the time
-            limit passed. ``memory``: more memory than permitted was used.
-        detail: Message or difference, for the list of failures.
-    """
-
-    name: str
+    name: str  # what was tried, precise enough to repeat it
+    # ``completed``: correct result. ``refused``: a one-line error, and nothing was changed. ``lost``: a file of the
+    # user, or a finished part of the result, is damaged or missing. ``wrong``: success was reported, but the result is
+    # wrong or incomplete. ``traceback``: an exception that is neither ValueError, TypeError nor OSError in Python, or a
+    # traceback or another exit code than 0 and 2 on the command line. ``hang``: the time limit passed. ``memory``: more
+    # memory than permitted was used.
     outcome: Outcome
-    detail: str = ""
+    detail: str = ""  # message or difference, for the list of failures
 
 
 @dataclass(frozen=True)
@@ -57,12 +52,9 @@ def _memory_of_tree(process: psutil.Process) -> int:
 
 
 def run_watched(command: Sequence[str], *, limit: float, folder: Path) -> Process:
-    """Run a command with a time limit and measure the peak resident memory of its process tree.
+    """Run a command in a folder and measure the peak resident memory of its process tree.
 
-    Args:
-        command: Program and arguments.
-        limit: Time limit in s; after it all processes of the tree are ended.
-        folder: Working directory; ``output.txt`` in it receives the output.
+    All processes of the tree are ended after ``limit`` s; ``output.txt`` in the folder receives the output.
     """
     begin = time.perf_counter()
     path = folder / "output.txt"

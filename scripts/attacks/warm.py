@@ -17,9 +17,9 @@ import psutil
 import torch
 from attacks.trial import Trial
 
-__all__ = ["in_warm_child", "tried"]
+__all__ = ["in_warm_child"]
 
-Attempt = Callable[[Path, Any], Trial]
+Attempt = Callable[[Path, Any], str]
 
 
 def _unclear(text: str) -> str:
@@ -30,19 +30,12 @@ def _unclear(text: str) -> str:
     return ""
 
 
-def tried(name: str, work: Callable[[], str], unclear: Callable[[str], str] = lambda _: "") -> Trial:
-    """Trial of a call of Python.
-
-    Args:
-        name: Name of the trial.
-        work: The call; it returns what is wrong with the result, an empty text if nothing is.
-        unclear: What else is wrong with the message of a ``ValueError``, ``TypeError`` or ``OSError``.
-    """
+def _tried(attempt: Attempt, folder: Path, name: str, item: Any) -> Trial:
     try:
-        wrong = work()
+        wrong = attempt(folder, item)
     except (ValueError, TypeError, OSError) as error:
         text = str(getattr(error, "strerror", None) or error)  # the system repeats names that are too long
-        fault = _unclear(text) or unclear(str(error))
+        fault = _unclear(text)
         return Trial(name, "wrong" if fault else "refused", (fault or str(error))[:300])
     except MemoryError as error:
         return Trial(name, "memory", str(error)[:300])
@@ -53,11 +46,14 @@ def tried(name: str, work: Callable[[], str], unclear: Callable[[str], str] = la
     return Trial(name, "wrong" if wrong else "completed", wrong)
 
 
-def _serve(connection: Connection, attempt: Attempt, folder: Path, memory: int) -> None:
+def _serve(
+    connection: Connection, attempt: Attempt, prepare: Callable[[Path], Any] | None, folder: Path, memory: int
+) -> None:
     """Run trials until the other end closes the connection; output of libraries is discarded."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    attempt(folder, None)  # prepares what all trials share
+    if prepare is not None:
+        prepare(folder)
     with open(os.devnull, "wb") as nothing:
         os.dup2(nothing.fileno(), 1)
         os.dup2(nothing.fileno(), 2)
@@ -68,7 +64,7 @@ def _serve(connection: Connection, attempt: Attempt, folder: Path, memory: int) 
     connection.send(None)
     with contextlib.suppress(EOFError):
         while True:
-            connection.send(attempt(folder, connection.recv()))
+            connection.send(_tried(attempt, folder, *connection.recv()))
 
 
 def _answers(connection: Connection, child: Any, limit: float) -> bool:
@@ -88,39 +84,46 @@ def _answers(connection: Connection, child: Any, limit: float) -> bool:
 
 
 def in_warm_child(
-    attempt: Attempt, items: Iterable[Any], name: Callable[[Any], str], folder: Path, *, limit: float, memory: int
+    attempt: Attempt,
+    items: Iterable[tuple[str, Any]],
+    folder: Path,
+    *,
+    limit: float = 60.0,
+    memory: int = 10**9,
+    prepare: Callable[[Path], Any] | None = None,
 ) -> Iterator[Trial]:
     """Run one trial per item in a child process, which is replaced after a trial that ended or blocked it.
 
     Args:
-        attempt: ``attempt(folder, item)``, a function of a module; ``item=None`` prepares what all trials share.
-        items: What is tried.
-        name: Name of the trial of an item.
+        attempt: ``attempt(folder, item)``, a function of a module; it returns what is wrong with the result, an empty
+            text if nothing is.
+        items: Names of the trials, and what is tried.
         folder: Folder for files.
         limit: Limit of the processor time of a trial in s; ten times as much may pass on a busy machine.
         memory: Bytes that the child may allocate in addition to what it uses at the start.
+        prepare: Makes what all trials share, in every new child.
     """
     context = multiprocessing.get_context("spawn")
     child, connection = None, None
     try:
-        for item in items:
+        for name, item in items:
             if child is None:
                 connection, other = context.Pipe()
-                child = context.Process(target=_serve, args=(other, attempt, folder, memory), daemon=True)
+                child = context.Process(target=_serve, args=(other, attempt, prepare, folder, memory), daemon=True)
                 child.start()
                 other.close()
                 connection.recv()
             assert connection is not None
-            connection.send(item)
+            connection.send((name, item))
             if _answers(connection, child, limit):
                 try:
                     yield connection.recv()
                     continue
                 except EOFError:
                     child.join()
-                    trial = Trial(name(item), "traceback", f"the process ended with exit code {child.exitcode}")
+                    trial = Trial(name, "traceback", f"the process ended with exit code {child.exitcode}")
             else:
-                trial = Trial(name(item), "hang", f"not finished after {limit:g} s of processor time")
+                trial = Trial(name, "hang", f"not finished after {limit:g} s of processor time")
             child.kill()
             child.join()
             child = None

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.honesty_cases import BLANKING, FRAME_PERIOD, of_tones, plain, record, recording, tones_of
-from harness import Rows, in_turns, named, seconds_of, shown_seconds, table
+from harness import Rows, in_turns, named, seconds_of, shown_seconds, table_of
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 OPTIONS = {
     "cost_size": (384, "cost: rows and columns of the difficult inputs"),
@@ -58,19 +58,12 @@ OF_CLASSES = {  # recordings (class, number) of honesty_cases
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """Frames with the stated timing, and a plain recording of as many pixels.
+    """Frames with the stated timing, and a plain recording of as many pixels."""
 
-    Attributes:
-        frames: (T, H, W).
-        timing: The stated timing.
-        plain_frames: Of the same number of pixels.
-        plain_timing: Their timing.
-    """
-
-    frames: torch.Tensor
-    timing: rsv.SensorTiming
-    plain_frames: torch.Tensor
-    plain_timing: rsv.SensorTiming
+    frames: torch.Tensor  # (T, H, W)
+    timing: rsv.SensorTiming  # the stated timing
+    plain_frames: torch.Tensor  # of the same number of pixels
+    plain_timing: rsv.SensorTiming  # their timing
 
 
 def _frames(values: Any) -> torch.Tensor:
@@ -248,29 +241,26 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     of_parts = [[row[f"{of}_ratio"] for row in difficult] for of in ("detection", "restoration")]
     beyond = [sum(ratio > BOUND for ratio in ratios) for ratios in (list(both.values()), *of_parts)]
     return [
-        *table(
-            (f"detection, {options.size}^2", "seconds", "FFT round trips"),
-            [(row["name"], shown_seconds(row), f"{row['round_trips']:.1f}") for row in plain_cases],
+        *table_of(
+            plain_cases,
+            (f"detection, {options.size}^2", "{name}"),
+            ("seconds", shown_seconds),
+            ("FFT round trips", "{round_trips:.1f}"),
         ),
         f"{len(difficult)} difficult inputs of {options.cost_size} x {options.cost_size} px, or as many pixels; times "
         "over those of a plain vibration of the same size, the shortest of alternating runs. Restoration uses the "
         f"result of detection. More than {BOUND:g} times as long: both together of {beyond[0]} inputs, detection of "
         f"{beyond[1]}, restoration of {beyond[2]}.",
         "",
-        *table(
-            ("input", "frames", "detection (s)", "ratio", "restoration (s)", "ratio", "ratio of both", "first reason"),
-            [
-                (
-                    row["name"],
-                    "{} of {} x {}".format(*row["shape"]),
-                    f"{row['detection']:.2f}",
-                    f"{row['detection_ratio']:.1f}",
-                    f"{row['restoration']:.2f}",
-                    f"{row['restoration_ratio']:.1f}",
-                    f"{both[row['name']]:.1f}",
-                    row["reason"],
-                )
-                for row in sorted(difficult, key=lambda row: -both[row["name"]])
-            ],
+        *table_of(
+            sorted(difficult, key=lambda row: -both[row["name"]]),
+            ("input", "{name}"),
+            ("frames", "{shape[0]} of {shape[1]} x {shape[2]}"),
+            ("detection (s)", "{detection:.2f}"),
+            ("ratio", "{detection_ratio:.1f}"),
+            ("restoration (s)", "{restoration:.2f}"),
+            ("ratio", "{restoration_ratio:.1f}"),
+            ("ratio of both", lambda row: f"{both[row['name']]:.1f}"),
+            ("first reason", "{reason}"),
         ),
     ]

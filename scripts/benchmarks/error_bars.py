@@ -37,10 +37,11 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields, cramer_rao_bound
+from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.evaluation import cramer_rao_bound
 
 _TESTS = Path(__file__).parents[2] / "tests"
-sys.path += [str(_TESTS), str(_TESTS / "calibration")]
+sys.path += [str(_TESTS), str(_TESTS / "row_time")]
 
 from motion_truth import common_warp, rms  # noqa: E402
 from test_calibrate import HEIGHT, WIDTH, blink, record_frames, shaded, sine  # noqa: E402

@@ -25,7 +25,7 @@ from benchmarks.independent_camera import (
     take_frames,
 )
 from benchmarks.pipeline import SCENES
-from harness import Rows, one_thread, table
+from harness import Rows, one_thread, table_of
 from scipy import ndimage
 
 import rsvib_torch as rsv
@@ -62,19 +62,12 @@ def joint(frames: torch.Tensor, timing: rsv.SensorTiming, motion: Any, scale: in
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames without noise, and the scene after optics and pixel on half pixels and on pixels.
+    """Frames without noise, and the scene after optics and pixel on half pixels and on pixels."""
 
-    Attributes:
-        frames: (T, H, W).
-        half: (2 H, 2 W).
-        timing: The sensor.
-        vibration: The true motion.
-    """
-
-    frames: Array
-    half: Array
-    timing: rsv.SensorTiming
-    vibration: rsv.Vibration
+    frames: Array  # (T, H, W)
+    half: Array  # (2 H, 2 W)
+    timing: rsv.SensorTiming  # the sensor
+    vibration: rsv.Vibration  # the true motion
 
     @property
     def pixels(self) -> Array:
@@ -218,51 +211,35 @@ def rows(options: argparse.Namespace) -> Rows:
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """Tables of the scenes and of the conditions."""
-    heads = (
-        "scene",
-        "σ of the optics (px)",
-        "noise",
-        "frames",
-        "half pixels: still frames",
-        "drizzle",
-        "shift-and-add",
-    )
-    heads += ("`joint=True`, interpolated", "`joint=True, scale=2`", "pixels: `joint=True`", "`joint=True, scale=2`")
     return [
         f"PSNR in dB against the noise-free scene after optics and pixel, without a border of {RIM} points; frames of "
         f"{options.finer_size} x {options.finer_size} px, exposure of {EXPOSURE_ROWS} rows, vibration detected in all "
         f"{max(FRAMES)} frames. Still frames are averaged and interpolated; in brackets, infinitely many of them.",
         "",
-        *table(
-            heads,
-            [
-                (
-                    *(row[name] for name in ("scene", "sigma", "noise", "frames")),
-                    f"{row['still']:.1f} ({row['endless']:.1f})",
-                    *(f"{row[name]:.1f}" for name in ("drizzle", "added", "joint")),
-                    f"**{row['finer']:.1f}**",
-                    f"{row['joint_pixels']:.1f}",
-                    f"**{row['finer_pixels']:.1f}**",
-                )
-                for row in results
-                if "scene" in row
-            ],
+        *table_of(
+            (row for row in results if "scene" in row),
+            ("scene", "{scene}"),
+            ("σ of the optics (px)", "{sigma}"),
+            ("noise", "{noise}"),
+            ("frames", "{frames}"),
+            ("half pixels: still frames", "{still:.1f} ({endless:.1f})"),
+            ("drizzle", "{drizzle:.1f}"),
+            ("shift-and-add", "{added:.1f}"),
+            ("`joint=True`, interpolated", "{joint:.1f}"),
+            ("`joint=True, scale=2`", "**{finer:.1f}**"),
+            ("pixels: `joint=True`", "{joint_pixels:.1f}"),
+            ("`joint=True, scale=2`", "**{finer_pixels:.1f}**"),
         ),
         f"The same for {max(FRAMES)} frames of the city, σ 0.3 px (roll: 0.4 px), with the true vibration but in the "
         "last rows. Still frames have none of the conditions. Saturated: points below saturation only.",
         "",
-        *table(
-            ("condition", "noise", "still frames", "`joint=True`, interpolated", "`joint=True, scale=2`", "warning"),
-            [
-                (
-                    row["condition"],
-                    row["noise"],
-                    *(f"{row[name]:.1f}" for name in ("still", "joint")),
-                    f"**{row['finer']:.1f}**",
-                    "yes" if row["warned"] else "",
-                )
-                for row in results
-                if "condition" in row
-            ],
+        *table_of(
+            (row for row in results if "condition" in row),
+            ("condition", "{condition}"),
+            ("noise", "{noise}"),
+            ("still frames", "{still:.1f}"),
+            ("`joint=True`, interpolated", "{joint:.1f}"),
+            ("`joint=True, scale=2`", "**{finer:.1f}**"),
+            ("warning", lambda row: "yes" if row["warned"] else ""),
         ),
     ]

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 _CUDA = "cuda" in devices()
 OPTIONS = {
@@ -43,13 +43,7 @@ COPIES = {"_to_copy", "copy_", "to", "cpu", "cuda", "_copy_from"}
 
 
 class Count(TorchDispatchMode):
-    """Counts tensor operations, transfers and bytes of the operations within it.
-
-    Attributes:
-        operations: Number of operations.
-        transfers: Number of operations after which the processor waits for the device.
-        moved: Bytes of inputs and outputs.
-    """
+    """Counts operations, transfers (operations that the processor waits for) and bytes ``moved`` by operations."""
 
     def __init__(self, device: str) -> None:
         super().__init__()

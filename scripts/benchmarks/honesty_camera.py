@@ -30,17 +30,13 @@ NODES = (5, 2.0, 160)
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A scene, or a part of it in front of others, that moves by itself.
+    """A scene, or a part of it in front of others, that moves by itself."""
 
-    Attributes:
-        light: Spline coefficients (rows, columns) on the fine grid, of the light of the layer times its cover.
-        cover: Those of the share of light from behind that the layer blocks; None for a layer that blocks all.
-        velocity: Motion of the layer over the scene, (x, y) in px/s.
-    """
-
+    # spline coefficients (rows, columns) on the fine grid, of the light of the layer times its cover
     light: NDArray[np.float32]
+    # those of the share of light from behind that the layer blocks; None for a layer that blocks all
     cover: NDArray[np.float32] | None = None
-    velocity: tuple[float, float] = (0.0, 0.0)
+    velocity: tuple[float, float] = (0.0, 0.0)  # motion of the layer over the scene, (x, y) in px/s
 
 
 def fine_shape(height: int, width: int) -> tuple[int, int]:
@@ -93,15 +89,7 @@ def longest_path(motion: Motion, starts: Array, exposure: float, size: tuple[int
 
 
 def take_frames(layers: Sequence[Layer], motion: Motion, starts: Array, exposure: float, width: int) -> Array:
-    """Frames (T, H, W) without noise.
-
-    Args:
-        layers: The scene, and what is in front of it.
-        motion: The motion of the camera.
-        starts: (T, H) exposure start of every row of every frame in s.
-        exposure: Exposure time in s.
-        width: Columns of a frame.
-    """
+    """Frames (T, H, W) without noise of a scene and what is in front of it, with exposure starts (T, H) in s."""
     size = (starts.shape[1], width)
     fastest = max(float(np.hypot(*part.velocity)) for part in layers)
     least, for_a_px, most = NODES

@@ -29,34 +29,22 @@ Tones = Array  # (K, 3): amplitude in px, frequency in Hz, phase in rad
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A recording and the timing that is passed to detection.
+    """A recording and the timing that is passed to detection."""
 
-    Attributes:
-        motion: The true motion.
-        tones: True tones of the axes (x, y), if the motion consists of them; otherwise None.
-        num_frames: Number of frames.
-        exposure: Exposure in rows of a frame of ``FULL_ROWS`` rows.
-        noise: Standard deviation of the noise.
-        scene: Name of the scene; None to draw one of ``SCENES``.
-        in_front: Layers in front of the scene, a function of height, width and generator.
-        taken: Number of each frame in a regular sequence; None for 0, 1, 2 ...
-        reverse: Whether the last row is read first.
-        stated: Errors of the stated timing: factors of ``row_time``, ``exposure_rows`` and ``frame_rows``.
-        time_stamps: Whether the true start times of the frames are stated.
-        crf: Quality of the H.264 video (libx264) that the frames are decoded from; None for frames without encoding.
-    """
-
-    motion: Motion
-    tones: tuple[Tones, Tones] | None
-    num_frames: int = 4
-    exposure: float = 20.0
-    noise: float = 0.005
-    scene: str | None = None
+    motion: Motion  # the true motion
+    tones: tuple[Tones, Tones] | None  # true tones of the axes (x, y), if the motion consists of them; otherwise None
+    num_frames: int = 4  # number of frames
+    exposure: float = 20.0  # exposure in rows of a frame of ``FULL_ROWS`` rows
+    noise: float = 0.005  # standard deviation of the noise
+    scene: str | None = None  # name of the scene; None to draw one of ``SCENES``
+    # layers in front of the scene, a function of height, width and generator
     in_front: Callable[[int, int, Generator], Layer] | None = None
-    taken: Sequence[int] | None = None
-    reverse: bool = False
+    taken: Sequence[int] | None = None  # number of each frame in a regular sequence; None for 0, 1, 2 ..
+    reverse: bool = False  # whether the last row is read first
+    # errors of the stated timing: factors of ``row_time``, ``exposure_rows`` and ``frame_rows``
     stated: dict[str, float] = field(default_factory=dict)
-    time_stamps: bool = False
+    time_stamps: bool = False  # whether the true start times of the frames are stated
+    # quality of the H.264 video (libx264) that the frames are decoded from; None for frames without encoding
     crf: int | None = None
 
     @property
@@ -67,23 +55,14 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The frames of a case with the truth.
+    """The frames of a case with the truth."""
 
-    Attributes:
-        case: The case.
-        frames: (T, H, W) with noise.
-        timing: The stated timing.
-        starts: (T, H) true exposure starts of the rows.
-        exposure: True exposure time in s.
-        layers: The scene and what is in front of it.
-    """
-
-    case: Case
-    frames: Array
-    timing: rsv.SensorTiming
-    starts: Array
-    exposure: float
-    layers: tuple[Layer, ...]
+    case: Case  # the case
+    frames: Array  # (T, H, W) with noise
+    timing: rsv.SensorTiming  # the stated timing
+    starts: Array  # (T, H) true exposure starts of the rows
+    exposure: float  # true exposure time in s
+    layers: tuple[Layer, ...]  # the scene and what is in front of it
 
     def displacement(self) -> Array:
         """True displacement of the rows, (2, T, H) in px."""

@@ -118,16 +118,8 @@ def take_frames(
 ) -> Array:
     """Frames (T, H, W) without noise, centred on a periodic scene of ``points`` per px along both axes.
 
-    Args:
-        scene: (points (H + 2 margin), points (W + 2 margin)).
-        shake: The motion.
-        timing: The camera.
-        num_frames: T.
-        size: (H, W).
-        points: Points of the scene per px.
-        between: Interpolated rows per row of the scene.
-        nodes: Quadrature nodes of an exposure; None: as many as the motion needs.
-        rows: ``fine_rows(scene, between)``, where it is used several times.
+    There are ``between`` interpolated rows per row of the scene; ``rows`` are ``fine_rows(scene, between)``, where they
+    are used several times. The quadrature of an exposure has as many ``nodes`` as the motion needs, if none are given.
     """
     rows = fine_rows(scene, between) if rows is None else rows
     top, left = ((whole - points * part) // 2 for whole, part in zip(scene.shape, size, strict=True))

@@ -123,13 +123,9 @@ def detect_by_libraries(frames: NDArray[np.float32], timing: rsv.SensorTiming) -
 
 
 def kernel_of_row(vibration: rsv.Vibration, start: float, timing: rsv.SensorTiming, moved: int) -> Array:
-    """The centred kernel of a row whose exposure begins at ``start``, by bilinear spreading (Eqs. 26-39).
+    """The centred kernel of a row whose exposure begins at ``start`` in s, by bilinear spreading (Eqs. 26-39).
 
-    Args:
-        vibration: One tone on either axis.
-        start: Seconds.
-        timing: The camera.
-        moved: Displacement of the slab around the row, in rows.
+    The slab around the row is ``moved`` by some rows.
     """
     count = int(np.ceil(timing.exposure_rows))
     times = start + (np.arange(count) + 0.5) / count * timing.exposure_time

@@ -16,12 +16,12 @@ import numpy as np
 import psutil
 import torch
 from benchmarks.independent_camera import closed, take_frames
-from harness import Rows, table
+from harness import Rows, table, table_of
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
-from rsvib_torch.live import LiveReport, TimedFrame, run_live
+from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.video import LiveReport, TimedFrame, run_live
 
 OPTIONS = {
     "minutes": (0.5, "live: duration of the session"),
@@ -282,49 +282,36 @@ def lines(rows: Rows, options: argparse.Namespace) -> list[str]:
                 ("frames, dropped", f"{one['frames']}, {one['dropped']}"),
                 (
                     "delay of the written frames in frame periods: median, 99 %",
-                    f"{one['delay_median']}, {one['delay_99']}",
+                    "{delay_median}, {delay_99}".format(**one),
                 ),
                 ("frames with a delay of at most 2 frame periods", f"{one['within_two']:.1%}"),
                 ("processor time per frame", f"{one['cpu']:.0f} ms"),
-                (
-                    "largest resident memory, change between the halves",
-                    f"{one['memory']:.0f} MiB, {one['drift']:+.1%}",
-                ),
+                ("largest resident memory, change between the halves", "{memory:.0f} MiB, {drift:+.1%}".format(**one)),
                 (
                     "frames with known motion, late ones that were predicted, detections",
-                    f"{one['tracked']:.1%}, {one['predicted']}, {one['detections']}",
+                    "{tracked:.1%}, {predicted}, {detections}".format(**one),
                 ),
                 *accuracies,
             ],
         ),
         f"Changes along x, {changes[0]['size']} x {changes[0]['size']}, rms errors from the beginning of the change:",
         "",
-        *table(
-            ("change", "amplitude (%)", "frequency (Hz)", "frames without known motion", "further detections"),
-            [
-                (
-                    row["name"],
-                    f"{100 * row['amplitude']:.2f}",
-                    f"{row['frequency']:.3f}",
-                    row["lost"],
-                    row["detections"] - 1,
-                )
-                for row in changes
-            ],
+        *table_of(
+            changes,
+            ("change", "{name}"),
+            ("amplitude (%)", lambda row: f"{100 * row['amplitude']:.2f}"),
+            ("frequency (Hz)", "{frequency:.3f}"),
+            ("frames without known motion", "{lost}"),
+            ("further detections", lambda row: row["detections"] - 1),
         ),
         "The same clip as fast as possible, with the motion between consecutive frames of the result:",
         "",
-        *table(
-            ("method", "frames/s", "processor ms per frame", "rows about the frame (px)", "whole frames (px)"),
-            [
-                (
-                    row["name"],
-                    "" if math.isnan(row["rate"]) else f"{row['rate']:.1f}",
-                    "" if math.isnan(row["cpu"]) else f"{row['cpu']:.0f}",
-                    f"{row['rows']:.3f}",
-                    f"{row['whole']:.3f}",
-                )
-                for row in timed
-            ],
+        *table_of(
+            timed,
+            ("method", "{name}"),
+            ("frames/s", lambda row: "" if math.isnan(row["rate"]) else f"{row['rate']:.1f}"),
+            ("processor ms per frame", lambda row: "" if math.isnan(row["cpu"]) else f"{row['cpu']:.0f}"),
+            ("rows about the frame (px)", "{rows:.3f}"),
+            ("whole frames (px)", "{whole:.3f}"),
         ),
     ]

@@ -28,7 +28,7 @@ from harness import Rows, one_thread, table
 from skimage import data
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation.scenes import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 OPTIONS = {
     "mosaic_size": (160, "mosaic: rows and columns of the frames"),

@@ -15,7 +15,7 @@ from benchmarks.independent_camera import ALIASING, POINTS_PER_PX, Array, Shake,
 from harness import Rows, one_thread, table
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 OPTIONS = {"orbit_size": ((512, 256), "orbit: rows and columns of the frames")}
 QUICK = {"orbit_size": (256, 128)}

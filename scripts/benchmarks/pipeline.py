@@ -17,11 +17,11 @@ import torch
 from benchmarks.independent_camera import Shake, closed, take_frames
 from benchmarks.library_chain import detect_by_libraries
 from benchmarks.restoration_peers import remap_lanczos, sampled_rows, slabs_and_kernels, wiener_loop, wiener_rows
-from harness import Rows, Timed, in_turns, named, shown_seconds, table
+from harness import Rows, Timed, in_turns, named, shown_seconds, table, table_of
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
 
 SCENES: dict[str, Callable[[int, int, int], Tensor]] = {
     "city": city_and_fields,
@@ -247,19 +247,15 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
             [chain, *(cell for r in here if r["chain"] == chain for cell in _accuracy_cells(r))] for chain in chains
         ]
         text += table((f"{scene}, exposure of {exposure} rows", *heads), cells)
-    heads = [f"a pair of {options.size} x {options.size} px", "seconds", "detection", "restoration"]
-    text += table(
-        (*heads, "FFT round trips: detection", "restoration per frame", "frames per second"),
-        [
-            (
-                r["chain"],
-                shown_seconds(r),
-                *(f"{r[f'{part}_seconds']:.3f}" for part in ("detection", "restoration")),
-                *(f"{r[f'{part}_round_trips']:.1f}" for part in ("detection", "restoration")),
-                f"{r['frames_a_second']:.1f}",
-            )
-            for r in timed
-        ],
+    text += table_of(
+        timed,
+        (f"a pair of {options.size} x {options.size} px", "{chain}"),
+        ("seconds", shown_seconds),
+        ("detection", "{detection_seconds:.3f}"),
+        ("restoration", "{restoration_seconds:.3f}"),
+        ("FFT round trips: detection", "{detection_round_trips:.1f}"),
+        ("restoration per frame", "{restoration_round_trips:.1f}"),
+        ("frames per second", "{frames_a_second:.1f}"),
     )
     unsure = [row for row in compared if row["chain"] == OURS and not row["reliable"]]
     text += [

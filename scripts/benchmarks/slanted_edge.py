@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import Rows, one_thread, table
+from harness import Rows, one_thread, table_of
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
@@ -112,32 +112,22 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as Markdown tables."""
     of_part = {part: [row for row in results if row["part"] == part] for part in ("gaussian", "other", "8 bits")}
     rounding = (f"{row['mtf50_percent']:+.2f} % at noise {row['noise']:g}" for row in of_part["8 bits"])
-    measured = ("MTF50, no noise", "MTF50 rms, noise 1 %")
+    noisy = ("MTF50 rms, noise 1 %", "{noisy_percent:.2f} %")
     return [
-        *table(
-            ("optics", "largest MTF error at 0.1 ... 0.5 cycles/px", *measured, "bound"),
-            [
-                (
-                    row["optics"],
-                    f"{row['mtf_error']:.0e}",
-                    f"{row['mtf50_percent']:.0e} %",
-                    f"{row['noisy_percent']:.2f} %",
-                    f"{row['bound_percent']:.2f} %",
-                )
-                for row in of_part["gaussian"]
-            ],
+        *table_of(
+            of_part["gaussian"],
+            ("optics", "{optics}"),
+            ("largest MTF error at 0.1 ... 0.5 cycles/px", "{mtf_error:.0e}"),
+            ("MTF50, no noise", "{mtf50_percent:.0e} %"),
+            noisy,
+            ("bound", "{bound_percent:.2f} %"),
         ),
-        *table(
-            ("optics", "largest MTF error at 0.02 ... 0.5 cycles/px", *measured),
-            [
-                (
-                    row["optics"],
-                    f"{row['mtf_error']:.0e}",
-                    f"{row['mtf50_percent']:+.4f} %",
-                    f"{row['noisy_percent']:.2f} %",
-                )
-                for row in of_part["other"]
-            ],
+        *table_of(
+            of_part["other"],
+            ("optics", "{optics}"),
+            ("largest MTF error at 0.02 ... 0.5 cycles/px", "{mtf_error:.0e}"),
+            ("MTF50, no noise", "{mtf50_percent:+.4f} %"),
+            noisy,
         ),
         f"8 bits, sigma = 0.5 px, contrast 204 counts, mean error of MTF50: {', '.join(rounding)}.",
     ]

@@ -20,7 +20,7 @@ import psutil
 from harness import Rows, plain_environment, table
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.stacks import process_stack
 from rsvib_torch.stacks.memory import memory_needed
 

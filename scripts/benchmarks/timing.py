@@ -47,18 +47,13 @@ RESTORED = 2  # frames
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake of the timing.
+    """A mistake of the timing."""
 
-    Attributes:
-        state: From the correct timing to the stated one.
-        setting: The mistaken setting, which an assumption must name. The ratio of frame period and row time is
-            ``frame_rows``, also if it is wrong because of ``row_time``.
-        code: Code of the reason that names this setting as the cause; empty for none.
-    """
-
-    state: Callable[[rsv.SensorTiming], rsv.SensorTiming]
+    state: Callable[[rsv.SensorTiming], rsv.SensorTiming]  # from the correct timing to the stated one
+    # the mistaken setting, which an assumption must name. The ratio of frame period and row time is ``frame_rows``,
+    # also if it is wrong because of ``row_time``.
     setting: str
-    code: str
+    code: str  # code of the reason that names this setting as the cause; empty for none
 
 
 def scaled(setting: str, code: str, **factors: float) -> Mistake:

@@ -20,7 +20,7 @@ from harness import Rows, one_thread, table
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.restoration import judge_restoration, restore
 
 OPTIONS = {

@@ -18,8 +18,8 @@ from harness import Rows, table, write_h264
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
-from rsvib_torch.stacks import process_video
+from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.video import process_video
 
 OPTIONS = {
     "video_frames": (300, "video: frames"),

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 LINE_TIME = 1e-4  # s
 DELAYS = (0.0, 73 * LINE_TIME, 200 * LINE_TIME)  # s; delay of each line

@@ -18,7 +18,7 @@ from rich.table import Table
 from torch import Tensor
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=600)
 TRUTH = rsv.Vibration(amplitude=[2.4, 3.1], frequency=[65.0, 50.0], phase=[0.7, -0.4])

@@ -16,7 +16,7 @@ from rich.console import Console
 from torch import Tensor, nn
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=60e-6, exposure_rows=10, frame_rows=200)
 PATCH, RIM = 64, 8  # px

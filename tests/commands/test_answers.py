@@ -23,7 +23,7 @@ from truth import draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch.commands import main
-from rsvib_torch.core.progress import listening
+from rsvib_torch.execution.progress import listening
 
 PROGRAM = Path(sys.executable).with_name("rsvib")
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=200)
@@ -277,7 +277,7 @@ def in_terminal(arguments, columns):
 LOOPS = """
 import time
 from rsvib_torch.commands.terminal import current_output, working
-from rsvib_torch.core.progress import listening, steps
+from rsvib_torch.execution.progress import listening, steps
 
 with working("restoring"):
     advance = steps(4, "frames")

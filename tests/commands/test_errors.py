@@ -10,8 +10,8 @@ from small_stack import CONFIG, TIMING, write_small
 from rsvib_torch import process_stack
 from rsvib_torch.commands.shared_options import check_new
 from rsvib_torch.commands.terminal import current_output, running
-from rsvib_torch.core.text import printable
 from rsvib_torch.io import StackFormat, formats
+from rsvib_torch.text import printable
 
 ONE_WINDOW = CONFIG.partition("[stack]")[0]
 

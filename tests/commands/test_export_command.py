@@ -10,7 +10,7 @@ import torch
 from program import refused, rsvib
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
 VIBRATION = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])

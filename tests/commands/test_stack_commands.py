@@ -10,7 +10,7 @@ from program import refused, rsvib
 from small_stack import CAMERA, HEIGHT, WIDTH, write_small
 
 from rsvib_torch import read_stack_info, write_stack
-from rsvib_torch.evaluation import example_frames
+from rsvib_torch.datasets import example_frames
 
 FRAMES = 13
 CONFIG = f"""{CAMERA}

@@ -7,8 +7,8 @@ import torch
 from refusals import refuses
 
 import rsvib_torch as rsv
-from rsvib_torch.core.progress import listening
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
+from rsvib_torch.execution.progress import listening
 
 SIZE = 192
 TIMING = rsv.SensorTiming(row_time=1 / (24 * 1.15 * SIZE), exposure_rows=2, frame_rows=1.15 * SIZE)

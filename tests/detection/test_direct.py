@@ -8,7 +8,7 @@ from scipy import ndimage
 from truth import Curve, Motion, draw_scene, recorded, take_frames
 
 from rsvib_torch import SensorNoise, SensorTiming, Vibration, detect_vibration, simulate_frames
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
 
 
 def errors(vibration, motion):

@@ -97,7 +97,7 @@ def test_image_motion_is_separated(scene):
     )
     frames = take_frames(wide, TIMING, scan, FRAMES, 0.005, margin=MARGIN + 80)
     found = rsv.detect_motion(torch.from_numpy(frames).float(), TIMING)
-    assert found.motion.image_motion[1] == pytest.approx(-500.0, rel=5e-3)
+    assert found.motion.tones.image_motion[1] == pytest.approx(-500.0, rel=5e-3)
     error = found.displacement.numpy() - scan.displacement(found.times.numpy())
     assert (rms(without_frame_mean(error - error.mean((0, 1)))) < 0.1).all()
 

@@ -12,7 +12,7 @@ from refusals import refuses
 from truth import Curve, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import example_frames
+from rsvib_torch.datasets import example_frames
 
 TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=25, frame_rows=1 / (60 * 4e-5))
 TONES = ((0.8, 137.0, 0.3), (0.05, 411.3, 1.0), (0.02, 266.0, 2.0))  # px, Hz, rad

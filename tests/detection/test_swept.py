@@ -10,7 +10,7 @@ from program import rsvib
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.core.reason import Reason
+from rsvib_torch.results.reason import Reason
 
 HEIGHT, WIDTH, FRAMES = 256, 160, 5
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=270)

@@ -6,8 +6,8 @@ import torch
 from scipy.interpolate import BSpline
 
 import rsvib_torch as rsv
-from rsvib_torch.core.splines import bspline_coefficients
 from rsvib_torch.evaluation.bound import Recording, cramer_rao_bound, projected_information
+from rsvib_torch.numerics.splines import bspline_coefficients
 
 TIMING = rsv.SensorTiming(row_time=160e-6, exposure_rows=3, frame_rows=300)
 FIELDS = ("amplitude", "frequency", "period", "phase", "image_motion")

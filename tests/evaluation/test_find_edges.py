@@ -8,7 +8,7 @@ from refusals import refuses
 from scipy.ndimage import rotate
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields, resolution_chart
+from rsvib_torch.datasets import city_and_fields, resolution_chart
 
 
 def test_every_edge_of_the_chart_is_found_and_measures_the_optics():

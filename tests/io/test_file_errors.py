@@ -12,7 +12,7 @@ import tifffile
 import torch
 from refusals import refuses
 
-from rsvib_torch.core.atomic import whole_file, whole_folder
+from rsvib_torch.files.atomic import whole_file, whole_folder
 from rsvib_torch.io import check_stack_target, read_stack, read_stack_info, write_stack
 
 FRAMES = torch.rand(3, 9, 7, generator=torch.Generator().manual_seed(1))

@@ -7,12 +7,12 @@ import pytest
 import torch
 from detections import detection_of
 
-from rsvib_torch.core.presentation import plain_values
-from rsvib_torch.core.result_files import decode
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.results import check_same_timing
+from rsvib_torch.results.presentation import plain_values
+from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks import read_manifest
 
 TIMING = SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)

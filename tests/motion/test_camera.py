@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 
 import rsvib_torch as rsv
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 
 LENS = rsv.Camera(574.0, (6.5, 9.5), (-0.12, 0.05, 1e-3, -2e-3, 0.01))
 

@@ -20,8 +20,7 @@ import torch
 from edge_truth import draw_edge, gaussian, mtf50_of, through_pixels
 from program import refused, rsvib
 
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.evaluation import resolution_chart
+from rsvib_torch.datasets import resolution_chart
 from rsvib_torch.imaging import SensorNoise, simulate_frames
 from rsvib_torch.io import write_stack
 from rsvib_torch.motion.timing import SensorTiming
@@ -31,6 +30,7 @@ from rsvib_torch.report.html.template import before_after, write_page
 from rsvib_torch.report.html.words import TERMS, overall_result, verdict_sentences
 from rsvib_torch.report.plots import gain_figure, motion_blur, psf_figure, rows_figure
 from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.results.reason import Reason
 
 TIMING = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=512)
 COMMAND = "rsvib report '<img src=x>.tif' out"

@@ -11,13 +11,13 @@ import pytest
 import torch
 from detections import result_of
 
-from rsvib_torch.core.reason import Reason
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.plots import comparison_figure, detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import read_vibration, write_offsets, write_restoration, write_vibration
 from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks import RestoredFrames
 
 TIMING = SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)

@@ -149,7 +149,7 @@ def test_missing_package_is_named_with_the_extra(monkeypatch, method, package):
     def without(name):
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
-    monkeypatch.setattr("rsvib_torch.core.checks.import_module", without)
+    monkeypatch.setattr("rsvib_torch.checks.values.import_module", without)
     with pytest.raises(ModuleNotFoundError, match=rf"{method} needs the package {package}: pip install .*\[tables\]"):
         getattr(detection_of(TWO_TONES), method)()
 

@@ -7,7 +7,7 @@ from exact_steps import model_of, solved
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration, psnr, simulate_frames
-from rsvib_torch.evaluation.scenes import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import restore as restore_by_any_method
 from rsvib_torch.restoration import visible_pixels
 from rsvib_torch.restoration.exact.exact import model_frames

@@ -9,8 +9,8 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.core.reason import Reason
 from rsvib_torch.restoration import judge_restoration, restore
+from rsvib_torch.results.reason import Reason
 
 SCENE, MOTION, NOISE = draw_scene(272, 240, seed=12), Motion(), 0.01
 quietly = partial(restore, check=False)

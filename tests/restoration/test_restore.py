@@ -15,7 +15,7 @@ from truth import Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
 from rsvib_torch import SensorTiming, Vibration, detect_vibration
-from rsvib_torch.evaluation import city_and_fields
+from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.restoration import (
     RestorationWarning,
     VibrationRestorer,

@@ -18,16 +18,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import chunks, runs
-from rsvib_torch.core.fourier import extend_rows, fast_length
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import Array, table, tables
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
+from rsvib_torch.execution.chunking import chunks, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing, shown_by_tones
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.registration.gradients import (
     BLOCK,
     RowGradients,
@@ -47,16 +47,11 @@ class FrameGroups:
     """M groups of G consecutive frames; those of a group are compared, and its last frame is the first of the next.
 
     The groups of all stacks are measured as one batch (B M), group after group of each stack.
-
-    Attributes:
-        spectra: Spectra of the F = M (G - 1) + 1 frames of B stacks.
-        starts: (B, F) s, exposure starts of their first rows.
-        count: Number M of groups.
     """
 
-    spectra: RowSpectra
-    starts: Tensor
-    count: int = 1
+    spectra: RowSpectra  # spectra of the F = M (G - 1) + 1 frames of B stacks
+    starts: Tensor  # (B, F) s, exposure starts of their first rows
+    count: int = 1  # number M of groups
 
     @property
     def size(self) -> int:
@@ -84,32 +79,20 @@ class FrameGroups:
 
 @dataclass(frozen=True, eq=False)
 class _Positions:
-    """Where the frames of a group contain scene rows.
+    """Where the frames of a group contain scene rows."""
 
-    Attributes:
-        scene_rows: (B, 1, S) scene rows s.
-        columns: (B, 1, 1) px, displacement along the rows that is common to the group and is not taken out.
-        rows: (B, G, S) frame rows that contain the scene rows.
-        shift: (B, G, S) px, displacement along the rows to be taken out.
-        exposure_starts: (B, G, S) s, exposure starts of the frame rows.
-    """
-
-    scene_rows: Tensor
-    columns: Tensor
-    rows: Tensor
-    shift: Tensor
-    exposure_starts: Tensor
+    scene_rows: Tensor  # (B, 1, S) scene rows s
+    columns: Tensor  # (B, 1, 1) px, displacement along the rows that is common to the group and is not taken out
+    rows: Tensor  # (B, G, S) frame rows that contain the scene rows
+    shift: Tensor  # (B, G, S) px, displacement along the rows to be taken out
+    exposure_starts: Tensor  # (B, G, S) s, exposure starts of the frame rows
 
     @classmethod
     def of(cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1) -> "_Positions":
         """Positions of every ``step``-th row of the scene that the middle of a group contains.
 
-        Args:
-            starts: (B, G) s, exposure starts of the first rows of the frames.
-            height: Rows of a frame.
-            timing: The sensor, in row order.
-            motion: Motion of each group (B).
-            step: Rows from one position to the next.
+        ``starts`` (B, G) are the exposure starts in s of the first rows of the frames, ``motion`` is that of each
+        group.
         """
         rows = torch.arange(0, height, step, dtype=torch.float64, device=starts.device)
         # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
@@ -151,10 +134,7 @@ def compared_intervals(
 def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | None = None) -> RowSpectra:
     """Spectra of grey frames (B, T, H, W) in row order, each frame with mean 0 and standard deviation 1.
 
-    Args:
-        frames: The frames.
-        valid: (B, T, H, W) bool, False for missing pixels; None if all are valid.
-        strips: Strips (B S) whose spectra are computed; None for whole rows.
+    Pixels are missing where ``valid`` is False. Those of ``strips`` (B S) are computed instead of those of whole rows.
     """
     if valid is None:
         sample = frames[..., ::4, :].flatten(-2)  # a copy: two passes take a tenth of the time of torch.var_mean
@@ -181,13 +161,10 @@ def frame_groups(
 ) -> list[FrameGroups]:
     """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
 
-    Args:
-        spectra: Spectra of all frames, from ``stack_spectra``.
-        timing: The sensor, in row order.
-        motion: Motion of each stack (B); an image motion limits how many frames contain the same part of the scene.
-        pairs_if_blurred_differently: Form pairs if exposures blur the frames differently, because only the blur of two
-            frames can be equalised. Pairs are enough for a tone; a free motion needs all frames that contain a row.
-        one_at_a_time: Measure one group at a time; otherwise as many as fit in the cache.
+    An image motion limits how many frames contain the same part of the scene. ``pairs_if_blurred_differently``: form
+    pairs if exposures blur the frames differently, because only the blur of two frames can be equalised. Pairs are
+    enough for a tone; a free motion needs all frames that contain a row. As many groups as fit in the cache are
+    measured together, unless ``one_at_a_time``.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
@@ -218,19 +195,11 @@ def measure_group(
     motion: Motion,
     gradients: RowGradients | None = None,
 ) -> tuple["MeasuredGroup", RowGradients]:
-    """Displacements of blocks of scene rows in the frames of groups, measured around a motion.
+    """Displacements of blocks of scene rows in the frames of groups, measured around a motion of each stack.
 
     The displacement of the motion is added to the measured residual displacement, so that the measurements do not
-    depend on the motion to first order.
-
-    Args:
-        group: The frames.
-        timing: The sensor, in row order.
-        motion: Motion of each stack (B) that the frames are warped by.
-        gradients: Gradients of the scene from a motion that differs by much less than a pixel; None to compute them.
-
-    Returns:
-        The measurements, and the gradients (B M) for the next call.
+    depend on the motion to first order. The gradients (B M) of the scene are computed unless those of a motion that
+    differs by much less than a pixel are given; they are returned with the measurements, for the next call.
     """
     spectra, motion = group.spectra_of_groups, group.motion_of_groups(motion)
     positions = _Positions.of(group.starts_of_groups, spectra.height, timing, motion)
@@ -247,19 +216,12 @@ def measure_group(
 
 @dataclass(frozen=True, eq=False)
 class _JoinedRows:
-    """Rows of full width, joined from strips that were warped by themselves; as ``RowSpectra`` for ``row_gradients``.
+    """Rows of full width, joined from strips that were warped alone; as ``RowSpectra`` for ``row_gradients``."""
 
-    Attributes:
-        width: Columns of a frame.
-        length: Of the transforms along the rows.
-        frequencies: (U,) cycles/px.
-        valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
-    """
-
-    width: int
-    length: int
-    frequencies: Tensor
-    valid: Tensor | None
+    width: int  # columns of a frame
+    length: int  # of the transforms along the rows
+    frequencies: Tensor  # (U,) cycles/px
+    valid: Tensor | None  # (B, S, W) bool, pixels of the scene that are valid in all frames; None for all
 
     def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
         """``valid``: the strips have been warped."""
@@ -335,19 +297,12 @@ def measure_strips(
 
 @dataclass(frozen=True, eq=False)
 class MeasuredGroup:
-    """Displacements of N blocks of rows of groups of G frames, as ``Measurements`` on the device of the frames.
+    """Displacements of N blocks of rows of groups of G frames, as ``Measurements`` on the device of the frames."""
 
-    Attributes:
-        exposure_starts: (B, N, G) s.
-        displacements: (B, N, G, A) px, up to the displacement of the scene.
-        visible: (B, N, G), 1 where a frame contains the block, else 0.
-        information: (B, N, A, A) px^-2.
-    """
-
-    exposure_starts: Tensor
-    displacements: Tensor
-    visible: Tensor
-    information: Tensor
+    exposure_starts: Tensor  # (B, N, G) s
+    displacements: Tensor  # (B, N, G, A) px, up to the displacement of the scene
+    visible: Tensor  # (B, N, G), 1 where a frame contains the block, else 0
+    information: Tensor  # (B, N, A, A) px^-2
 
 
 def _measured(
@@ -361,14 +316,8 @@ def _measured(
 ) -> MeasuredGroup:
     """Measurements of blocks from the products of the gradients with the differences of the frames.
 
-    Args:
-        group: The frames.
-        timing: The sensor, in row order.
-        motion: The motion (B M) of the groups with the components that are measured.
-        exposure_starts: (B M, G, S) s.
-        visible: (B M, G, S), 1 where a scene row is visible in a frame.
-        gradients: Gradients of the scene.
-        products: As ``RowGradients.residual_products``.
+    The motion (B M) has the components that are measured; ``exposure_starts`` (B M, G, S) are in s, ``visible`` (B M,
+    G, S) is 1 where a scene row is visible in a frame, ``products`` as ``RowGradients.residual_products``.
     """
     residual, information = _solved(*row_equations(products, gradients, visible))
     exposure_starts = _in_blocks(exposure_starts).mean(3)
@@ -487,12 +436,7 @@ def column_pattern_of(
 def differential_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
     """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
 
-    Rotation of the camera and parallax move the halves differently.
-
-    Args:
-        gradients: Gradients of all groups, from ``measure_groups``.
-        stacks: Number B of stacks.
-        rows: Rows over which the sums are taken.
+    Rotation of the camera and parallax move the halves differently. Arguments as in ``_rms_of_contrasts``.
     """
     return _rms_of_contrasts(gradients, stacks, rows, [[-1.0, 1.0]])
 
@@ -500,12 +444,8 @@ def differential_motion(gradients: list[RowGradients], stacks: int, *, rows: int
 def uneven_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
     """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
 
-    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not.
-
-    Args:
-        gradients: Gradients of all groups, from ``measure_groups``.
-        stacks: Number B of stacks.
-        rows: Rows over which the sums are taken.
+    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not. Arguments as in
+    ``_rms_of_contrasts``.
     """
     quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
     return _rms_of_contrasts(gradients, stacks, rows, [quadratic, cubic])
@@ -514,11 +454,8 @@ def uneven_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64)
 def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, weights: list[list[float]]) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
-    Args:
-        gradients: Gradients of all groups.
-        stacks: Number B of stacks.
-        rows: Rows over which the sums are taken.
-        weights: Weights of the parts in each contrast.
+    The gradients are those of all groups of B ``stacks``; sums are taken over ``rows`` rows. The weights of each
+    contrast are those of the parts.
     """
     excesses = []
     for of_group in gradients:
@@ -531,12 +468,7 @@ def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, wei
 
 
 def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual displacements of the parts of the rows from the first to the last frame, from sums over ``rows`` rows.
-
-    Args:
-        gradients: Gradients of a group.
-        rows: Rows over which the sums are taken.
-        parts: Number of parts, 2 or 4.
+    """Residual displacements of 2 or 4 parts of the rows from first to last frame, from sums over ``rows`` rows.
 
     Returns:
         The differences of the displacements (B, N, parts, 2) in px, the variance of their noise, and (B, N) whether all
@@ -592,14 +524,9 @@ def blur_ratio(
     An exposure blurs a row to second order by ``1 + M : grad grad / 2`` with the second moments M of the path. The
     difference of two warped frames is fitted by ``ratio (M_2 - M_1) : grad grad m / 2 + gain m``, m their mean. The
     offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Only coarse detail is
-    compared, along and across rows: interpolation errors of fine detail increase the ratio.
-
-    Args:
-        groups: The frames.
-        timing: The sensor, in row order.
-        motion: Motion of each stack (B).
-        block: Rows that are averaged, three of these blocks with the weights 1/4, 1/2, 1/4.
-        highest: Cycles/px along rows, below which the expansion is used; a blur of 2 px is then expanded to 20 %.
+    compared, along and across rows: interpolation errors of fine detail increase the ratio. Three blocks of ``block``
+    rows are averaged with the weights 1/4, 1/2, 1/4; ``highest`` is in cycles/px along rows, below which the expansion
+    is used; a blur of 2 px is then expanded to 20 %.
 
     Returns:
         (B,) each: ratio, its standard deviation, and the size of the expected difference relative to m.
@@ -699,7 +626,7 @@ def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away
 def _warp_to_scene(
     spectra: RowSpectra, positions: _Positions, timing: RowTiming, motion: Motion
 ) -> Callable[[slice], Tensor]:
-    """Function that warps the frames of a group to some of the scene rows, the frames of a pair with equal blur.
+    """Function from a slice of the scene rows to spectra (B, G, s, U) of the frames warped to them, with equal blur.
 
     A long exposure displaces fine detail by more or less than the mean displacement of the row, differently in each
     frame. Each frame of a pair is therefore blurred once more, by the kernel of the other frame, so that both equal
@@ -708,15 +635,6 @@ def _warp_to_scene(
     Kernels change from row to row, and such operators do not commute: a copy from a distance y was blurred by second
     moments M of the path that differ by ``y dM/ds`` to first order, which displaces detail by 0.01 px. Each node of the
     path is therefore corrected by ``y / 2 dM/ds`` times second derivatives of the image.
-
-    Args:
-        spectra: Spectra of the frames of a group.
-        positions: Where the frames contain the scene rows.
-        timing: The sensor, in row order.
-        motion: Motion of each stack (B).
-
-    Returns:
-        Function from a slice of the scene rows to warped spectra (B, G, s, U).
     """
     with_equal_blur = False
     if positions.rows.shape[1] == 2:

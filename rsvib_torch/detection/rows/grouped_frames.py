@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import Array, table, take_stacks, tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroups,
@@ -29,29 +27,26 @@ from rsvib_torch.detection.rows.displacements import (
     uneven_motion,
 )
 from rsvib_torch.detection.strips import FieldScale
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.field import ColumnMotion, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import Array, table, take_stacks, tensor
 from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.row_spectra import MARGIN
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRows:
-    """One round of measurements.
+    """One round of measurements."""
 
-    Attributes:
-        measurements: The components of the motion of every row.
-        gradients: Gradients of the scene, for further rounds.
-        apart: (B, N, 2) px^2, mean square difference of the displacements of strips from these components, less that by
-            noise; None if rows were measured as a whole.
-    """
-
-    measurements: Measurements
-    gradients: list[RowGradients]
+    measurements: Measurements  # the components of the motion of every row
+    gradients: list[RowGradients]  # gradients of the scene, for further rounds
+    # (B, N, 2) px^2, mean square difference of the displacements of strips from these components, less that by noise;
+    # None if rows were measured as a whole
     apart: Array | None = None
 
     @property
@@ -91,15 +86,10 @@ class MeasuredRows:
 
 @dataclass(frozen=True, eq=False)
 class GroupedFrames:
-    """Frames whose rows are measured as a whole.
+    """Frames whose rows are measured as a whole."""
 
-    Attributes:
-        groups: The frames.
-        timing: The sensor, in row order.
-    """
-
-    groups: list[FrameGroups]
-    timing: RowTiming
+    groups: list[FrameGroups]  # the frames
+    timing: RowTiming  # the sensor, in row order
 
     def measure(
         self,
@@ -151,14 +141,7 @@ class GroupedFrames:
 
 
 def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
-    """Frames (B, T, H, W) in groups for a motion of two components.
-
-    Args:
-        frames: Grey frames in row order.
-        valid: Their valid pixels, or None for all.
-        timing: The sensor, in row order.
-        motion: A first estimate of the motion.
-    """
+    """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given."""
     spectra = stack_spectra(frames, valid)
     return GroupedFrames(frame_groups(spectra, timing, motion, pairs_if_blurred_differently=True), timing)
 
@@ -175,21 +158,13 @@ def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | Fr
 
 @dataclass(frozen=True, eq=False)
 class GroupedStrips(GroupedFrames):
-    """Frames whose strips of columns are measured.
+    """Frames whose strips of columns are measured."""
 
-    Attributes:
-        scale: Components of the motion.
-        strips: The strips.
-        columns: (S,) px from the centre of the frame, middles of the strips.
-        num_frames: Frames of a stack.
-        slide: px, difference of the displacements of the middle of a strip and its ends.
-    """
-
-    scale: FieldScale
-    strips: ColumnStrips
-    columns: Tensor
-    num_frames: int
-    slide: float
+    scale: FieldScale  # components of the motion
+    strips: ColumnStrips  # the strips
+    columns: Tensor  # (S,) px from the centre of the frame, middles of the strips
+    num_frames: int  # frames of a stack
+    slide: float  # px, difference of the displacements of the middle of a strip and its ends
 
     def measure(
         self,
@@ -265,18 +240,12 @@ def grouped_strips(
     max_slide: float = 0.1,
     min_pitch: int = 48,
 ) -> GroupedStrips:
-    """Frames (B, T, H, W) in strips of columns.
+    """Frames (B, T, H, W) in strips of columns, for a motion of which all components are in px.
 
-    Args:
-        frames: Grey frames in row order.
-        valid: Their valid pixels, or None for all.
-        timing: The sensor, in row order.
-        motion: A first estimate of the motion, all components in px.
-        scale: Components of the motion.
-        pairs_if_blurred_differently: As in ``frame_groups``.
-        max_slide: px, difference of the displacements by roll and zoom of two neighbouring strips; the second order of
-            their interpolation blurs as an exposure with a path of this length.
-        min_pitch: Columns from the middle of a strip to that of the next; narrower strips consist of margins mostly.
+    ``pairs_if_blurred_differently`` as in ``frame_groups``. ``max_slide`` is the difference in px of the displacements
+    by roll and zoom of two neighbouring strips; the second order of their interpolation blurs as an exposure with a
+    path of this length. ``min_pitch`` are the columns from the middle of a strip to that of the next; narrower strips
+    consist of margins mostly.
     """
     field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()

@@ -18,20 +18,15 @@ from scipy import linalg
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, without_gradients
-from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.splines import gauss_legendre, spline_taps
-from rsvib_torch.core.tables import Array, table, tensor
-from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
@@ -45,8 +40,13 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import gauss_legendre, spline_taps
+from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FreeMotionOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_table
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text
 
 MAX_BAND_ERROR = 0.1  # px; smaller differences between the offsets of row bands and a motion are errors of registration
 _SECOND = (1.0, -2.0, 1.0)  # second difference
@@ -91,7 +91,7 @@ class MotionDetection(
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames()
         >>> found = rsv.detect_motion(frames, timing)
         >>> found.motion.displacement(torch.tensor(0.01, dtype=torch.float64)).shape  # px along x and y at 10 ms
@@ -141,14 +141,13 @@ def detect_motion(frames: FramesOrFiles, timing: SensorTiming, options: FreeMoti
         The motion in image axes with its uncertainty over time.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If there are fewer than two frames, a frame is constant or has too few valid pixels, the motion is
             beyond the search range, or an option is out of range.
 
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
         >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px
@@ -224,7 +223,7 @@ def _measure_field(
 ) -> tuple[MeasuredRows, FreeMotion]:
     """``measure_freely`` with roll and zoom, from a motion without them; all components in px."""
     still = torch.zeros_like(start.coefficients[:, :1]).expand(-1, scale.axes - 2, -1)
-    drift = torch.cat([start.image_motion, start.image_motion.new_zeros(1, scale.axes - 2)], -1)
+    drift = torch.cat([start.tones.image_motion, start.tones.image_motion.new_zeros(1, scale.axes - 2)], -1)
     tones = Vibration(torch.zeros(1, scale.axes, 1), 0.0, 0.0, drift)
     motion = FreeMotion(torch.cat([start.coefficients, still], 1), start.start, start.spacing, tones)
 
@@ -394,11 +393,9 @@ class _SplineFit:
         return self.start + (np.arange(self.coefficients.shape[-1]) - 1.0) * self.spacing
 
     def variances(self, index: Array, weights: Array) -> Array:
-        """Variances (S, F, A) of linear functions of the coefficients.
+        """Variances (S, F, A) of linear functions of coefficients ``index`` (S, M), at most ``step`` apart.
 
-        Args:
-            index: (S, M) coefficients of the functions, at most ``step`` apart.
-            weights: (S, F, M) their factors; the sum of a function is 1 or 0.
+        Their factors are ``weights`` (S, F, M); the sum of a function is 1 or 0.
         """
         part = np.minimum(index.min(1) // self.step, len(self.covariances[0]) - 1)
         place = index - self.step * part[:, None]
@@ -413,14 +410,9 @@ def _fit_spline(
     """Fit a spline with knots at a spacing in seconds to the measurements of one stack (B = 1), each axis by itself.
 
     Minimises ``sum w (d - relative(D))^2 + lambda |D''|^2``; lambda maximises the marginal likelihood. Rows are
-    compared within groups of frames only, so that the normal matrix is banded.
-
-    Args:
-        measurements: The displacements.
-        spacing: Seconds between knots.
-        record: Start and end of the record in seconds.
-        report_times: Times (S,) in s over which the motion has mean 0, if its uncertainty is asked for. The power
-            spectrum of the motion is then estimated as well, for splines of up to 800 knots.
+    compared within groups of frames only, so that the normal matrix is banded. ``record`` is start and end in seconds.
+    ``report_times`` (S,) in s are those over which the motion has mean 0, if its uncertainty is asked for. The power
+    spectrum of the motion is then estimated as well, for splines of up to 800 knots.
     """
     first, last = record
     axes = measurements.displacements.shape[-1]
@@ -457,14 +449,10 @@ def _normal_equations(
 
 
 def normal_bands(index: Array, weights: Array, seen: Array, row_weights: Array, count: int) -> Array:
-    """Lower bands (A, D, N) of the normal matrices of N coefficients for values relative to their group.
+    """Lower bands (A, D, N) of the normal matrices of N = ``count`` coefficients for values relative to their group.
 
-    Args:
-        index: (R, G, M) coefficients that the value of a row in a frame depends on.
-        weights: (R, G, M) their factors.
-        seen: (R, G), 1 where a frame contains the row, else 0.
-        row_weights: (A, R) weights of the rows in each matrix.
-        count: Number N of coefficients.
+    The value of a row in a frame depends on the coefficients ``index`` (R, G, M) by the factors ``weights``. ``seen``
+    (R, G) is 1 where a frame contains the row, else 0; ``row_weights`` (A, R) are those of the rows in each matrix.
     """
     inside = seen[..., None] > 0
     first = np.minimum(np.where(inside, index, count - 1).min((1, 2)), count - 1)
@@ -490,12 +478,8 @@ def _solved_spline(
 ) -> tuple[Array, Array | None, int]:
     """Coefficients (N,) of a smooth spline, their covariances and the step of these as in ``_SplineFit``.
 
-    Args:
-        band: Lower band (D, N) of the normal matrix.
-        right: (N,).
-        energy: Weighted sum of the squared displacements.
-        known: Number of independent displacements.
-        mean: (N,) function of the coefficients that has no variance; None for no covariances.
+    ``energy`` is the weighted sum of the squared displacements, of which ``known`` are independent; ``mean`` (N,) is a
+    function of the coefficients that has no variance, or None for no covariances.
     """
     count = len(right)
     rounding = 1e-12 * energy  # error of the sums that make the residual energy
@@ -545,11 +529,9 @@ def _solved_spline(
 
 
 def _inverse_near_diagonal(band: Array) -> tuple[int, Array]:
-    """Parts (K, 2 B, 2 B) of the inverse of a matrix, from the row and column k B on, and B.
+    """Parts (K, 2 B, 2 B) of the inverse of a matrix of lower band (B, N), from the row and column k B on, and B.
 
-    Args:
-        band: Its lower band (B, N). Blocks of B rows are eliminated from the last to the first; the inverse follows
-            from the first to the last.
+    Blocks of B rows are eliminated from the last to the first; the inverse follows from the first to the last.
     """
     width, count = band.shape
     blocks = max(2, -(-count // width))

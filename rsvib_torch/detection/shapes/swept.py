@@ -9,15 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_shapes
-from rsvib_torch.core.parallel import threads_for
-from rsvib_torch.core.precision import full_precision, without_gradients
-from rsvib_torch.core.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
-from rsvib_torch.core.progress import whole_steps
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.splines import gauss_legendre
-from rsvib_torch.core.tables import Array, split_axis, table, tensor, unit_wave
-from rsvib_torch.core.text import measured_text, text_table
+from rsvib_torch.checks.arguments import check_shapes
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
 from rsvib_torch.detection.shapes.free import (
@@ -33,6 +25,9 @@ from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.periodogram import explained_power
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.execution.progress import whole_steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
@@ -43,7 +38,12 @@ from rsvib_torch.frames.orientation import (
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.splines import gauss_legendre
+from rsvib_torch.numerics.tables import Array, split_axis, table, tensor, unit_wave
 from rsvib_torch.options import RegistrationOptions, SweptToneOptions
+from rsvib_torch.results.presentation import AXIS_NAMES, JudgedResult, axis_rows, verdict_lines, verdict_table
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text, text_table
 
 # Of 24 simulated tones in two frames, 10 were found more than 6 standard deviations from the truth (a steady tone of
 # 90 Hz as 83.6 ± 1.1 Hz with a decay of 68 ± 6 /s); of 12 in three frames and 48 in four frames, none.
@@ -94,7 +94,7 @@ class SweptTone(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, _ = example_frames(num_frames=4)  # of a steady tone
         >>> bool((rsv.detect_swept_tone(frames, timing).decay.abs() < 1).all())  # 1/s
         True
@@ -152,7 +152,6 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
         Parameters of both axes at the time origin, with standard deviations and verdict.
 
     Raises:
-        TypeError: If frames are not numbers.
         ValueError: If they cannot be registered, see ``detect_motion``, an option is out of range, or three frames
             cover more time than the grid of starts is searched in: 0.47 s for bands of 32 rows of 20 us.
 
@@ -162,7 +161,7 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
     Example:
         >>> import torch
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import city_and_fields
+        >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
         >>> times = torch.arange(0.0, 0.06, 2e-4, dtype=torch.float64)
         >>> decaying = 3.0 * torch.exp(-20 * times) * torch.sin(2 * torch.pi * 105 * times)  # px, 20/s
@@ -409,13 +408,7 @@ def _best_starts(banded: Measurements, axis: int, record: tuple[float, float], h
 def _settle(
     measured: Measurements, axis: int, record: tuple[float, float], fits: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Levenberg-Marquardt from several starts side by side.
-
-    Args:
-        measured: Displacements of one stack.
-        axis: Axis to fit.
-        record: Start and end of the record in seconds.
-        fits: (S, 6) start parameters.
+    """Levenberg-Marquardt from several starts (S, 6) side by side, for one axis of one stack.
 
     Returns:
         Best fit first: parameters (S, 6), their covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the

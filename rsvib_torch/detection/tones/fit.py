@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from scipy.linalg import block_diag
 
-from rsvib_torch.core.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, cos_sin, select_stacks, split_axis, tensor, unit_wave, without_nan
 
 MIN_GAIN = 0.1  # px of offset per px of displacement; below it, amplitudes are ten times noisier than offsets
 # px, amplitude of tones near blind frequencies, of x, y, roll and zoom. A clip with a blind vibration along y was
@@ -29,40 +29,27 @@ LARGEST = (30.0, 30.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Structure of the motion that is fitted.
+    """Structure of the motion that is fitted."""
 
-    Attributes:
-        harmonics: Tones come in families of a fundamental and its multiples up to this one, with one common frequency;
-            1 leaves all frequencies independent.
-        drift_order: 1 for a uniform image motion, 2 for a uniformly accelerated one.
-    """
-
+    # tones come in families of a fundamental and its multiples up to this one, with one common frequency; 1 leaves all
+    # frequencies independent
     harmonics: int = 1
-    drift_order: int = 1
+    drift_order: int = 1  # 1 for a uniform image motion, 2 for a uniformly accelerated one
 
 
 @dataclass(frozen=True, eq=False)
 class ToneFit:
-    """Fitted motion ``D(t) = Re sum_k C_k exp(2 pi i f_k s) + sum_j d_j s^j / j!`` of each axis, s = t - centre.
+    """Fitted motion ``D(t) = Re sum_k C_k exp(2 pi i f_k s) + sum_j d_j s^j / j!`` of each axis, s = t - centre."""
 
-    Attributes:
-        coefficients: (B, 2, K) complex128 C in px.
-        frequencies: (B, 2, K) float64 f in Hz.
-        active: (B, 2, K) bool, tones that exist.
-        drift: (B, 2, J) float64 d in px/s^j.
-        covariance: (B, 2 P, 2 P) float64 of the P = 3 K + J parameters [Re C, Im C, f of each tone, d] of x, then of y.
-            With roll and zoom there are A = 3 or 4 axes instead of 2, in the units of the measurements.
-        centre: (B,) float64 s, the middle of the record, where phase and frequency are least correlated.
-        model: Structure of the motion.
-    """
-
-    coefficients: Array
-    frequencies: Array
-    active: Array
-    drift: Array
+    coefficients: Array  # (B, 2, K) complex128 C in px
+    frequencies: Array  # (B, 2, K) float64 f in Hz
+    active: Array  # (B, 2, K) bool, tones that exist
+    drift: Array  # (B, 2, J) float64 d in px/s^j
+    # (B, 2 P, 2 P) float64 of the P = 3 K + J parameters [Re C, Im C, f of each tone, d] of x, then of y. With roll and
+    # zoom there are A = 3 or 4 axes instead of 2, in the units of the measurements.
     covariance: Array
-    centre: Array
-    model: MotionModel
+    centre: Array  # (B,) float64 s, the middle of the record, where phase and frequency are least correlated
+    model: MotionModel  # structure of the motion
 
     @property
     def tones(self) -> Array:
@@ -91,19 +78,12 @@ class ToneFit:
 
 
 def tone_response(measurements: Measurements, frequencies: Array) -> Array:
-    """Relative displacements that unit tones cause at the measurements.
+    """Relative displacements, complex128 (B, N, G, 2, K), that unit tones of frequencies (B, 2, K) in Hz cause.
 
     ``S(f) exp(2 pi i f (t - centre))`` at the mid-exposures t of the rows, less the mean over the frames of the group.
     ``S(f) = sinc(f T_e) sinc(f h T_row)`` is the attenuation by exposure (Eq. 2) and by a band of h rows; the
     difference from the group mean is the gain of Eq. (4). The times t contain the coupling of the scan with motion
     along it.
-
-    Args:
-        measurements: The displacements.
-        frequencies: (B, 2, K) Hz.
-
-    Returns:
-        complex128 (B, N, G, 2, K).
     """
     return measurements.relative(_tones_at(measurements, frequencies))
 
@@ -138,10 +118,8 @@ def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
 def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Array:
     """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C and f of each tone.
 
-    Args:
-        smearing_times: (2, 1, 2, 1) s, as in ``Measurements``.
-        time: (B, N, G, 1, 1) s, mid-exposures from the centre of the record.
-        tones: (B, 2, K, 3) Re C and Im C in px, and f >= 0 in Hz.
+    ``smearing_times`` as in ``Measurements``; ``time`` (B, N, G, 1, 1) in s are mid-exposures from the centre of the
+    record; ``tones`` (B, 2, K, 3) are Re C and Im C in px, and f >= 0 in Hz.
     """
     frequencies = tones[..., 2]
     smeared, smeared_slope = _sinc(frequencies * smearing_times)
@@ -185,32 +163,20 @@ def _constraints(model: MotionModel, tones: int, axes: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """Parameters with their residual and normal equations.
+    """Parameters with their residual and normal equations."""
 
-    Attributes:
-        values: (B, 2, P) all parameters.
-        jacobian: (B, N, G, 2, P) derivatives of the displacements of each axis by its parameters.
-        residual: (B, N, G, 2) px.
-        cost: (B,) weighted square of the residual.
-        matrix: (B, M, M) normal matrix of the free parameters.
-        right: (B, M) its right-hand side.
-    """
-
-    values: Array
-    jacobian: Array
-    residual: Array
-    cost: Array
-    matrix: Array
-    right: Array
+    values: Array  # (B, 2, P) all parameters
+    jacobian: Array  # (B, N, G, 2, P) derivatives of the displacements of each axis by its parameters
+    residual: Array  # (B, N, G, 2) px
+    cost: Array  # (B,) weighted square of the residual
+    matrix: Array  # (B, M, M) normal matrix of the free parameters
+    right: Array  # (B, M) its right-hand side
 
 
 class _Problem:
-    """Nonlinear least squares ``min sum_n r_n^T W_n r_n``, r the residual and W the information of scene row n.
+    """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` for the ``active`` (B, 2, K) tones of displacements.
 
-    Args:
-        measurements: The displacements.
-        active: (B, 2, K) bool, tones to fit.
-        model: Structure of the motion.
+    r is the residual and W the information of scene row n.
     """
 
     def __init__(self, measurements: Measurements, active: Array, model: MotionModel) -> None:
@@ -340,10 +306,7 @@ class _Problem:
     def solve(self, start: Array | ToneFit, iterations: int, tolerance: float) -> _Estimate:
         """Levenberg-Marquardt from start frequencies or another fit, each stack on its own.
 
-        Args:
-            start: As in ``fit_tones``.
-            iterations: At most.
-            tolerance: Relative decrease of the cost that a step must promise.
+        It ends when a step promises a relative decrease of the cost below the tolerance.
         """
         # 1. Start values.
         if isinstance(start, ToneFit):
@@ -395,10 +358,9 @@ def _step(state: _Estimate, free: Array, damping: Array) -> Array:
 def fit_roughly(
     measurements: Measurements, start: Array | ToneFit, active: Array, model: MotionModel, iterations: int = 5
 ) -> tuple[ToneFit, Array]:
-    """A few steps of ``fit_tones``, as a start for another fit.
+    """A few steps of ``fit_tones``, as a start for another fit; also returns the residual displacements (B, N, G, 2).
 
-    Returns:
-        The fit, whose covariance has no meaning, and its residual displacements (B, N, G, 2).
+    The covariance of the fit has no meaning.
     """
     problem = _Problem(measurements, active, model)
     state = problem.solve(start, iterations, tolerance=1e-4)
@@ -414,15 +376,9 @@ def fit_tones(
 ) -> ToneFit:
     """Fit all tones of both axes and the image motion by weighted least squares (Levenberg-Marquardt).
 
-    The gain of Eq. (7) is part of the model, so that a negative gain needs no special case.
-
-    Args:
-        measurements: The displacements.
-        start: (B, 2, K) start frequencies in Hz; with harmonics, K is a multiple of their number, each family with its
-            fundamental first. Or an earlier fit of the same tones.
-        active: (B, 2, K) bool, tones to fit; the others stay at zero.
-        model: Structure of the motion.
-        iterations: At most.
+    The gain of Eq. (7) is part of the model, so that a negative gain needs no special case. ``start`` are frequencies
+    (B, 2, K) in Hz, or an earlier fit of the same tones; with harmonics, K is a multiple of their number, each family
+    with its fundamental first. Tones that are not ``active`` (B, 2, K) stay at zero.
 
     Returns:
         The fit with its covariance. The variance of the errors of each axis is that of its residuals: with
@@ -439,10 +395,6 @@ def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
 
     Aliasing and fixed patterns depend on the scene, so that more frames do not average them out: in eight frames with
     little text, the amplitude was wrong by 6 standard deviations without this step, and by 3 with it.
-
-    Args:
-        measurements: The measurements of the fit, with its weights.
-        fit: With the covariance of its parameters.
     """
     problem = _Problem(measurements, fit.active, fit.model)
     fit = fit.about(measurements.centre)
@@ -466,10 +418,6 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
 
     Such a fit is exact for any errors, and its residual contains nothing of them. They may be as large as the
     displacements.
-
-    Args:
-        measurements: The measurements of the fit, with its weights.
-        fit: With the covariance of its parameters.
     """
     problem = _Problem(measurements, fit.active, fit.model)
     unknown = problem.num_spare <= 0.0
@@ -488,12 +436,7 @@ _MAX_PATH, _MAX_SIZE, _MAX_FREQUENCY = 1e3, 1e6, 1e9
 
 
 def is_bounded(fit: ToneFit, exposure_time: float) -> Array:
-    """(B,) bool, fits whose parameters are finite and of a size that frames can be warped by.
-
-    Args:
-        fit: With its covariance.
-        exposure_time: T_e in seconds.
-    """
+    """(B,) bool, fits whose parameters are finite and of a size that frames can be warped by."""
     amplitude, drift = fit.amplitude, np.abs(fit.drift).max(-1)
     cycles = without_nan(fit.frequencies * exposure_time, 0.0)
     path = (amplitude * np.minimum(2 * math.pi * cycles, 4 * cycles + 2)).sum(-1) + drift * exposure_time  # (B, A)
@@ -565,13 +508,7 @@ def vibration_of_fit(fit: ToneFit) -> tuple[Vibration, VibrationStd]:
 
 
 def displacement_std(fit: ToneFit, exposure_starts: Array, exposure_time: float) -> Array:
-    """Standard deviation (B, 2) in px of the displacement of rows without their mean, rms over the rows.
-
-    Args:
-        fit: With its covariance.
-        exposure_starts: (N,) s, exposure starts of the rows.
-        exposure_time: T_e in seconds.
-    """
+    """Standard deviation (B, 2) in px of the displacement of rows (N,) without their mean, rms over the rows."""
     jacobian = displacement_jacobian(fit, exposure_starts[None], exposure_time)
     jacobian = jacobian - jacobian.mean(1, keepdims=True)
     covariance = _covariance_of_axes(fit)
@@ -615,12 +552,8 @@ def shrunk(fit: ToneFit, intervals: Array) -> ToneFit:
     """The fit with uncertain amplitudes near blind frequencies reduced, for warping frames by its motion.
 
     An amplitude A of standard deviation s becomes ``A max(0, 1 - s^2 / A^2)`` (positive-part James-Stein estimate)
-    where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays.
-    Tones that hardly move the frames against each other, but through ``LARGEST`` of their size, are left out.
-
-    Args:
-        fit: With its covariance.
-        intervals: (M,) s, times between the frames compared.
+    where the gain is small. Where the gain is large, the tone moves the frames by what was measured, and stays. Tones
+    that hardly move the frames against each other, but through ``LARGEST`` of their size, are left out.
     """
     blindness = 1 / (1 + np.square(offset_gain(fit.frequencies, intervals) / MIN_GAIN))
     noise = np.square(amplitude_std(fit) / np.maximum(np.abs(fit.coefficients), 1e-30))

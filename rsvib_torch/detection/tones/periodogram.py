@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.fourier import fourier_sums
-from rsvib_torch.core.tables import Array, quantile, split_axis, take_stacks, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import MIN_GAIN, ToneFit, fit_roughly, tone_response
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.numerics.fourier import fourier_sums
+from rsvib_torch.numerics.tables import Array, quantile, split_axis, take_stacks, without_nan
 
 _OVERSAMPLING = 8  # grid points per 1 / duration: a peak between two of them keeps 98 % of its height
 _MAX_POWERS = 2**18  # frequencies, times weightings and stacks, at a time; each takes about 1.3 kB
@@ -27,22 +27,14 @@ def _grid(duration: float, sample_interval: float) -> tuple[float, int, int]:
 
 
 def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Array) -> Array:
-    """Decrease of the weighted sum of squares by a tone of each frequency and a uniform image motion.
+    """Decrease (B, S, A, F) of the weighted sum of squares by a tone of each frequency and a uniform image motion.
 
-    A weak prior on the amplitude suppresses blind frequencies, where a huge tone would fit noise.
+    A weak prior on the amplitude suppresses blind frequencies, where a huge tone would fit noise. ``weights`` (B, S, N,
+    A) are several weightings of the displacements.
 
     All sums over waves ``E = exp(2 pi i f t)`` are transforms. With ``A = sum_g E_g`` over the n frames that contain a
-    row, the squares of the cosine and of the sine relative to their means over these frames are
-    ``(R + Re Q) / 2`` and ``(R - Re Q) / 2``, and their product is ``Im Q / 2``, with ``Q = sum_g E_g^2 - A^2 / n`` and
-    ``R = n - |A|^2 / n``.
-
-    Args:
-        measurements: The displacements.
-        grid: Frequencies, from ``_grid``.
-        weights: (B, S, N, A), several weightings of the displacements.
-
-    Returns:
-        Weighted squares (B, S, A, F).
+    row, the squares of the cosine and of the sine relative to their means over these frames are ``(R + Re Q) / 2`` and
+    ``(R - Re Q) / 2``, and their product is ``Im Q / 2``, with ``Q = sum_g E_g^2 - A^2 / n`` and ``R = n - |A|^2 / n``.
     """
     # 1. Weights of rows and frames, and the normal equations of the image motion.
     seen, time = measurements.visible, measurements.middles[..., 0, 0]
@@ -81,13 +73,9 @@ def explained_power(
 ) -> Array:
     """Decrease of the weighted sum of squares by a wave and an image motion.
 
-    Args:
-        Q: Weighted sums of the square of the complex wave.
-        R: Those of its squared modulus.
-        with_values: Those of its product with the values.
-        with_drift: Those of its product with the drift by a unit image motion.
-        drift_value: Weighted sum of the products of drift and values.
-        drift_drift: That of the squares of the drift.
+    ``Q`` and ``R`` are weighted sums of the square of the complex wave and of its squared modulus, the others those of
+    products: of the wave ``with_values`` and ``with_drift``, the drift by a unit image motion; of drift and values; and
+    of the drift with itself.
     """
     # Normal equations of cosine and sine after elimination of the image motion, and the decrease by their solution.
     cosine = 0.5 * (R + Q.real) - np.square(with_drift.real) / drift_drift
@@ -102,17 +90,10 @@ def explained_power(
 def strongest_frequencies(
     measurements: Measurements, sample_interval: float, harmonics: int, count: int, weights: Array
 ) -> Array:
-    """Frequencies of the highest peaks of the periodogram.
+    """Frequencies (B, S, 2, count) in Hz of the highest peaks of the periodogram of residuals, highest first.
 
-    Args:
-        measurements: Residual displacements of the tones found so far.
-        sample_interval: Seconds between neighbouring rows or bands.
-        harmonics: Multiples of the frequency that are added up.
-        count: Number of peaks.
-        weights: (B, S, N, 2), weightings to search with.
-
-    Returns:
-        (B, S, 2, count) Hz, the highest peak first.
+    Measurements are ``sample_interval`` seconds apart; the powers of ``harmonics`` multiples are added up; the search
+    is made with each of S ``weights`` (B, S, N, 2).
     """
     grid = _grid(float(measurements.duration.max()), sample_interval)
     window = _OVERSAMPLING // 2
@@ -183,22 +164,12 @@ def best_candidate(
     *,
     leave_out: bool,
 ) -> tuple[ToneFit, Array]:
-    """The further tone of each axis that fits the majority of the rows best.
+    """The further tone of each axis that fits the majority of the rows best, as a rough fit and its residual.
 
-    The peaks of the periodogram of the residual are fitted roughly, each with the tones of an earlier fit.
-
-    Args:
-        measurements: The displacements of B stacks.
-        weighed: The same with the weights of the earlier fit.
-        before: The earlier fit.
-        residual: (B, N, G, 2) px, its residual.
-        active: (B, 2, K) bool, its tones and the further one (or family).
-        sample_interval: Seconds between neighbouring rows or bands.
-        leave_out: Also try fits without a stretch of the record. Clouds and objects that move by themselves cover
-            stretches of rows: without them, the other rows agree.
-
-    Returns:
-        A rough fit, and its residual (B, N, G, 2).
+    The peaks of the periodogram of the ``residual`` (B, N, G, 2) px of the fit ``before`` are fitted roughly, each with
+    the tones of that fit. ``weighed`` are the measurements with its weights, ``active`` (B, 2, K) its tones and the
+    further one (or family). With ``leave_out``, fits without a stretch of the record are tried as well: clouds and
+    objects that move by themselves cover stretches of rows, without which the other rows agree.
     """
     # 1. The parts of the record that are searched: all rows, and the rows without a stretch.
     model, harmonics = before.model, before.model.harmonics

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rsvib_torch.core.tables import Array, median, quantile, select_stacks, split_axis, take_stacks, without_nan
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.tones.fit import (
     LARGEST,
@@ -18,6 +17,7 @@ from rsvib_torch.detection.tones.fit import (
     residual_of,
 )
 from rsvib_torch.detection.tones.periodogram import best_candidate, visibility
+from rsvib_torch.numerics.tables import Array, median, quantile, select_stacks, split_axis, take_stacks, without_nan
 from rsvib_torch.options import MAX_TONES
 
 MIN_SIGNIFICANCE = 4.0  # amplitude over its standard deviation
@@ -35,20 +35,12 @@ def robust_fit(
     steps: int = 2,
     iterations: int = 30,
 ) -> tuple[ToneFit, Measurements]:
-    """Fit with the weights of outliers reduced in two steps (Tukey's biweight).
+    """Fit with the weights of outliers reduced in two steps (Tukey's biweight), and measurements with these weights.
 
-    Args:
-        measurements: The displacements.
-        frequencies: (B, 2, K) Hz to start from. Amplitudes and phases follow from them by linear equations; starts with
-            those of an earlier fit take more steps along the valleys of slow tones.
-        active: (B, 2, K) bool.
-        model: Structure of the motion.
-        residual: (B, N, G, 2) px of an earlier fit; None to start with a fit of equal weights.
-        steps: 1 if the residual is that of a fit with reduced weights.
-        iterations: As in ``fit_tones``.
-
-    Returns:
-        The fit and the measurements with its weights.
+    Amplitudes and phases follow by linear equations from the ``frequencies`` (B, 2, K) in Hz to start from, of which
+    some are ``active``; starts with those of an earlier fit take more steps along the valleys of slow tones. With the
+    ``residual`` (B, N, G, 2) px of an earlier fit there is no fit of equal weights first, and with that of a fit with
+    reduced weights one of the ``steps`` suffices.
     """
     if residual is None:
         rough, residual = fit_roughly(measurements, frequencies, active, model)
@@ -64,18 +56,12 @@ _ALIASES, _WRONG_SIZE = 2, 3.0  # frequencies on either side; standard deviation
 
 
 def with_best_aliases(measurements: Measurements, fit: ToneFit) -> ToneFit:
-    """One tone of each axis, of the frequency ``f + k / T`` that leaves the smallest residual.
+    """One tone of each axis, of the frequency ``f + k / T`` that leaves the smallest residual; without covariance.
 
     Tones that are a multiple of 1 / T apart, T the interval of the frames, differ within a frame only. The offsets of
     bands may confuse them: in 7 of 72 stacks of 6 to 8 frames, a tone of 90.5 Hz was taken for one of 30.2 Hz, and
-    further tones explained the difference, so that the axis was reliable and wrong.
-
-    Args:
-        measurements: Displacements of rows.
-        fit: Fit with one tone of each axis. Stacks with a small residual are not changed.
-
-    Returns:
-        The fit, whose covariance has no meaning.
+    further tones explained the difference, so that the axis was reliable and wrong. The measurements are of rows, the
+    fit has one tone of each axis; stacks with a small residual are not changed.
     """
     size = without_nan(median(measurements.sizes(residual_of(measurements, fit)), 1), 0.0)  # (B, A)
     wrong = (size > _WRONG_SIZE) & fit.active[..., 0]
@@ -351,11 +337,6 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array)
     that the record hardly resolves are uncertain, although both are needed. Tones of large gain whose offsets are below
     ``MIN_OFFSET`` may be residuals of interpolation and blur. Where the gain is small, small offsets do not mean a
     small amplitude, and the tone stays for the verdict. A family of harmonics is kept or dropped as a whole.
-
-    Args:
-        measurements: The measurements of the fit.
-        fit: With its covariance.
-        intervals: (M,) s, times between the frames compared.
     """
     harmonics = fit.model.harmonics
     needed = np.zeros_like(fit.active)

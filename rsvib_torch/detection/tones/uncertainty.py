@@ -31,8 +31,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
@@ -46,7 +44,9 @@ from rsvib_torch.detection.tones.fit import (
     tone_response,
     vibration_of_fit,
 )
+from rsvib_torch.execution.chunking import runs
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 
 # Mean, and standard deviations of b, c and s, of x and of y over the expected size of b; chosen with 220 recordings of
 # drawn and real scenes. In 60 others each behind optics of 0.4 and 0.55 px, with one tone in 2 to 8 frames, the rms
@@ -87,22 +87,14 @@ class LinearisedFit:
     x and y of a row are nearly independent, and each axis is a problem of its own. With roll and zoom, the components
     of a row are strongly correlated, and X contains the parameters of all axes: the displacement along x of all rows
     determines roll as well.
-
-    Attributes:
-        axes: The A axes of the problem.
-        root: (B, N, A, A) from px to standard deviations.
-        jacobian: X (B, D, A M), D = N G A.
-        inverse: X^+ (B, A M, D).
-        residual: (B, D) of the fit.
-        to_all: (P, M), from the free parameters of an axis to all.
     """
 
-    axes: list[int]
-    root: Array
-    jacobian: Array
-    inverse: Array
-    residual: Array
-    to_all: Array
+    axes: list[int]  # the A axes of the problem
+    root: Array  # (B, N, A, A) from px to standard deviations
+    jacobian: Array  # X (B, D, A M), D = N G A
+    inverse: Array  # X^+ (B, A M, D)
+    residual: Array  # (B, D) of the fit
+    to_all: Array  # (P, M), from the free parameters of an axis to all
 
     @classmethod
     def of_axes(cls, measurements: Measurements, fit: ToneFit, axes: list[int]) -> "LinearisedFit":
@@ -126,14 +118,10 @@ class LinearisedFit:
         return 1e-12 * np.square(self.root[..., self.axes.index(axis)]).sum((1, 2))
 
     def unexplained(self, response: Array, axis: int) -> tuple[Array, Array]:
-        """Part of a response that the parameters do not explain, and the change of the parameters by it.
+        """Part of a response that the parameters do not explain, and their change ``X^+ Z`` (B, A M, Q) by it.
 
-        Args:
-            response: (B, N, G, Q) displacements of an axis in px by unit effects.
-            axis: The axis.
-
-        Returns:
-            Whitened responses (B, D, Q) and ``X^+ Z`` (B, A M, Q).
+        The response (B, N, G, Q) consists of displacements of an axis in px by unit effects; the part (B, D, Q) is
+        whitened.
         """
         root = self.root[..., self.axes.index(axis)]
         Z = root[:, :, None, :, None] * response[:, :, :, None]  # (B, N, G, A, Q)
@@ -171,13 +159,7 @@ def _problems(measurements: Measurements, fit: ToneFit) -> list[tuple[int, Linea
 
 
 def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> ToneFit:
-    """The fit without the error by aliasing of x and y, and with its remaining uncertainty in the covariance.
-
-    Args:
-        measurements: The measurements of the fit, with its weights.
-        fit: With its covariance.
-        size: (B,) px, expected size of b.
-    """
+    """The fit without the error by aliasing of x and y, of expected size (B,) px; what remains is in the covariance."""
     size = np.maximum(size, 1e-9)[:, None]
     covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
     change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
@@ -217,12 +199,9 @@ def with_unknown_amplitudes(
 ) -> ToneFit:
     """The fit with errors of its amplitudes that the models of unequal blur and of aliasing do not contain.
 
-    Args:
-        fit: With its covariance.
-        aliasing: (B,) px, expected size of the bias by aliasing.
-        intervals: (M,) s, times between the frames that are compared; errors of offsets are amplified by a small gain.
-        exposure_time: T_e in seconds.
-        known: Number of axes for which ``without_aliasing`` accounts for aliasing.
+    ``aliasing`` (B,) px is the expected size of the bias, for which ``without_aliasing`` accounts on the first
+    ``known`` axes. ``intervals`` (M,) are the times in s between the frames that are compared: a small gain amplifies
+    errors of offsets.
     """
     size = fit.amplitude  # (B, A, K)
     path = size * np.minimum(2 * math.pi * fit.frequencies * exposure_time, 2.0)
@@ -245,15 +224,11 @@ def with_unknown_amplitudes(
 
 @dataclass(frozen=True, eq=False)
 class StatedFit:
-    """A fit with the uncertainty that is stated for it.
+    """A fit with the uncertainty that is stated for it."""
 
-    Attributes:
-        fit: The fit with its covariance.
-        displacement_std: (B, A) px, standard deviation of the displacement of rows without their mean, rms over the
-            rows; the effect of a further tone is that without linear trend, which the image motion contains.
-    """
-
-    fit: ToneFit
+    fit: ToneFit  # the fit with its covariance
+    # (B, A) px, standard deviation of the displacement of rows without their mean, rms over the rows; the effect of a
+    # further tone is that without linear trend, which the image motion contains
     displacement_std: Array
 
     def vibration(self) -> tuple[Vibration, VibrationStd]:
@@ -267,14 +242,8 @@ def with_further_tones(
 ) -> tuple[StatedFit, StatedFit]:
     """The fit with slow errors in its covariance, and the same with an allowance for a further tone.
 
-    Args:
-        measurements: The measurements of the fit, with its weights.
-        fit: With the covariance of its own parameters.
-        exposure_starts: (N,) s, exposure starts of the rows.
-        number_is_known: Whether there are no further tones; slow errors remain.
-
-    Returns:
-        The fit if there are no further tones, and if one may be hidden.
+    ``exposure_starts`` (N,) of the rows are in s. If the ``number_is_known``, there are no further tones; slow errors
+    remain.
     """
     rows = np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
     variance = np.square(displacement_std(fit, exposure_starts, measurements.exposure_time))
@@ -318,17 +287,9 @@ def _added(
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Covariance (B, A M, A M) of the free parameters and variance (B, A) of the displacement, by tones of an axis.
 
-    By slow errors only, and with a further tone.
-
-    Args:
-        measurements: As in ``with_further_tones``.
-        fit: As in ``with_further_tones``.
-        axis: Axis of the tones.
-        problem: The problem that contains the axis.
-        rows: (B, n) s, exposure starts of the rows.
-        jacobian: (B, n, A', P) derivatives of their displacements by the parameters of each axis.
-        slow_error: (B,) px, as from ``_slow_errors``.
-        number_is_known: As in ``with_further_tones``.
+    By slow errors only, of (B,) px as from ``_slow_errors``, and with a further tone. The ``problem`` contains the
+    axis. ``rows`` (B, n) are exposure starts in s, ``jacobian`` (B, n, A', P) the derivatives of their displacements by
+    the parameters of each axis. Other arguments as in ``with_further_tones``.
     """
     axes = problem.axes
     of_displacement = _without_trend(jacobian[:, :, axes] @ problem.to_all, rows)

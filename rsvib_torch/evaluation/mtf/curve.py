@@ -7,13 +7,13 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike
-from rsvib_torch.core.checks import check_number
-from rsvib_torch.core.presentation import Result
-from rsvib_torch.core.text import measured_text
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import ArrayLike
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.evaluation.mtf.edge import as_real, check_edge, check_roi, fit_edge, straighten
 from rsvib_torch.evaluation.mtf.spread import Tail, fit_spread
+from rsvib_torch.results.presentation import Result
+from rsvib_torch.text import measured_text
 
 
 @dataclass(frozen=True, repr=False)

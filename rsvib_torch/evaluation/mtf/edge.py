@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arrays import as_tensor
+from rsvib_torch.checks.arrays import as_tensor
 
 
 def edge_spread(distance: Tensor, sigma: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:

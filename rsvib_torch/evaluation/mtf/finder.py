@@ -10,9 +10,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.core.arguments import check_fields, check_shapes, checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, as_tensor
-from rsvib_torch.core.checks import check_whole_number
+from rsvib_torch.checks.arguments import check_fields, check_shapes, checks_arguments
+from rsvib_torch.checks.arrays import ArrayLike, as_tensor
+from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.evaluation.mtf.edge import (
     EdgeFit,
     Scatter,
@@ -83,7 +83,7 @@ def find_slanted_edges(
         The edges, those of the largest contrast times length first; no two of them overlap by more than half.
 
     Example:
-        >>> from rsvib_torch.evaluation import resolution_chart
+        >>> from rsvib_torch.datasets import resolution_chart
         >>> edges = find_slanted_edges(resolution_chart(512, 512))
         >>> len(edges), {round(abs(edge.angle), 1) for edge in edges}
         (16, {5.0})

@@ -8,12 +8,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from rsvib_torch.core.presentation import AXIS_NAMES, AXIS_UNITS
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.reason import Reason, on_command_line
-from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
 from rsvib_torch.evaluation import MtfCurve, find_slanted_edges, slanted_edge_mtf
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
@@ -30,7 +27,10 @@ from rsvib_torch.report.html.template import (
     write_page,
 )
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
+from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.results.reason import Reason, on_command_line
 from rsvib_torch.stacks import StackManifest
+from rsvib_torch.text import measured_text
 
 Box = tuple[int, int, int, int]  # top, left, height, width in px
 
@@ -259,11 +259,9 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         sentences[0] = words.WINDOWS_RESTORED
     mark = words.overall_result(result, report.verdict, restored)[0]
     if restored and report.windows is not None and report.windows.followed() is not None:
-        details = [] if report.verdict is None else [sentences[-1]]
-        sentences, mark = (
-            [words.FOLLOWED, *details],
-            "good" if report.verdict and report.verdict.overall == "helps" else "doubt",
-        )
+        verdict = report.verdict
+        sentences = [words.FOLLOWED, *([] if verdict is None else sentences[-1:])]
+        mark = "good" if verdict is not None and verdict.overall == "helps" else "doubt"
     if report.command is not None:
         sentences = list(map(on_command_line, sentences))
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.atomic import whole_file
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.result_files import figure_png
-from rsvib_torch.core.text import data_uri
+from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.reading import Table
 from rsvib_torch.report.plots import picture
+from rsvib_torch.results.result_files import figure_png
+from rsvib_torch.text import data_uri
 
 GreyLevels = tuple[float, float]  # values that are drawn black and white, full scale 1
 PERCENTILES = (0.2, 99.8)  # of the values of the images; few saturated or dead pixels do not reduce the contrast

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Literal
 
-from rsvib_torch.core.presentation import AXIS_NAMES
-from rsvib_torch.core.reading import Table
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.text import measured_text
 from rsvib_torch.detection import DetectionResult
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies, tone_head, tone_rows
 from rsvib_torch.report.plots import motion_blur, tones_text
 from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text
 
 Mark = Literal["good", "doubt", "bad"]
 _QUANTITIES = ("amplitude", "frequency", "period", "phase")

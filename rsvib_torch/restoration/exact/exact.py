@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extend_rows, extended_length, fast_length
-from rsvib_torch.core.parallel import in_parallel
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.tables import take_stacks
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import in_parallel
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.numerics.fourier import extend_rows, extended_length, fast_length
+from rsvib_torch.numerics.tables import take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import (
     FILLED_BLUR_REACH,
@@ -60,18 +60,10 @@ def restore_exact(
     frequency. The interpolation error of the kernel counts as noise. Several frames of one scene add their normal
     matrices.
 
-    Args:
-        frames: (B, T, C, H, W) in row order, with local means at missing pixels.
-        motion: Motion of the frames.
-        options: Options of the method.
-        ignore: Boolean mask shaped like the frames of missing pixels, whose values are estimated from all others.
-        clipped: Boolean mask of saturated pixels, whose values are lower bounds, which are held approximately.
-        strips: Number of neighbouring stacks of the batch that are strips of columns of the same frames. They have one
-            noise level, and one strength of the prior for each level.
-
-    Returns:
-        Restored frames of the same shape, or (B, 1, C, H, W); with ``scale=2``, of twice the rows and columns, point
-        (2 i, 2 j) at pixel (i, j).
+    Arguments and result as above ``METHODS``. Values of missing pixels are estimated from all others; those of
+    saturated pixels are lower bounds, which are held approximately. ``strips`` neighbouring stacks of the batch are
+    strips of columns of the same frames: they have one noise level, and one strength of the prior for each level. With
+    ``scale=2``, point (2 i, 2 j) of the result is at pixel (i, j).
     """
     # 1. Check the options, and list the frames of each result.
     factor, scale, prior = options.regularisation, options.scale, options.prior

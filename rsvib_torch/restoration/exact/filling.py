@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.fourier import extend_rows, fast_length
+from rsvib_torch.numerics.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
 
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame
@@ -49,16 +49,10 @@ def with_missing_values(
     """The problem with missing values replaced by what the solution for all other data predicts.
 
     The missing values x solve ``x = (K c(x))`` where they are, with the solution c(x) for the filled data. Conjugate
-    gradients, each step of which is one fast solution, start from the solution of the most complete frames. Lower
-    bounds are held approximately, by two rounds of an active set: at the beginning of each, values that are predicted
-    below their bound are set to it, and count as measured from then on.
-
-    Args:
-        problem: N scenes, whose data have any values where they are missing.
-        measured: (N, M, C, R, L) mask of measured values.
-        floor: (N, M, C, R, L) lower bound of the missing values (saturated pixels), or None.
-        iterations: Largest number of iterations.
-        tolerance: Residual of the missing values, in units of the noise level, at which iterations stop.
+    gradients, each step of which is one fast solution, start from the solution of the most complete frames, until the
+    residual is ``tolerance`` times the noise level. The lower bounds ``floor`` (N, M, C, R, L) of saturated pixels are
+    held approximately, by two rounds of an active set: at the beginning of each, values that are predicted below their
+    bound are set to it, and count as ``measured`` (N, M, C, R, L) from then on.
     """
     data, solver = problem.data, problem.solver(keep=True)
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
 
-from rsvib_torch.core.fourier import extend_rows
-from rsvib_torch.core.progress import steps
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
+from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.exact import given_level, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
@@ -50,14 +50,9 @@ def _colours(components: Tensor) -> Tensor:
 class MosaicSolver:
     """Minimises ``sum_m w_m |V_m^(1/2) (g_m - K_m c)|^2 + sum_k c_k^H P_k c_k`` for the components c_k of a scene.
 
-    The weights V of the colours of a pixel couple all frequencies and components. Conjugate gradients are
-    preconditioned by the banded systems of each component with V replaced by its mean.
-
-    Args:
-        observation: Observation operator K of M frames of R rows.
-        weights: V, (M, 3, R, L) or (1, 3, R, L).
-        precisions: P_k, as from ``PolynomialPrior.precision``.
-        partition: Parts solved at a time.
+    The ``weights`` V, (M, 3, R, L) or (1, 3, R, L), of the colours of a pixel couple all frequencies and components.
+    Conjugate gradients are preconditioned by the banded systems of each component with V replaced by its mean. The
+    ``precisions`` P_k are as from ``PolynomialPrior.precision``.
     """
 
     def __init__(
@@ -147,25 +142,16 @@ def restore_mosaic(
     ignore: Tensor | None = None,
     clipped: Tensor | None = None,
 ) -> Tensor:
-    """Colour images from mosaics, all frames of a group and all three colours together.
+    """Colour images (B, groups, 3, scale H, scale W) from mosaics: all frames of a group and all colours together.
 
     The scene is unknown on a grid of half pixels, as in ``restore_exact`` with ``scale=2``, and each pixel measures one
     of its colours. Luminance and two colour differences have independent priors, fitted to frames whose missing colours
-    are first interpolated and then predicted from the restored scene. ``similar_patches`` removes noise from it.
-    Where the frames do not determine the colours, as with one frame, ``similar_patches`` interpolates those of each.
+    are first interpolated and then predicted from the restored scene. ``similar_patches`` removes noise from it. Where
+    the frames do not determine the colours, as with one frame, ``similar_patches`` interpolates those of each.
 
-    Args:
-        frames: (B, T, 1, H, W) in row order, with local means at missing pixels.
-        motion: Motion of the frames.
-        colours: (B, T, 1, H, W), the colour that each pixel measures, 0 to 2.
-        options: As in ``restore_exact``, with a prior that declares ``mosaic`` in ``PRIORS``. ``noise="auto"`` is
-            estimated from the residual of the frames of a group. With one frame it is hardly known, and too low rather
-            than too high.
-        ignore: (B, T, 1, H, W) bool, missing pixels; None for none.
-        clipped: (B, T, 1, H, W) bool, saturated pixels, whose values are lower bounds; None for none.
-
-    Returns:
-        (B, groups, 3, scale H, scale W).
+    Arguments as above ``METHODS``; ``colours`` (B, T, 1, H, W) is the colour that each pixel measures, 0 to 2, and the
+    prior declares ``mosaic`` in ``PRIORS``. ``noise="auto"`` is estimated from the residual of the frames of a group.
+    With one frame it is hardly known, and too low rather than too high.
     """
     # 1. Check the options, and list the frames of each result.
     height, width = frames.shape[-2:]

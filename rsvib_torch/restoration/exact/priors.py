@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.checks import check_choice
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import in_parallel
+from rsvib_torch.checks.values import check_choice
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem
 from rsvib_torch.restoration.scene_model.observation import KERNEL_REACH, kernel_samples
 

@@ -20,15 +20,15 @@ from math import prod
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import (
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
+from rsvib_torch.numerics.banded_solver import (
     BandedFactor,
     InterpolatedFactors,
     factor_banded,
     node_frequencies,
     solve_halves,
 )
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.parallel import allowed_threads, in_parallel
 from rsvib_torch.restoration.scene_model.observation import Observation
 
 
@@ -60,14 +60,10 @@ def join_windows(values: Tensor, windows: list[slice]) -> Tensor:
 
 @dataclass(eq=False)
 class Partition:
-    """Which parts of the systems of a scene are solved at a time, in memory that is used again.
+    """Which parts of the systems of a scene are solved at a time, in memory that is used again."""
 
-    Attributes:
-        chunk: Frequencies solved at a time; None: chosen by memory.
-        segments: Number of windows of rows; None: as many as make a step of the elimination worth its call.
-    """
-
-    chunk: int | None = None
+    chunk: int | None = None  # frequencies solved at a time; None: chosen by memory
+    # number of windows of rows; None: as many as make a step of the elimination worth its call
     segments: int | None = None
     _buffers: dict[int, Tensor] = field(default_factory=dict)
 
@@ -131,14 +127,9 @@ class Partition:
 class SceneSolver:
     """Solver of the normal equations of N scenes.
 
-    Args:
-        observation: Observation operator of the scenes.
-        precision: P, products (p + 1, p + 1, N, U) as from ``RowPrior.precision``, in units of the noise of weight 1.
-        partition: Parts solved at a time.
-        keep: Keep the factors, for solving several times.
-
-    Attributes:
-        parts: Frequencies that are solved at a time.
+    The ``precision`` P are products (p + 1, p + 1, N, U) as from ``RowPrior.precision``, in units of the noise of
+    weight 1. ``keep`` keeps the factors, for solving several times. ``parts`` are the frequencies that are solved at a
+    time.
     """
 
     def __init__(

@@ -30,16 +30,9 @@ def similar_patches(
 ) -> Tensor:
     """Colour images (N, C, H, W) whose groups of similar patches are Gaussian, from noisy or missing values.
 
-    Groups are chosen again in each round, from the images of the round before.
-
-    Args:
-        images: (N, C, H, W) to start from.
-        values: (N, C, H, W) measured values.
-        measured: (C, H, W) mask of the measured ones, the same number at every pixel, which repeats every two rows and
-            columns; None if all are measured.
-        level: Standard deviation of their noise.
-        rounds: Number of rounds.
-        steps: Steps of expectation maximisation in a round.
+    Groups are chosen again in each of the ``rounds``, from the images of the round before, and have ``steps`` of
+    expectation maximisation. ``values`` have noise of standard deviation ``level``; the mask ``measured`` (C, H, W) has
+    the same number at every pixel, and repeats every two rows and columns; None if all are measured.
     """
     if min(images.shape[-2:]) < _PATCH + _REACH:
         return images

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from rsvib_torch.core.chunking import runs
-from rsvib_torch.core.fourier import waves
-from rsvib_torch.core.parallel import allowed_threads, in_parallel
+from rsvib_torch.checks.arrays import Array
+from rsvib_torch.execution.chunking import runs
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
+from rsvib_torch.numerics.fourier import waves
 from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
-
-Array = NDArray[Any]
 
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
 
@@ -275,22 +274,14 @@ def prior_strengths(
     *,
     certain: bool = True,
 ) -> NDArray[np.float64]:
-    """Factors (S,) on the prior for restoring S scenes.
+    """Factors (S,), of a few, on the prior for restoring S scenes.
 
     The prior is fitted to the power spectrum of the frames minus that of the noise. A weaker one predicts pixels better
     where dense texture is taken for noise, or where the scene differs from its mean spectrum.
 
-    Args:
-        images: (S, M, C, R, W) of each scene, in row order.
-        kernels: Kernels of the rows of S M images.
-        prior: Fitted to them.
-        noise_power: (S, 1) variance of the noise of images of weight 1.
-        blur_reach: (S, 1), of ``RowPrior.precision``.
-        certain: Whether the noise level is given or estimated from several frames. That of a single frame includes
-            texture, so that the prior cannot be too weak.
-
-    Returns:
-        One of a few factors for each scene.
+    The images (S, M, C, R, W) are in row order; ``noise_power`` (S, 1) is that of images of weight 1, ``blur_reach``
+    (S, 1) as in ``RowPrior.precision``. The noise level is ``certain`` if it is given or estimated from several frames:
+    that of a single frame includes texture, so that the prior cannot be too weak.
     """
     height, width = images.shape[-2:]
     if min(height, width) < 64:  # too few values for a choice

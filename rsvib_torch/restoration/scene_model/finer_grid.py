@@ -21,8 +21,8 @@ from math import pi
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.splines import bspline_weights
 from rsvib_torch.imaging.blur import row_taps
+from rsvib_torch.numerics.splines import bspline_weights
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import (
     MARGIN,
@@ -220,18 +220,11 @@ class PolynomialPrior:
 def fit_polynomial_prior(
     frames: Tensor, motion: FrameMotion, levels: Tensor, length: int, iterations: int = 60
 ) -> PolynomialPrior:
-    """Fit the prior to the frames of one stack, whose spectrum is blurred and aliased.
+    """Fit the prior to the frames (1, T, C, H, W) of one stack in row order, whose spectrum is blurred and aliased.
 
-    The expected power of a frame at (u, v) is that of the noise plus that of the scene, through the blur of the
+    The expected power of a frame at (u, v) is that of the noise (1, T) plus that of the scene, through the blur of the
     exposure, at (u - a, v - b) for all aliases within 1 cycle per px. Observed powers are distributed like chi-squared
-    around it (Whittle likelihood): scoring for the logarithms of a_mn.
-
-    Args:
-        frames: (1, T, C, H, W) in row order.
-        motion: Motion of the frames.
-        levels: (1, T) standard deviation of the noise of each frame.
-        length: Length of the Fourier transform along rows.
-        iterations: Largest number of steps.
+    around it (Whittle likelihood): scoring for the logarithms of a_mn. ``length`` is that of the transform along rows.
     """
     spectrum = observed_spectrum(frames, motion, levels, length)
     u, v = spectrum.u[:, None], spectrum.v

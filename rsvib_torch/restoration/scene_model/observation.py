@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.banded_solver import from_both_ends
-from rsvib_torch.core.fourier import shift_phases
-from rsvib_torch.core.splines import correlated, gauss_legendre
 from rsvib_torch.imaging.blur import row_taps, row_transfer
+from rsvib_torch.numerics.banded_solver import from_both_ends
+from rsvib_torch.numerics.fourier import shift_phases
+from rsvib_torch.numerics.splines import correlated, gauss_legendre
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH
@@ -243,12 +243,10 @@ class SmoothBand:
         return replace(self, left=left, windows=len(windows), rows=len(parts))
 
     def at(self, u: Tensor, precision: Tensor, out: Tensor | None = None) -> Tensor:
-        """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex.
+        """Halves (H + b, 2 b + 1, 2 n U) of the matrices in windows, complex, at frequencies u (U,) in cycles per px.
 
-        Args:
-            u: (U,) frequencies in cycles per px.
-            precision: Products (p + 1, p + 1, N, U) of the prior there.
-            out: Memory for them; page faults in fresh memory take as long as the product that fills it.
+        The ``precision`` are products (p + 1, p + 1, N, U) of the prior there; ``out`` is memory for the halves: page
+        faults in fresh memory take as long as the product that fills it.
         """
         bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], out)
         real = bands[..., 0].unflatten(3, (-1, self.windows))
@@ -282,13 +280,8 @@ def normal_matrices(
 ) -> Tensor:
     """Bands (K + b, 2 b + 1, N, 2 Q) of ``sum_m w_m K_m^H K_m`` of N scenes at the Chebyshev nodes, float64.
 
-    Args:
-        kernels: Kernels of the frames, those of a scene one after the other.
-        top: First coefficient of the scenes.
-        count: K.
-        width: Half-width b of the band.
-        dtype: dtype of the frames, which determines the number of nodes.
-        num_scenes: N.
+    The kernels are those of the frames of one scene after the other; K = ``count`` coefficients from ``top`` on, b is
+    the ``width``, and the dtype of the frames determines the number of nodes.
     """
     nodes, _ = interpolation_matrix(2 * kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
     nodes = nodes.to(kernels.middle.device)
@@ -313,14 +306,8 @@ class Observation:
 
     ``A`` and ``A_adjoint`` have images of whole frames; ``forward`` and ``adjoint`` have spectra of some frequencies.
 
-    Args:
-        kernels: Kernels of the rows of N M frames, those of a scene one after the other.
-        num_rows: R.
-        period: L in px.
-        dtype: dtype of the data.
-        num_scenes: N.
-
     Attributes:
+        kernels: Kernels of the rows of N M frames, those of a scene one after the other.
         u: (U,) frequencies along the rows in cycles per px, on the CPU.
         top: First scene row that is observed or needed to evaluate a scene, in frame coordinates.
         count: Number of such scene rows, K.

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extend_rows, squared_modulus, waves
-from rsvib_torch.core.splines import mirrored
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
+from rsvib_torch.numerics.splines import mirrored
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
 
@@ -128,17 +128,10 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
     """Fit the prior to the power spectrum of blurred, noisy frames by expectation maximisation.
 
     Each step computes the expected power spectrum of the scene for the current model, the sum of the squared Wiener
-    estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations).
-
-    Args:
-        observed: (N, U, V) power of the frames, horizontal frequencies by vertical ones.
-        transfer: (N, U, V) squared transfer function of the blur.
-        aliases: (N, T, U, V) power of the interpolation error of the kernel between rows, through the blur of each
-            frame, for a wave of power 1.
-        noise_power: (N, U, V) power of the noise in each value.
-
-    Returns:
-        The priors.
+    estimate and of its variance, and fits the autoregressive model to it (Yule-Walker equations). ``observed`` (N, U,
+    V) is the power of the frames, horizontal frequencies by vertical ones, ``transfer`` that of the blur, and
+    ``noise_power`` that of the noise. ``aliases`` (N, T, U, V) is the power of the interpolation error of the kernel
+    between rows, through the blur of each frame, for a wave of power 1.
     """
     excess = observed - noise_power
     # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
@@ -227,8 +220,7 @@ class ObservedSpectrum:
     def weighted(self, transfer: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Observed power (N, U, V), weights (N, T, pieces, U, V) of sum 1, and power (N, U, V) of the noise.
 
-        Args:
-            transfer: Squared transfer function of each piece; pieces with a stronger one and less noise weigh more.
+        Pieces with a stronger squared ``transfer`` and less noise weigh more.
         """
         weight = transfer / self.levels.to(torch.float64).square()[..., None, None, None]
         total = weight.sum((1, 2)).clamp(min=_TINY)
@@ -288,11 +280,7 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
 
 
 def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) -> RowPrior:
-    """Fit the priors to the frames of N stacks: to their ``observed_spectrum``, whose arguments it has.
-
-    Returns:
-        The priors for transforms of that length.
-    """
+    """Fit the priors to the frames of N stacks: to their ``observed_spectrum``, whose arguments it has."""
     spectrum = observed_spectrum(frames, motion, levels, length)
     # blur at the vertical frequencies, and at those of the two strongest aliases across rows: all others together have
     # less than 4 % of their power

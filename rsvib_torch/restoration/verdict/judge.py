@@ -16,14 +16,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rsvib_torch.core.arguments import checks_arguments
-from rsvib_torch.core.arrays import ArrayLike, Channels, as_tensor
-from rsvib_torch.core.checks import check_whole_number
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.presentation import JudgedResult
-from rsvib_torch.core.progress import steps
-from rsvib_torch.core.reason import Reason
-from rsvib_torch.core.text import measured_text, text_table, wrapped
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import ArrayLike, Channels, as_tensor
+from rsvib_torch.checks.values import check_whole_number
+from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
@@ -45,6 +42,9 @@ from rsvib_torch.restoration.verdict.pairs import (
     shared_part,
 )
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
+from rsvib_torch.results.presentation import JudgedResult
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text, text_table, wrapped
 
 Outcome = Literal["helps", "unknown", "partly", "worse"]
 _OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
@@ -94,7 +94,7 @@ class RestorationVerdict(
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> restored = rsv.restore(frames, timing, vibration, check=False)
         >>> verdict = rsv.judge_restoration(frames, restored, timing, vibration)
@@ -334,12 +334,11 @@ def judge_restoration(
         may differ in brightness and contrast.
 
     Raises:
-        TypeError: If an argument has the wrong type.
         ValueError: If there is one frame only, shapes differ, or two frames have too little in common.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.evaluation import example_frames
+        >>> from rsvib_torch.datasets import example_frames
         >>> frames, timing, vibration = example_frames()
         >>> wrong = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[3.6, 4.1])  # opposite phase
         >>> for candidate in (vibration, wrong):
@@ -418,11 +417,7 @@ def judge_prepared(
     joint: bool | int = False,
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
-    """``judge_restoration`` of one stack of frames that are already prepared; arguments as in ``judge_stacks``.
-
-    Raises:
-        TooLittleInCommonError: If two frames have too little in common.
-    """
+    """``judge_restoration`` of one stack of frames that are already prepared; arguments as in ``judge_stacks``."""
     motion = motion_in_row_order(frames, vibration)
     moves = {0: motion.moving_axes()[0].tolist()}
     (verdict,) = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=most_pairs)

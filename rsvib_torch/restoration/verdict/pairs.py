@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.core.chunking import at_once, runs
-from rsvib_torch.core.fourier import extended_length, spline_spectra
-from rsvib_torch.core.splines import correlated
+from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts, detailed_parts
 from rsvib_torch.imaging.blur import form_rows
 from rsvib_torch.imaging.trajectory import exposure_trajectory
+from rsvib_torch.numerics.fourier import extended_length, spline_spectra
+from rsvib_torch.numerics.splines import correlated
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
@@ -32,14 +32,11 @@ class TooLittleInCommonError(ValueError):
 
 @dataclass(frozen=True)
 class Overlap:
-    """What two frames of a stack have in common, in whole px along (rows, columns).
+    """What two frames of a stack have in common, in whole px along (rows, columns)."""
 
-    Attributes:
-        step: Displacement of the content from the earlier to the later frame, beyond the displacement of single rows.
-        rim: Displacement of single rows, with a margin: so much at the ends of the common part is not compared.
-    """
-
+    # displacement of the content from the earlier to the later frame, beyond the displacement of single rows
     step: tuple[int, int]
+    # displacement of single rows, with a margin: so much at the ends of the common part is not compared
     rim: tuple[int, int]
 
     @classmethod
@@ -115,17 +112,11 @@ def shared_part(
     common: list[Overlap],
     columns: int | None,
 ) -> FramePairs:
-    """Cut two frames of each stack to their common part; rows are those of the later one.
+    """Cut two ``frames`` (indices) of each stack to their common part; rows are those of the later one.
 
-    Args:
-        raw: (B, T, C, H, W) in row order.
-        restored: (B, T, C, H, W), or (B, 1, C, H, W) in the coordinates of the first of ``frames``.
-        ignore: Mask shaped like ``raw`` of pixels that were not measured.
-        motion: Motion of the frames.
-        moved: As in ``overlaps``.
-        frames: Indices of the two frames.
-        common: ``overlaps`` of each stack.
-        columns: Cut to so many columns, those with the most detail; None for all.
+    ``raw`` is (B, T, C, H, W) in row order, ``restored`` likewise, or (B, 1, C, H, W) in the coordinates of the earlier
+    frame. ``moved`` is as in ``overlaps``, whose results are ``common``. Of the columns, those with the most detail are
+    kept; None for all.
     """
     earlier, later = frames
     # the largest displacement of all stacks determines the size of the part
@@ -207,20 +198,14 @@ def equally_bright(pair: FramePairs, noise: Tensor, *, block: int = 16) -> Frame
 
 
 def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Tensor]:
-    """Root-mean-square displacement between two images of one scene, along each axis.
+    """Root-mean-square displacement between two images (..., C, H, W) of one scene along each axis, and its resolution.
 
-    A displacement d changes brightness by ``d . grad f``, so that the mean squared difference is
-    ``a + dx^2 fx^2 + dy^2 fy^2 + 2 dx dy fx fy``; white noise raises ``a`` only. Both images are smoothed, so that this
-    holds for displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2.
-
-    Args:
-        first: (..., C, H, W), at least 35 px on a side.
-        second: The same shape.
-        step: px between the places that are used; after smoothing, neighbours are nearly equal.
-
-    Returns:
-        Misfit (..., 2) and its resolution (..., 2) in px, axes (x, y), float64; a misfit below the resolution cannot be
-        distinguished from zero. For images without contrast 0 and infinity.
+    A displacement d changes brightness by ``d . grad f``, so that the mean squared difference is ``a + dx^2 fx^2 + dy^2
+    fy^2 + 2 dx dy fx fy``; white noise raises ``a`` only. Both images are smoothed, so that this holds for
+    displacements up to about 10 px, and weighted least squares gives the means of dx^2 and dy^2 from places that are
+    ``step`` px apart: neighbours are nearly equal. Images have at least 35 px on a side. The results (..., 2) are in
+    px, axes (x, y), float64; a misfit below the resolution cannot be distinguished from zero. They are 0 and infinity
+    for images without contrast.
     """
     # Gaussian and its derivative; gradients of the mean image, and the smoothed difference
     place = np.arange(-_RIM, _RIM + 1)
@@ -263,18 +248,9 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Ten
 def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int], *, degree: int = 5) -> Tensor:
     """Form one frame of each stack from restored scenes (Eq. 9), independently of the restoration method.
 
-    Displacement along rows is a phase ramp, across rows a B-spline, the exposure a Gauss-Legendre sum.
-
-    Args:
-        scenes: (B, C, H, W) in row order, in the coordinates in which frame ``frame`` is restored; they may be a part
-            of the rows and columns, and are mirrored beyond.
-        motion: Motion of the frames.
-        frame: Index of the frame to form.
-        first_rows: Row of the frame at row 0 of the scene, for each stack.
-        degree: Degree of the B-spline.
-
-    Returns:
-        The same parts (B, C, H, W) of the frames.
+    Displacement along rows is a phase ramp, across rows a B-spline, the exposure a Gauss-Legendre sum. The scenes (B,
+    C, H, W) are in row order, in the coordinates in which frame ``frame`` is restored; they may be a part of the rows
+    and columns, and are mirrored beyond. Row 0 of a scene is at its row of ``first_rows`` of the frame.
     """
     # displacement of each row during its exposure
     count, (height, width) = len(scenes), scenes.shape[-2:]

@@ -1,3 +1,0 @@
-from .calibrate import RowTimeCalibration, calibrate_row_time, calibrate_row_time_by_exposure
-
-__all__ = ["RowTimeCalibration", "calibrate_row_time", "calibrate_row_time_by_exposure"]

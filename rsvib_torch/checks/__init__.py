@@ -1,0 +1,1 @@
+"""Checks of what users give: values, arrays, arguments of functions, groups of options."""

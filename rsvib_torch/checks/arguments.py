@@ -1,0 +1,290 @@
+"""Checks of the arguments of public functions against their annotations.
+
+Functions and methods of the public interface have the decorator ``checks_arguments``: a value of another type, a tensor
+that PyTorch cannot compute with, a number that is not finite or beyond all physical quantities, and an unknown choice
+are refused with the name of the argument. Bounds that depend on the function are checked by the function.
+"""
+
+import inspect
+import math
+import operator
+import os
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache, reduce, wraps
+from typing import Annotated, Any, ParamSpec, Self, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import torch
+from pydantic import ConfigDict, Field, Strict, TypeAdapter
+from pydantic_core import core_schema
+from torch import Tensor
+
+from rsvib_torch.checks.validation import Number, members_of, validated, without_alias
+from rsvib_torch.checks.values import MAX_NUMBER, described
+from rsvib_torch.text import one_line, quoted
+
+P = ParamSpec("P")
+R = TypeVar("R")
+_ARRAYS = (Tensor, np.ndarray)
+_PLAIN = (bool, float, str, type(None), object)  # types that pydantic checks itself
+
+
+def check_tensor(name: str, value: object) -> Tensor:
+    """Return ``value`` if it is a dense tensor of real numbers that has data."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a tensor, got {described(value)}")
+    if value.is_nested:
+        raise TypeError(f"{name} must be a dense tensor, got a nested tensor; pass its parts one by one")
+    if value.layout != torch.strided:
+        raise TypeError(f"{name} must be a dense tensor, got {value.layout}; call {name}.to_dense()")
+    if value.is_quantized:
+        raise TypeError(f"{name} must not be quantised, got {value.dtype}; call {name}.dequantize()")
+    if value.is_complex():
+        raise TypeError(f"{name} must be real numbers, got {value.dtype}")
+    if value.is_floating_point() and value.dtype.itemsize == 1:
+        raise TypeError(f"{name} must have at least 16 bits, got {value.dtype}; call {name}.float()")
+    if value.device.type == "meta":
+        raise TypeError(f"{name} must be a tensor with data, got a meta tensor; load the data onto a device first")
+    return value
+
+
+def as_numbers(name: str, value: object, device: torch.device | None = None) -> Tensor:
+    """Return a copy of a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
+
+    By default on the device of a tensor.
+    """
+    if isinstance(value, Tensor):
+        return check_tensor(name, value).to(dtype=torch.float64, device=device, copy=True)
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{name} must not be a masked array; pass the values without the masked ones")
+    try:
+        return torch.tensor(value, dtype=torch.float64, device="cpu" if device is None else device)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise TypeError(
+            f"{name} must be a number, a tensor, or numbers in lists of equal lengths, got {described(value)}"
+        ) from error
+
+
+def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
+    """Raise a ``ValueError`` unless tensors have the stated shapes.
+
+    Args:
+        values: Tensors by name; None and names without a stated shape are omitted.
+        shapes: Axes of a tensor: a size; a name for a size of at least 1 that is the same in all tensors, with its
+            limits if there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or
+            ``[...]`` for these or none. ``...`` alone, for values that are not tensors, is not checked.
+
+    Example:
+        >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
+        Traceback (most recent call last):
+        ...
+        ValueError: scene must have shape (..., H, W), got (3,)
+    """
+    known: dict[str, Any] = {}
+    for name, stated in shapes.items():
+        value = values.get(name)
+        if value is None or stated == "...":
+            continue
+        lead, axes = _stated_axes(stated)
+        shape = tuple(value.shape)
+        count = len(shape) - len(axes)
+        batch, sizes = shape[: max(count, 0)], shape[max(count, 0) :]
+        fits = count >= 0 and all(
+            low <= size <= high and size == known.get(axis, size)
+            for size, (axis, low, high) in zip(sizes, axes, strict=True)
+        )
+        batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
+        if not fits or batch not in batches:
+            names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
+            limits = {axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high}
+            sizes_known = [f"{axis} = {(limits | known)[axis]}" for axis in names if axis in limits | known]
+            where = f" with {', '.join(sizes_known)}" if sizes_known else ""
+            raise ValueError(
+                f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}"
+            )
+        known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
+        if batch or lead == "...":
+            known["..."] = batch
+
+
+def _stated_axes(stated: str) -> tuple[str, list[tuple[str, int, float]]]:
+    """Mark of the leading dimensions, and name, smallest and largest size of each axis of a shape."""
+    names = stated.split()
+    lead = names.pop(0) if names[0] in ("...", "[...]") else ""
+    axes: list[tuple[str, int, float]] = []
+    for entry in names:
+        axis, _, limits = entry.partition("=")
+        low, _, high = (axis if axis.isdecimal() else limits or "1").partition("-")
+        axes.append((axis, int(low), int(high or low) if limits or axis.isdecimal() else math.inf))
+    return lead, axes
+
+
+def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> None:
+    """Check that tensors are floating-point images of the shapes of ``check_shapes``."""
+    for name, image in images.items():
+        if not image.is_floating_point():
+            raise TypeError(
+                f"{name} must be a floating-point tensor, got {image.dtype}; divide counts by their full scale"
+            )
+    check_shapes(images, shapes)
+
+
+def check_pixels(name: str, pixels: Tensor) -> None:
+    """Raise a ``ValueError`` if a pixel of a floating-point tensor is NaN, infinite or beyond all scales."""
+    if not pixels.numel():
+        return
+    ends = torch.stack(pixels.detach().aminmax())  # one pass; propagates NaN and infinity
+    if not bool(torch.isfinite(ends).all()):
+        pixel = tuple((~torch.isfinite(pixels)).nonzero()[0].tolist())
+        raise ValueError(f"{name} must be finite, but pixel {pixel} is {pixels[pixel].item()}")
+    largest = float(ends.abs().max())
+    if largest > MAX_NUMBER:
+        raise ValueError(
+            f"{name} reach {largest:.3g}, at most {MAX_NUMBER:g} is possible: divide them by their full scale"
+        )
+
+
+def check_broadcast(**tensors: object) -> None:
+    """Raise a ``ValueError`` unless tensors broadcast; other values are omitted."""
+    given = {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
+    if len(given) < 2:
+        return
+    try:
+        torch.broadcast_tensors(*given.values())  # torch.broadcast_shapes takes 40 us, and its first call imports sympy
+    except RuntimeError as error:
+        shapes = ", ".join(str(tuple(value.shape)) for value in given.values())
+        raise ValueError(f"{' and '.join(given)} do not fit together: {shapes}") from error
+
+
+def check_device(name: str, value: object) -> torch.device:
+    """Return ``value`` as a device on which tensors can be computed."""
+    if not isinstance(value, (str, torch.device)):
+        raise TypeError(f"{name} must be a device such as 'cpu' or 'cuda', got {described(value)}")
+    try:
+        device = torch.device(value)
+        torch.empty(0, device=device, dtype=torch.float32)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = one_line(str(error).partition("\n")[0], 200)
+        raise ValueError(f"{name}={quoted(str(value))} is not available: {reason}; use 'cpu'") from error
+    return device
+
+
+def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Check the arguments of a function against its annotations before each call.
+
+    Arguments that accept arrays are left to ``as_tensor``, which the function calls. Compiled graphs omit the checks.
+
+    Example:
+        >>> @checks_arguments
+        ... def doubled(count: int) -> int:
+        ...     return 2 * count
+        >>> doubled("3")
+        Traceback (most recent call last):
+        ...
+        TypeError: count must be a whole number, got '3' (str)
+    """
+    parameters = inspect.signature(function).parameters.values()
+    # inspect.Signature.bind would take longer than the checks; calls that it refuses are refused by the function
+    names = [parameter.name for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not torch.compiler.is_compiling():
+            kinds = hints_of(function)
+            for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+                if name in kinds:
+                    _checked(name, value, kinds[name])
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def checked_methods(kind: type[R]) -> type[R]:
+    """Check the arguments of the public methods that a class defines against their annotations before each call."""
+    for name, method in tuple(vars(kind).items()):
+        function = method.__func__ if isinstance(method, classmethod) else method
+        is_public = name in ("__init__", "__getitem__") or not name.startswith("_")
+        if isinstance(function, types.FunctionType) and is_public and len(function.__annotations__) > 1:
+            checked = checks_arguments(function)
+            setattr(kind, name, classmethod(checked) if isinstance(method, classmethod) else checked)
+    return kind
+
+
+def check_fields(value: Any) -> None:
+    """Check the fields of a dataclass against their annotations; lists become tuples, tensors are copied."""
+    kinds = hints_of(value.__class__)
+    for name in (field.name for field in fields(value)):
+        given = getattr(value, name)
+        made = _checked(name, given, kinds[name], finite=False)
+        made = made.clone() if isinstance(made, Tensor) else made
+        if isinstance(made, (tuple, Tensor)) and not isinstance(given, tuple):
+            object.__setattr__(value, name, made)
+
+
+@cache
+def hints_of(owner: Any) -> dict[str, Any]:
+    """Annotations of the arguments of a function, or of the fields of a class."""
+    given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
+    if isinstance(owner, type):
+        return get_type_hints(owner, localns={"Tensor": Tensor}, include_extras=True)
+    names = inspect.unwrap(owner).__globals__
+    known = {"Tensor": Tensor, "torch": torch}
+    return get_type_hints(types.SimpleNamespace(__annotations__=given), names, known, include_extras=True)
+
+
+def _checked(name: str, value: object, kind: object, *, finite: bool = True) -> Any:
+    """The value, or a tuple in place of a list or array, if it is of a kind."""
+    adapter, members = _adapter(kind, finite)
+    if torch.device in members and value is not None:
+        return check_device(name, value)
+    if adapter is None:
+        return value
+    if isinstance(value, Tensor) and Tensor in members:
+        return check_tensor(name, value)
+    if isinstance(value, _ARRAYS) and any({int, float} & {*get_args(member)} for member in members):
+        value = (check_tensor(name, value) if isinstance(value, Tensor) else value).tolist()
+    return validated(name, tuple(value) if isinstance(value, (torch.Size, range)) else value, adapter, kind)
+
+
+@cache
+def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple[Any, ...]]:
+    """The check of an annotation, None where the function converts the value itself; and the members of a union."""
+    members = members_of(kind)
+    made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1
+    if made_by_function or any(getattr(member, "_is_protocol", False) for member in members):
+        return None, members
+    config = ConfigDict(strict=True, allow_inf_nan=not finite)
+    return TypeAdapter(_bounded(kind, finite), config=config), members
+
+
+def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911
+    """The annotation without numbers beyond all physical quantities, with lists in place of tuples, for pydantic."""
+    kind = without_alias(kind)
+    if kind is float and finite:
+        return Number
+    if kind is int:
+        return Annotated[int, Field(ge=-(2**63), le=2**63 - 1)]
+    if kind in (Any, Self) or isinstance(kind, TypeVar) or getattr(kind, "_is_protocol", False):
+        return Any
+    if get_origin(kind) in (os.PathLike, np.ndarray) or (
+        isinstance(kind, type) and kind not in _PLAIN and get_origin(kind) is None
+    ):
+        return Annotated[Any, _Instance(get_origin(kind) or kind)]
+    arguments: Any = tuple(argument if argument is ... else _bounded(argument, finite) for argument in get_args(kind))
+    if get_origin(kind) is tuple:
+        return Annotated[tuple.__class_getitem__(arguments), Strict(False)]
+    if get_origin(kind) in (Union, types.UnionType):
+        return reduce(operator.or_, arguments)
+    return get_origin(kind)[arguments] if get_origin(kind) in (Sequence, Mapping, list, dict) else kind
+
+
+@dataclass(frozen=True)
+class _Instance:
+    """Mark of an annotation of which pydantic checks only the class."""
+
+    kind: type
+
+    def __get_pydantic_core_schema__(self, source: object, handler: object) -> core_schema.CoreSchema:
+        return core_schema.is_instance_schema(self.kind)

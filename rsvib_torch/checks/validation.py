@@ -1,0 +1,401 @@
+"""Groups of options and tables from files: their checks, and one line for each mistake.
+
+The class of a group is the only place that states an option: its type, bounds and default, and its description in the
+text below the field. ``options`` makes a class such a group. Python arguments, keys of TOML files and options of the
+command line are checked by it, and ``_mistakes`` translates what pydantic reports for all of them.
+"""
+
+import inspect
+import json
+import os
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from textwrap import fill
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin
+
+import pydantic
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError, core_schema
+
+from rsvib_torch.checks.values import MAX_NUMBER, Error, described, named
+from rsvib_torch.files.reading import Table, read_text
+from rsvib_torch.text import one_line, quoted
+
+_Group = TypeVar("_Group")
+_Result = TypeVar("_Result")
+_MAX_LINES = 20  # of an error message
+_MAX_JSON_BYTES = 10**9  # a manifest has about 2 KB per window
+_TYPE_NAMES: dict[object, str] = {
+    float: "a number",
+    int: "a whole number",
+    str: "text",
+    bool: "true or false",
+    Sequence: "a sequence",
+    Mapping: "a dictionary",
+    dict: "a dictionary",
+    os.PathLike: "a path",
+}
+_CLASS_NAMES = {"Tensor": "a tensor", "ndarray": "a NumPy array"}
+_LIST_NAMES: dict[object, str] = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
+_BOUNDS = {
+    "greater_than": "larger than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than_equal": "at most {le:g}",
+    "finite_number": "finite",
+    "too_short": "{min_length} entries",
+    "too_long": "{max_length} entries",
+}
+_NOT_AN_OPTION = "not_an_option"  # kind of mistake that is a TypeError in Python
+
+# Numbers of options: finite, and of a magnitude that a quantity can have.
+Number = Annotated[float, Field(ge=-MAX_NUMBER, le=MAX_NUMBER, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=MAX_NUMBER, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=MAX_NUMBER, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=2**31)]
+
+
+class MistakesError(ValueError):
+    """Mistakes in one file; ``lines`` has one line for each."""
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        self.lines = tuple(lines)
+        super().__init__("\n".join(self.lines))
+
+
+# unknown keys are refused, and values are not converted; the text below a field is its description
+_CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
+
+
+class Section(BaseModel):
+    """Table with a fixed set of keys and strict types."""
+
+    model_config = ConfigDict(**_CONFIG, frozen=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: object) -> None:
+        _describe(cls)
+
+
+class Extensible:
+    """Mark of a choice whose names are keys of a table that users extend.
+
+    Files may contain only the names of the package. In Python, the function that uses the table refuses unknown names.
+    """
+
+    @staticmethod
+    def __get_pydantic_core_schema__(source: object, handler: object) -> core_schema.CoreSchema:
+        """Schema of any text outside of files."""
+        names = get_args(source)
+
+        def check(value: str, info: core_schema.ValidationInfo) -> str:
+            if info.context is not None and value not in names:
+                raise PydanticCustomError("literal_error", "unknown name")
+            return value
+
+        return core_schema.with_info_after_validator_function(check, core_schema.str_schema())
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
+def options(group: type[_Group]) -> type[_Group]:
+    """Make a class a group of options: a frozen dataclass whose values are checked.
+
+    Example:
+        >>> @options
+        ... class Bands:
+        ...     band_rows: int = Field(default=32, ge=4)
+        >>> Bands(band_rows=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: band_rows must be at least 4, got 2 (int)
+    """
+    group.__get_pydantic_core_schema__ = classmethod(_accepts_tables)  # type: ignore[attr-defined]
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
+    initialise = made.__init__
+    _describe(made)
+
+    def __init__(self: Any, *args: Any, **given: Any) -> None:  # noqa: N807
+        by_place = dict(zip(fields_of(made), args, strict=False))
+        values = {name: _plain(value) for name, value in (by_place | given).items()}
+        try:
+            initialise(self, **values)
+        except ValidationError as error:
+            raise _mistakes(made, values, error)[0].in_python() from None
+
+    made.__init__ = __init__
+    return made  # type: ignore[no-any-return]
+
+
+def _describe(group: type) -> None:
+    """Give each field of a group its description in one line, from its class or the one below it that states it."""
+    for name, field in fields_of(group).items():
+        stated = (getattr(kind, "__pydantic_fields__", {}).get(name) for kind in group.__mro__)
+        described_by = next((one for one in stated if one is not None and one.description), field)
+        field.description = " ".join((described_by.description or "").split())
+
+
+def _accepts_tables(_: type, source: object, handler: Callable[[object], Table]) -> Table:
+    """Schema of a group that can be a table; its values are not converted nevertheless."""
+    schema = handler(source)
+    return schema | {"strict": False} if schema["type"] == "dataclass" else schema
+
+
+def _plain(value: Any) -> Any:
+    """NumPy numbers and short arrays as Python numbers and lists."""
+    if type(value).__module__ != "numpy" or getattr(getattr(value, "dtype", None), "kind", "-") not in "biuf":
+        return value
+    return value.tolist() if value.ndim < 2 and value.size < 10 else value
+
+
+def fields_of(group: type) -> Table:
+    """Fields of a group of options or of a section, by name: annotation, default and description."""
+    return dict(vars(group)["__pydantic_fields__"])
+
+
+def flat_options(
+    group: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
+    """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
+
+    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced. ``build`` makes the
+    options of the arguments, if it is not the group.
+    """
+    direct = [one for name, one in inspect.signature(function).parameters.items() if name != "options"]
+    names = {parameter.name for parameter in direct}
+
+    @wraps(function)
+    def flat(*args: object, **given: object) -> object:
+        stated = {name: given.pop(name) for name in names & given.keys()}
+        return function(*args, **stated, options=(build or group)(**given))
+
+    kind = inspect.Parameter.KEYWORD_ONLY
+    of_group = [
+        inspect.Parameter(name, kind, default=field.get_default(), annotation=_without_bounds(field.annotation))
+        for name, field in fields_of(group).items()
+    ]
+    flat.__signature__ = inspect.Signature([*direct, *of_group])  # type: ignore[attr-defined]
+    flat.__doc__ = _with_options(inspect.getdoc(function) or "", group)
+    return flat
+
+
+def _without_bounds(annotation: Any) -> Any:
+    """The annotation of an option as users read it."""
+    if get_origin(annotation) is Annotated:
+        return _without_bounds(get_args(annotation)[0])
+    if arguments := get_args(annotation):
+        plain = tuple(map(_without_bounds, arguments))
+        return annotation.copy_with(plain) if hasattr(annotation, "copy_with") else annotation
+    return annotation
+
+
+def _with_options(text: str, group: type) -> str:
+    """A docstring in which the line ``options:`` is replaced by the options of a group; without text, only these."""
+    lines = (text or "Args:\n    options: Options.").splitlines()
+    place = next((number for number, line in enumerate(lines) if line.startswith("    options:")), len(lines))
+    entries = (f"{name}: {field.description}" for name, field in fields_of(group).items())
+    listed = [fill(entry, 116, initial_indent=" " * 4, subsequent_indent=" " * 8) for entry in entries]
+    return "\n".join([*lines[:place], *listed, *lines[place + 1 :]])
+
+
+def not_an_option(name: str, message: str) -> PydanticCustomError:
+    """The error of a group for an option that does not go with the others, a ``TypeError`` in Python."""
+    return PydanticCustomError(_NOT_AN_OPTION, "{message}", {"name": name, "message": message})
+
+
+def checked(build: Callable[..., _Result], *args: object, **kwargs: object) -> _Result:
+    """Call ``build`` in a validator: pydantic reports ``ValueError`` only, so a ``TypeError`` becomes one."""
+    try:
+        return build(*args, **kwargs)
+    except TypeError as error:
+        changed = ValueError(str(error))
+        vars(changed).update(vars(error))
+        raise changed from error
+
+
+def validate(model: type[_Result], data: Mapping[str, object], source: str) -> _Result:
+    """Parsed TOML or JSON as a ``Section`` or group of options; an error has a line for each mistake in ``source``."""
+    try:
+        return TypeAdapter(model).validate_python(data, context={"file": source})
+    except ValidationError as error:
+        mistakes = _mistakes(model, data, error)
+        lines = [mistake.in_file(source) for mistake in mistakes]
+        more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
+        raise mistakes[0].named(MistakesError([*lines[:_MAX_LINES], *more])) from error
+
+
+def validated(name: str, value: object, adapter: TypeAdapter[Any], kind: object) -> Any:
+    """Return the value of an argument if it is of a kind, as ``adapter`` converts it."""
+    try:
+        return adapter.validate_python(_plain(value))
+    except ValidationError as error:
+        mistake = _mistakes(kind, value, error)[0]
+        mistake.path = f"{name}.{mistake.path}".removesuffix(".").replace(".[", "[")
+        raise mistake.in_python() from None
+
+
+@dataclass
+class _Mistake:
+    """A mistake at one key."""
+
+    path: str  # the key, with the tables around it
+    value: object = None  # the value
+    expected: str = ""  # what was expected instead
+    text: str = ""  # a sentence that replaces the others
+    known: tuple[str, ...] = ()  # the keys that exist, for one that does not
+    choices: tuple[object, ...] = ()  # the choices, if there is nothing else
+    accepts_none: bool = False  # whether None is possible in Python
+    kind: type[Exception] = ValueError  # the exception in Python
+    is_bound: bool = False  # whether the value has the right type and is out of bounds
+    cause: Exception | None = None  # the error of a validator, which may state its argument
+
+    def in_python(self) -> Exception:
+        """The exception."""
+        if self.known:
+            return TypeError(f"unknown option {quoted(self.path)}; the options are {', '.join(self.known)}")
+        error = self.kind(self.text or f"{self.path} {self._problem} {described(self.value)}")
+        return self.named(error)
+
+    def named(self, error: Error) -> Error:
+        """An error with the argument that this mistake is about, for the options of commands."""
+        if self.cause is not None:
+            path = ".".join(filter(None, (self.path, getattr(self.cause, "argument", ""))))
+            return named(error, path, getattr(self.cause, "problem", str(self.cause)))
+        return error if self.text else named(error, self.path, f"{self._problem} {quoted(self.value)}")
+
+    @property
+    def _problem(self) -> str:
+        if self.choices:
+            return f"must be one of {', '.join(map(repr, self.choices))}; got"
+        expected = self.expected.replace("true or false", "True or False")
+        return f"must be {expected}{' or None' * self.accepts_none}, got"
+
+    def in_file(self, source: str) -> str:
+        """The line about a file."""
+        place = f"{source}: {one_line(self.path, 200)}" if self.path else source
+        if self.known:
+            return f"{place}: unknown key; expected one of {', '.join(self.known)}"
+        return f"{place}: {self.text or f'expected {self.expected}, got {quoted(self.value)}'}"
+
+
+def _mistakes(model: object, data: object, error: ValidationError) -> list[_Mistake]:
+    """The mistakes that pydantic found, one for each key: of the members of a union, that of the fitting type."""
+    found: dict[str, _Mistake] = {}
+    for entry in error.errors(include_url=False):
+        mistake = _mistake(model, data, entry)
+        if mistake.path not in found or (mistake.is_bound and not found[mistake.path].is_bound):
+            found[mistake.path] = mistake
+    return list(found.values())
+
+
+def _mistake(model: object, data: object, entry: ErrorDetails) -> _Mistake:
+    """What an entry of pydantic means: the key at its location, and what is wrong."""
+    path = ""
+    value, expected = data, model
+    kind, context = entry["type"], entry.get("ctx", {})
+    for step in entry["loc"]:
+        tables = [member for member in members_of(expected) if get_origin(member) in (Mapping, dict)]
+        if isinstance(value, Mapping) and tables:
+            path, value, expected = f"{path}[{step!r}]", value.get(step), get_args(tables[0])[1]
+        elif isinstance(value, Mapping) and isinstance(step, str):
+            keys = _keys(expected)
+            if step not in value and step not in keys:
+                break  # the rest of the location names a member of a union
+            path = f"{path}.{step}" if path else step
+            if step not in value:
+                return _Mistake(path, text=f"missing key; expected {expected_text(keys[step])}", kind=TypeError)
+            if kind in ("extra_forbidden", "unexpected_keyword_argument") and step not in keys:
+                return _Mistake(path, known=tuple(keys))
+            value, expected = value[step], keys.get(step, Any)
+        elif isinstance(value, (list, tuple)) and isinstance(step, int) and step < len(value):
+            path, value = f"{path}[{step}]", value[step]
+            expected = next(_items(expected, step), Any)
+        else:
+            break  # the rest of the location names a member of a union
+    if kind == _NOT_AN_OPTION:
+        return _Mistake(".".join(filter(None, (path, context["name"]))), text=context["message"], kind=TypeError)
+    if kind == "value_error":
+        return _Mistake(path, text=str(context["error"]), cause=context["error"])
+    if kind in _BOUNDS:
+        return _Mistake(path, value, _BOUNDS[kind].format(**context), is_bound=True)
+    choices = [member for member in members_of(expected) if get_origin(member) is Literal]
+    only = tuple(name for member in choices for name in get_args(member)) if choices == [*members_of(expected)] else ()
+    accepts_none = type(None) in get_args(expected)
+    error = ValueError if only else TypeError
+    return _Mistake(path, value, expected_text(expected), kind=error, choices=only, accepts_none=accepts_none)
+
+
+def members_of(annotation: object) -> tuple[Any, ...]:
+    """Members of a union without their bounds, and without None."""
+    annotation = without_alias(annotation)
+    if get_origin(annotation) is Annotated:
+        return members_of(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return tuple(member for part in get_args(annotation) for member in members_of(part))
+    return () if annotation is type(None) else (annotation,)
+
+
+def without_alias(annotation: Any) -> Any:
+    """The annotation that a type alias stands for, as ``NDArray`` of NumPy 2.5 is one."""
+    alias = get_origin(annotation) or annotation
+    if type(alias).__name__ != "TypeAliasType":
+        return annotation
+    arguments = get_args(annotation)
+    return alias.__value__[arguments] if arguments else alias.__value__
+
+
+def _items(annotation: object, index: int) -> Iterator[object]:
+    """Types that an entry of a list or tuple may have."""
+    for member in members_of(annotation):
+        if get_origin(member) in (list, tuple, Sequence):
+            several = get_origin(member) is tuple and ... not in get_args(member)
+            yield get_args(member)[index if several else 0]
+
+
+def _keys(annotation: object) -> dict[str, object]:
+    """Keys of a table with their types; empty for a table with arbitrary keys."""
+    for member in members_of(annotation):
+        if isinstance(member, type) and hasattr(member, "__pydantic_fields__"):
+            return {name: described.annotation for name, described in fields_of(member).items()}
+    return {}
+
+
+def expected_text(annotation: object) -> str:
+    """Description of a type in a message."""
+    words: list[str] = []
+    for member in members_of(annotation):
+        origin, arguments = get_origin(member), get_args(member)
+        if origin is Literal:
+            words.extend(repr(choice) for choice in arguments)
+        elif origin is list or (origin is tuple and arguments[-1] is ...):
+            item = members_of(arguments[0])[0]
+            words.append(f"a list of {_LIST_NAMES.get(item, 'lists' if get_origin(item) is list else 'tables')}")
+        elif origin is tuple:
+            words.append(f"{len(arguments)} {_LIST_NAMES.get(members_of(arguments[0])[0], 'values')}")
+        elif _keys(member):
+            words.append(f"a table with {', '.join(_keys(member))}")
+        elif isinstance(member, type) and member not in _TYPE_NAMES:
+            name, source = _CLASS_NAMES.get(member.__name__, member.__name__), getattr(member, "_MADE_BY", "")
+            article = "" if " " in name else "an " if name[0] in "AEIOU" else "a "
+            words.append(f"{article}{name}{source and f' ({source})'}")
+        else:
+            name = _CLASS_NAMES.get(getattr(origin, "__name__", ""), str(member))
+            words.append(_TYPE_NAMES.get(origin or member, name))
+    return " or ".join(dict.fromkeys(words))
+
+
+def read_json(path: Path, what: str) -> Table:
+    """Read a table from a JSON file of a kind, at most 1 GB."""
+    try:
+        text = read_text(path, at_most=_MAX_JSON_BYTES)
+        data = json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a {what}: {error}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path}: not a {what}: expected a table, got {type(data).__name__}")
+    return data
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")

@@ -1,1 +1,0 @@
-"""Numerical building blocks that do not depend on cameras: transforms, splines, banded systems, checks."""

@@ -1,0 +1,233 @@
+"""A resolution chart similar to that of ISO 12233."""
+
+import math
+from collections.abc import Callable
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.datasets.drawing import (
+    FLOAT,
+    Blur,
+    Canvas,
+    Size,
+    bars,
+    disc,
+    edge,
+    fractal_texture,
+    rectangle,
+    rotated,
+    sectors,
+)
+
+_INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture of either stay within 0 ... 1
+_Centre = tuple[float, float]
+
+
+@checks_arguments
+def resolution_chart(
+    height: Size, width: Size, *, sigma: Blur = 0.6, seed: int = 0, field: Annotated[float, Field(ge=32)] = 230.0
+) -> Tensor:
+    """Draw a resolution chart: slanted edges, hyperbolic wedges, bar groups, stars, rings and grey fields.
+
+    A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals, dark on light
+    and light on dark in turn, and bar groups, rings, stars and textured grey steps between them, on paper with a fine
+    grain. Edges are error functions of the distance, without aliasing at any size. The result is float32 (height,
+    width) with values in 0 ... 1.
+
+    Args:
+        height: Rows, at least 64.
+        width: Columns, at least 64.
+        sigma: Blur of the optics in px (Gaussian, pixel area included).
+        seed: Seed of the grain and texture.
+        field: px, approximate size of a field of the chart, at least 32.
+
+    Example:
+        >>> chart = resolution_chart(256, 320)
+        >>> chart.shape, bool(chart.min() > 0)
+        (torch.Size([256, 320]), True)
+    """
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    grain = fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
+    texture = fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
+    canvas = Canvas(torch.full((height, width), _PAPER, **FLOAT), sigma)
+
+    rim = max(10.0, 0.014 * min(height, width))
+    rows, columns = (max(3, 2 * round((size - 4 * rim) / (2 * field) - 0.5) + 1) for size in (height, width))
+    pitch = ((width - 4 * rim) / columns, (height - 4 * rim) / rows)
+    size = min(pitch)
+    relief = torch.full((2, height, width), 0.02, **FLOAT)  # amplitude of grain and texture
+    relief[1] = 0.012
+    for i in range(rows):
+        for j in range(columns):
+            down, right = i - rows // 2, j - columns // 2
+            centre = (2 * rim + (j + 0.5) * pitch[0] - 0.5, 2 * rim + (i + 0.5) * pitch[1] - 0.5)
+            _draw_field(canvas, relief, centre, size, (down, right))
+    middle = (0.5 * (width - 1), 0.5 * (height - 1))
+    for board, centre, step, count in (
+        (canvas, middle, pitch[0], columns),
+        (canvas.transposed(), middle[::-1], pitch[1], rows),
+    ):
+        for side in (-1, 1):
+            _draw_wedge(board, centre, side, begin=0.55 * step, length=(min(2, count // 2) - 0.1) * step)
+    _draw_border(canvas, rim)
+    # grain and texture are proportional to the tone
+    image = canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)
+    return image.clamp(0.0, 1.0)
+
+
+def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, steps: tuple[int, int]) -> None:
+    """Draw the field at a position (down, right) from the middle one."""
+    down, right = steps
+    ring = max(abs(down), abs(right))
+    if ring == 0:
+        _draw_star(canvas, centre, 0.42 * size, 72)
+        return
+    if 0 in (down, right) and ring <= 2:
+        return  # the wedges
+    if abs(down) == abs(right):
+        dark = (ring + (down > 0) + (right > 0)) % 2 == 0
+        turn = math.copysign(math.radians(5.0), down * right)
+        _draw_slanted_square(canvas, relief, centre, size, dark=dark, turn=turn)
+        return
+    kind = (3 * abs(down) + 2 * abs(right) + (down > 0) + 2 * (right > 0)) % len(_FIELDS)
+    _FIELDS[kind](canvas, relief, centre, size, ring)
+
+
+def _draw_star(canvas: Canvas, centre: _Centre, radius: float, count: int) -> None:
+    sigma = canvas.sigma
+    count = max(8, min(count, int(radius)))
+    canvas.paint(centre, radius, _INK, lambda x, y: sectors(x, y, count, sigma) * disc(x, y, radius, sigma))
+    canvas.paint(centre, radius, _INK, lambda x, y: disc(x, y, count / math.pi + 1.0, sigma))
+    width = 0.02 * radius + 0.8
+    for outline in (1.0, 1.1):
+        canvas.paint(
+            centre,
+            outline * radius + width,
+            _INK,
+            lambda x, y, r=outline * radius: disc(x, y, r + width, sigma) - disc(x, y, r, sigma),  # type: ignore[misc]
+        )
+
+
+def _draw_wedge(canvas: Canvas, middle: _Centre, side: int, *, begin: float, length: float) -> None:
+    """Draw seven bars along x whose frequency rises towards the middle of the chart."""
+    sigma, count = canvas.sigma, 7
+    coarse, fine = max(0.025, 2.0 * count / length), 0.5
+
+    def coverage(x: Tensor, y: Tensor) -> Tensor:
+        frequency = (fine + (coarse - fine) * (side * x / length + 0.5)).clamp(coarse, fine)
+        return bars(y * frequency + 0.5 * (count - 0.5), frequency, count, sigma) * _between(x, 0.5 * length, sigma)
+
+    centre = (middle[0] + side * (begin + 0.5 * length), middle[1])
+    canvas.paint(centre, (0.5 * length, 0.5 * count / coarse), _INK, coverage)
+
+
+def _between(x: Tensor, half: float, sigma: float) -> Tensor:
+    """Coverage of the strip ``|x| <= half``, much wider than the blur."""
+    return edge(x + half, sigma) * edge(half - x, sigma)
+
+
+def _draw_slanted_square(
+    canvas: Canvas, relief: Tensor, centre: _Centre, size: float, *, dark: bool, turn: float
+) -> None:
+    sigma, half = canvas.sigma, 0.3 * size
+    ground, tone = (0.62, 0.12) if dark else (0.2, 0.74)
+
+    def frame(x: Tensor, y: Tensor) -> Tensor:
+        return rectangle(x, y, 0.46 * size, 0.46 * size, sigma)
+
+    canvas.paint(centre, 0.46 * size, ground, frame)
+    for layer in relief:  # no grain, for measurements of the edges
+        Canvas(layer, sigma).paint(centre, 0.46 * size, 0.0, frame)
+    canvas.paint(centre, 1.2 * half, tone, lambda x, y: rectangle(*rotated(x, y, turn), half, half, sigma))
+
+
+def _draw_bar_groups(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+    """Groups of five bars, vertical and horizontal, of four frequencies."""
+    sigma, count, length = canvas.sigma, 5, 0.085 * size
+    for place, share in enumerate((1.0, 0.7, 0.48, 0.32)):
+        reach, down = 0.18 * size * share, centre[1] + (0.345 - 0.23 * place) * size
+        for board, middle, half in (
+            (canvas, (centre[0] - 0.23 * size, down), reach),
+            (canvas.transposed(), (down, centre[0] + 0.23 * size), length * share),
+        ):
+            frequency = 0.5 * (count - 0.5) / half
+
+            def coverage(x: Tensor, y: Tensor, f: float = frequency) -> Tensor:
+                return bars(x * f + 0.5 * (count - 0.5), f, count, sigma) * _between(y, length, sigma)
+
+            board.paint(middle, (reach, length), _INK, coverage)
+
+
+def _draw_rings(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+    """Rings that grow narrower outwards."""
+    sigma, radius = canvas.sigma, 0.44 * size
+    finest = 0.22 if ring % 2 else 0.12
+
+    def coverage(x: Tensor, y: Tensor) -> Tensor:
+        r = torch.hypot(x, y)
+        frequency = (finest * r / radius).clamp(min=0.5 * finest / radius)
+        cycles = 0.25 + 0.5 * finest * r.square() / radius  # a bar is centred on the rings
+        return bars(torch.remainder(cycles, 1.0) + 2.0, frequency, 6, sigma) * edge(radius - r, sigma)
+
+    canvas.paint(centre, radius, _INK, coverage)
+
+
+def _draw_grey_steps(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+    """Three by three textured patches of different tone."""
+    sigma, half = canvas.sigma, 0.145 * size
+    for i in range(3):
+        for j in range(3):
+            tone = 0.12 + 0.07 * ((4 * i + 2 * j + 5 * ring) % 9)
+            middle = (centre[0] + (j - 1) * 0.31 * size, centre[1] + (i - 1) * 0.31 * size)
+
+            def patch(x: Tensor, y: Tensor) -> Tensor:
+                return rectangle(x, y, half, half, sigma)
+
+            canvas.paint(middle, half, tone, patch)
+            Canvas(relief[1], sigma).paint(middle, half, 0.1, patch)
+
+
+def _draw_needles(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, ring: int) -> None:
+    """A fan of slanted lines of different width, and a disc."""
+    sigma = canvas.sigma
+    for index in range(8):
+        angle = math.pi * (index + 0.25) / 8
+        width = 0.7 + 0.006 * size * (index % 4)
+        canvas.paint(
+            centre,
+            0.45 * size,
+            _INK,
+            lambda x, y, a=angle, w=width: rectangle(*rotated(x, y, a), 0.45 * size, w, sigma),  # type: ignore[misc]
+        )
+    canvas.paint(centre, 0.13 * size, _INK, lambda x, y: disc(x, y, 0.13 * size, sigma))
+    canvas.paint(centre, 0.1 * size, _PAPER, lambda x, y: disc(x, y, 0.1 * size, sigma))
+
+
+_FIELDS: tuple[Callable[[Canvas, Tensor, _Centre, float, int], None], ...] = (
+    _draw_bar_groups,
+    _draw_grey_steps,
+    _draw_rings,
+    _draw_bar_groups,
+    _draw_needles,
+    lambda canvas, relief, centre, size, ring: _draw_star(canvas, centre, 0.36 * size, 36 if ring % 2 else 24),
+    _draw_grey_steps,
+)
+
+
+def _draw_border(canvas: Canvas, depth: float) -> None:
+    """Draw black teeth that point inwards along all four borders, wider towards one end."""
+    for board in (canvas, canvas.transposed()):
+        height, width = board.image.shape
+        for row, inwards in ((0.0, 1), (height - 1.0, -1)):
+
+            def coverage(x: Tensor, y: Tensor, inwards: int = inwards, width: int = width) -> Tensor:
+                place = (x / width + 0.5).clamp(0.0, 1.0)
+                cycles = (width / (2.4 * depth)) * (place - 0.15 * place * (1 - place))
+                tooth = depth * (1.0 - 2.0 * (torch.remainder(cycles, 1.0) - 0.5).abs())
+                return edge((tooth - inwards * y) / math.sqrt(2.0), canvas.sigma)
+
+            board.paint((0.5 * (width - 1), row), (0.5 * width, depth), _INK, coverage)

@@ -1,1 +1,0 @@
-"""Motions recorded by another instrument: clock alignment and check against the frames."""

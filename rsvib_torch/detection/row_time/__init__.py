@@ -1,1 +1,0 @@
-"""Row time of a camera from the motion in its frames."""

@@ -1,0 +1,5 @@
+"""Motions in the file formats of other programs: angular rates, sampling maps, and image support data."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

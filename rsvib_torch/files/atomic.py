@@ -1,0 +1,218 @@
+"""Atomic, durable writes: files and folders get their names when they are complete and on the disk."""
+
+import errno
+import fcntl
+import glob
+import os
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Literal
+
+from rsvib_torch.text import json_text
+
+PART = ".part"  # ending of temporary folders: .NAME.########.part
+_LONGEST_NAME = 255 - len("..12345678.part")  # bytes; of names of which temporary files have longer ones
+Kind = Literal["file", "folder", "tree"]
+
+
+def nearest_folder(path: Path) -> Path:
+    """The lowest existing folder above ``path``."""
+    parent = path.absolute().parent
+    while not parent.exists() and parent != parent.parent:
+        parent = parent.parent
+    return parent
+
+
+def sync(path: Path) -> None:
+    """Return when the content of a file, or the names in a folder, are on the disk: a power loss does not undo them."""
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        if path.is_dir():  # a folder in which files may be created but not listed
+            return
+        raise
+    try:
+        os.fsync(file)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():  # file systems without this function
+            raise
+    finally:
+        os.close(file)
+
+
+def sync_tree(path: Path) -> None:
+    """``sync`` a file, or a folder with everything in it."""
+    for folder, _, names in os.walk(path, topdown=False):
+        for name in names:
+            sync(Path(folder, name))
+        sync(Path(folder))
+    if path.is_file():
+        sync(path)
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder, and those above it, if it does not exist; its name is on the disk when the function returns."""
+    existing = nearest_folder(path)
+    path.mkdir(parents=True, exist_ok=True)
+    folder = path.absolute().parent
+    while True:
+        sync(folder)
+        if folder in (existing, folder.parent):
+            return
+        folder = folder.parent
+
+
+def remove_abandoned(path: Path) -> None:
+    """Remove temporary folders of killed processes: the operating system has released their locks."""
+    for folder in nearest_folder(path).glob(f".{glob.escape(path.name)}.{'?' * 8}{PART}"):
+        with suppress(OSError), _locked(folder) as file:
+            if os.fstat(file).st_uid == os.geteuid():
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path, *, wait: bool = False) -> Iterator[int]:
+    """Open and lock a folder; ``wait`` until another process releases its lock, or raise an ``OSError``.
+
+    A link, something else than a folder, and a file system without locks are refused.
+    """
+    file = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield file
+    finally:
+        os.close(file)
+
+
+def error_of_full_disk(error: Exception) -> int | None:
+    """Number of the error of the system if a disk is full, or a file larger than permitted; otherwise None."""
+    stated = re.search(r"errno = (\d+)", str(error))  # in a text of HDF5
+    number = int(stated[1]) if stated else getattr(error, "errno", None)
+    if "requested and" in str(error):  # NumPy does not state why an array is cut off
+        number = errno.ENOSPC
+    return number if number in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) else None
+
+
+@contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder on the file system of ``path``; those that killed processes left for it are removed.
+
+    Raises:
+        OSError: With the name of ``path``, if the disk is full.
+    """
+    parent = nearest_folder(path)
+    remove_abandoned(path)
+    with ExitStack() as opened:
+        folder = None
+        while folder is None or not folder.is_dir():  # another process may remove it before it is locked
+            try:
+                folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PART, dir=parent))
+            except OSError as error:
+                raise OSError(f"cannot write {path}: folder {parent} is not writable ({error.strerror})") from error
+            with suppress(OSError):  # file systems without locks
+                opened.enter_context(_locked(folder, wait=True))
+        opened.callback(shutil.rmtree, folder, ignore_errors=True)
+        try:
+            yield folder
+        except (OSError, RuntimeError) as error:
+            number = error_of_full_disk(error)
+            if number is None:
+                raise
+            raise OSError(number, os.strerror(number), str(path)) from error
+
+
+def check_not_special(path: str | os.PathLike[str]) -> None:
+    """Raise an ``OSError`` if a path exists and is neither a regular file nor a folder: it would be replaced by one."""
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        raise FileExistsError(f"cannot write {os.fspath(path)}: it is a device, pipe or socket; choose another name")
+
+
+def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True) -> None:
+    """Raise an ``OSError`` with the reason if ``path`` must not be replaced by a file, or written into as a folder.
+
+    ``kind`` is as in ``StackFormat``; ``parent_exists`` states whether the folder of a file must exist.
+    """
+    size = len(os.fsencode(path.name))
+    if size > _LONGEST_NAME:
+        raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} fit")
+    check_not_special(path)
+    if kind == "file" and path.is_dir():
+        raise IsADirectoryError(f"cannot write {path}: it is a folder")
+    if kind == "file" and parent_exists and not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
+    if kind != "file" and path.exists() and not path.is_dir():
+        raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
+    if kind != "file" and path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+        raise PermissionError(f"cannot write into folder {path}: it is not writable")
+
+
+def check_tree(path: Path, marker: str, what: str) -> None:
+    """Raise a ``FileExistsError`` unless ``path``, which is replaced with all its files, has the file ``marker``."""
+    if path.exists() and not (path / marker).is_file():
+        raise FileExistsError(f"cannot write {path}: it exists and is not a {what}; choose another name")
+
+
+def check_writable(path: Path, *, folder: bool = False) -> None:
+    """Raise an ``OSError`` with the reason if ``path`` cannot be written; creates nothing."""
+    check_target(path, "folder" if folder else "file")
+    with temporary_folder(path):
+        pass
+
+
+@contextmanager
+def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[str, ...] = ()) -> Iterator[Path]:
+    """Write a file or folder under a temporary name; it gets its name when the block ends without an exception.
+
+    It is on the disk then. The folders above it are created. An existing file or tree is replaced; an existing folder
+    keeps its other files. The block creates what has the temporary name. ``kind``, and ``companions``, the endings of
+    files beside it, are as in ``StackFormat``.
+    """
+    target = Path(path)
+    endings = (*companions, "")  # what describes a file is there before it
+    check_target(target, kind, parent_exists=False)
+    with temporary_folder(target) as folder:
+        yield folder / target.name
+        sync_tree(folder)
+        make_folder(target.parent)
+        if kind == "folder" and target.is_dir():
+            moves = [(file, target / file.name) for file in sorted((folder / target.name).iterdir())]
+        else:
+            moves = [(folder / f"{target.name}{end}", target.with_name(f"{target.name}{end}")) for end in endings]
+        for part, final in moves:
+            check_target(final, "file" if part.is_file() else "folder", parent_exists=False)
+        for part, final in moves:
+            if final.is_file():
+                part.chmod(stat.S_IMODE(final.stat().st_mode))
+            elif final.is_dir():
+                os.replace(final, folder / "old")  # is removed with the temporary folder
+            os.replace(part, final)
+        if kind == "folder":
+            sync(target)
+        sync(target.absolute().parent)
+
+
+@contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """``whole`` for a file in a folder that must exist."""
+    check_target(Path(path))
+    with whole(path) as part:
+        yield part
+
+
+@contextmanager
+def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """``whole`` for a folder, which is created."""
+    with whole(path, "folder") as part:
+        part.mkdir()
+        yield part
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, object]) -> None:
+    """Write a table as JSON with one key per line, atomically."""
+    with whole_file(path) as part:
+        part.write_text(json_text(content) + "\n", encoding="utf-8")

@@ -1,0 +1,5 @@
+"""Motions recorded by gyroscopes and accelerometers: files, alignment of clocks and axes, checks."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

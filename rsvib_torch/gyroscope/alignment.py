@@ -1,0 +1,404 @@
+"""Alignment of a motion that another instrument recorded with the clock of the frames.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ParamSpec, Protocol, overload
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rsvib_torch.checks.validation import Extensible, Number
+from rsvib_torch.checks.validation import options as option_group
+from rsvib_torch.checks.values import check_single
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.shapes.free import residual_of_motion, rms_motion, start_curve
+from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.verdict import recording_reasons
+from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.frames.entry_points import entry_point
+from rsvib_torch.frames.grey import grey_frames
+from rsvib_torch.frames.orientation import (
+    frames_from_row_order,
+    magnitudes_from_row_order,
+    offsets_from_row_order,
+    reasons_from_row_order,
+    sequence_from_row_order,
+)
+from rsvib_torch.gyroscope.clock_range import offset_range, outside
+from rsvib_torch.gyroscope.corner_tracks import corner_tracks
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.options import BandOptions, MaskedInputOptions, Registration, RegistrationOptions
+from rsvib_torch.results.presentation import JudgedResult
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text, wrapped
+
+P = ParamSpec("P")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ClockAlignment(
+    JudgedResult,
+    units={"offset": "s", "offset_std": "s", "drift": "px/s", "unexplained": "px"},
+    shapes={"drift": "2", "unexplained": "2"},
+):
+    """Time of the frames within a recorded motion: ``scale t + offset`` on its clock.
+
+    Attributes:
+        motion: The motion in image axes on the clock of the frames, with gain and drift.
+        offset: Reading of the recording's clock at time 0 of the frames, in seconds.
+        offset_std: Its standard deviation.
+        scale: Seconds on the recording's clock per second of the frames.
+        scale_std: Its standard deviation; 0 if it was not fitted.
+        gain: Factor of the recorded motion of each axis (x, y); 1 if it was not fitted.
+        drift: (2,) px/s that the recording does not contain, as gyroscopes drift.
+        unexplained: (2,) px, rms displacement of rows that the aligned motion does not explain, beyond their noise.
+        reliable: Whether the recording explains the measurements, at this offset only.
+        findings: Each ``Reason`` why not; ``reasons`` has their texts.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, vibration = example_frames()
+        >>> times = torch.linspace(0.0, 0.05, 101, dtype=torch.float64)
+        >>> recorded = rsv.FreeMotion.from_samples(times, vibration.displacement(times))
+        >>> found = rsv.align_motion(frames, timing, recorded, offsets=(-0.004, 0.004))
+        >>> abs(found.offset) < 1e-4  # s: the clocks agree
+        True
+    """
+
+    motion: FreeMotion
+    offset: float
+    offset_std: float
+    scale: float
+    scale_std: float
+    gain: tuple[float, float]
+    drift: Tensor
+    unexplained: Tensor
+    reliable: bool
+    findings: tuple[Reason, ...]
+
+    def summary(self) -> str:
+        """Offset and scale of the clock with standard deviations, gain, drift, and the verdict."""
+        verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
+        drift, left = self.drift.tolist(), self.unexplained.tolist()
+        second = measured_text(self.scale, self.scale_std or None, digits=8)
+        return "\n".join(
+            [
+                f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the recording",
+                f"1 s of the frames is {second} s of the recording",
+                f"x: recorded motion times {self.gain[0]:.4f}, drift {drift[0]:.3g} px/s, {left[0]:.2g} px unexplained",
+                f"y: recorded motion times {self.gain[1]:.4f}, drift {drift[1]:.3g} px/s, {left[1]:.2g} px unexplained",
+                wrapped(verdict),
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class FittedClock:
+    """Parameters of the fit; ``at`` is the reading of the recording's clock at time ``middle`` of the frames."""
+
+    at: float
+    scale: float
+    gain: tuple[float, float]
+    drift: tuple[float, float]
+    middle: float
+
+    @property
+    def offset(self) -> float:
+        """Reading of the recording's clock at time 0 of the frames, in seconds."""
+        return self.at - self.scale * self.middle
+
+    def motion(self, recorded: FreeMotion) -> FreeMotion:
+        """The recorded motion on the clock of the frames."""
+        moved = recorded.retimed(self.offset, self.scale, self.gain)
+        knots = moved.knots - self.middle
+        drift = knots.new_tensor(self.drift)[:, None] * knots
+        return FreeMotion(moved.coefficients + drift, moved.start, moved.spacing, moved.tones, moved.camera)
+
+
+@option_group
+class AlignOptions(BandOptions, MaskedInputOptions):
+    """Options of ``align_motion``; bands are those of the start, and not used for angular rates."""
+
+    registration: Annotated[Registration, Extensible] | None = Field(
+        default=None, description='Method of the bands, for a motion; by default "ncc".'
+    )
+    camera: Camera | None = Field(
+        default=None, description="Focal length and lens, for angular rates; by default the focal length is fitted."
+    )
+    offsets: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="Smallest and largest offset in seconds; by default all for which the recording covers the frames. "
+        "A result outside them is refused.",
+    )
+    fit_scale: bool = Field(default=True, description="Whether to fit the ratio of the speeds of the clocks.")
+    fit_gain: bool = Field(
+        default=False,
+        description="Whether to fit a factor of the recorded motion of each axis; with angular rates, the focal length "
+        "of the camera.",
+    )
+    fit_row_time: bool = Field(
+        default=False,
+        description="Whether to fit the row time as well, with angular rates; ``timing`` has the start value.",
+    )
+
+    def bands(self) -> RegistrationOptions:
+        """The row bands."""
+        return RegistrationOptions(
+            registration=self.registration or "ncc",
+            band_rows=self.band_rows,
+            band_step=self.band_step,
+            search=self.search,
+        )
+
+
+class _AlignsMotion(Protocol[P]):
+    """Type of ``align_motion``."""
+
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion, *args: P.args, **kwargs: P.kwargs
+    ) -> ClockAlignment: ...
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, recorded: AngularRates, *args: P.args, **kwargs: P.kwargs
+    ) -> RotationAlignment: ...
+
+
+def _align_options(options: Callable[P, AlignOptions]) -> Callable[[Callable[..., Any]], _AlignsMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_align_options(AlignOptions)
+@full_precision
+@without_gradients
+def align_motion(
+    frames: FramesOrFiles, timing: SensorTiming, recorded: FreeMotion | AngularRates, options: AlignOptions
+) -> ClockAlignment | RotationAlignment:
+    """Find offset and scale between the clock of a recorded motion and that of the frames.
+
+    The recording (of a gyroscope, of attitude sensors) is compared with the displacements of the rows between frames:
+    first at many offsets with those of row bands, then by least squares with those measured on the images around it. A
+    uniform drift of each axis is fitted as well.
+
+    **Angular rates** (``read_gyroscope``). Corners are followed between consecutive frames, and compared with the
+    rotation of the camera between the exposures of their rows, for all 24 assignments of the axes and all offsets.
+    Bias, clock and, without a camera, the focal length are fitted. Robust weights exclude what moves by itself or is
+    fixed to the camera. Every pair of frames has a translation of its own: if the scene has parallax, only
+    displacements across its lines (epipolar lines) determine the rotation.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of at least two frames; tensor, array, list of these, or files; NaN
+            marks missing pixels.
+        timing: The sensor.
+        recorded: The motion on its own clock, in image axes; or the rates of a gyroscope.
+        options: Options.
+
+    Returns:
+        The motion on the clock of the frames, offset and scale with standard deviations, and a verdict.
+
+    Raises:
+        TypeError: If frames are not numbers, or the recording is neither a motion nor angular rates.
+        ValueError: If the recording is shorter than the frames or does not cover them at any offset in ``offsets``,
+            frames cannot be registered, or an option is out of range.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.linspace(0.0, 0.05, 51, dtype=torch.float64)
+        >>> path = torch.stack([1.5 * torch.sin(700 * times), 1.1 * torch.sin(500 * times)], -1)  # px
+        >>> motion = rsv.FreeMotion.from_samples(times, path)
+        >>> frames = rsv.simulate_frames(city_and_fields(260, 220, seed=3), timing, motion, num_frames=3)
+        >>> late = rsv.FreeMotion.from_samples(times + 0.002, path)  # a gyroscope whose clock is 2 ms ahead
+        >>> found = rsv.align_motion(frames, timing, late, offsets=(-0.004, 0.004))
+        >>> round(1e3 * found.offset, 2)  # ms
+        2.0
+    """
+    if not isinstance(recorded, (FreeMotion, AngularRates)):
+        raise TypeError(
+            "recorded must be a FreeMotion (read_motion, FreeMotion.from_samples) or AngularRates (read_gyroscope), "
+            f"got {type(recorded).__name__}"
+        )
+    if isinstance(recorded, FreeMotion):
+        check_single("recorded", recorded)
+    if isinstance(recorded, FreeMotion) and (options.camera is not None or options.fit_row_time):
+        raise ValueError("camera and fit_row_time are for angular rates (read_gyroscope); omit them for a FreeMotion")
+    stack = grey_frames(frames, timing, options)
+    timing = stack.timing
+    if stack.batched:
+        raise ValueError(f"align_motion takes one stack, got a batch of {len(stack.images)}")
+    grey = stack.images
+    if isinstance(recorded, AngularRates):
+        valid = None if stack.valid is None else frames_from_row_order(stack.valid[0], timing)
+        starts = timing.in_row_order().frame_starts(grey.shape[1]).cpu()
+        return align_rates(
+            corner_tracks(frames_from_row_order(grey[0], timing), valid, timing),
+            torch.stack([starts[:-1], starts[1:]], -1),
+            grey.shape[2:],
+            timing,
+            recorded,
+            options.camera,
+            offsets=options.offsets,
+            fit_scale=options.fit_scale,
+            fit_focal_length=options.camera is None or options.fit_gain,
+            fit_row_time=options.fit_row_time,
+        )
+    bands = options.bands()
+    rowwise, curve, (first, last) = start_curve(stack, timing, bands)
+    turned = recorded.to_row_order(timing).to("cpu")
+    low, high = offset_range(turned, first, last, options.offsets)
+    measured = measurements_of_curve(curve, rowwise, bands.band_step)
+    offset, other = best_offset(measured, turned, low, high, rowwise)
+    clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
+    clock, _, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
+    weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
+    clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+    groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1).to(grey.device))
+    for _ in range(3):
+        measured, _ = measure_groups(
+            groups, rowwise, clock.motion(turned).expanded(1).to(grey.device), keep_images=False
+        )
+        weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
+        clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+    aligned = clock.motion(turned)
+    residual = residual_of_motion(measured, aligned)
+    covariance = covariance / measured.independent_fraction(residual)
+    std = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    gradient = np.array([1.0, -clock.middle])  # offset = at - scale * middle
+    offset_std = float(np.sqrt(np.maximum(gradient @ covariance[:2, :2] @ gradient, 0.0)))
+    rest = measured.unexplained(residual)[0]
+    reasons = recording_reasons(rms_motion(measured, aligned).tolist(), rest.tolist(), other)
+    reasons += outside(clock.offset, offset_std, options.offsets)
+    drift = offsets_from_row_order(torch.tensor(clock.drift, dtype=torch.float64, device="cpu"), timing)
+    gain_x, gain_y = sequence_from_row_order(clock.gain, timing)
+    in_image = replace(clock, gain=(gain_x, gain_y), drift=(float(drift[0]), float(drift[1])))
+    return ClockAlignment(
+        motion=in_image.motion(recorded),
+        offset=clock.offset,
+        offset_std=offset_std,
+        scale=clock.scale,
+        scale_std=float(std[1]),
+        gain=in_image.gain,
+        drift=drift,
+        unexplained=magnitudes_from_row_order(tensor(rest), timing).to(grey.device),
+        reliable=not reasons,
+        findings=reasons_from_row_order(reasons, timing),
+    )
+
+
+def best_offset(
+    measured: Measurements, recorded: FreeMotion, low: float, high: float, timing: SensorTiming
+) -> tuple[float, float | None]:
+    """The offset of the least residual, with a free drift, and another local minimum below twice the least square."""
+    every = max(1, measured.exposure_starts.shape[1] // 400)  # 400 scene rows are enough for a start
+    used = np.flatnonzero((measured.weights[0] > 0).all(-1))[::every]
+    exposure_starts = tensor(measured.exposure_starts[0, used] + 0.5 * measured.exposure_time)
+    seen = tensor(measured.visible[0, used])
+    values = (tensor(measured.displacements[0, used]) * seen[..., None]).flatten(0, 1)
+    weight = (tensor(measured.weights[0, used])[:, None] * seen[..., None]).flatten(0, 1)
+
+    def relative(of: Tensor) -> Tensor:  # (..., N, G, A)
+        mean = (of * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
+        return ((of - mean) * seen[..., None]).flatten(-3, -2)
+
+    drift = relative(exposure_starts[..., None].expand(-1, -1, 2))
+    norm = (weight * drift.square()).sum(0).clamp(min=1e-300)
+    step = max(0.5 * recorded.spacing, 4 * timing.row_time, (high - low) / 20000)  # at most 20,000 offsets
+    grid = torch.linspace(
+        low, high, max(2, math.ceil((high - low) / step) + 1), dtype=torch.float64, device=drift.device
+    )
+    costs = []
+    for part in grid.split(128):  # (128, N G, 2) values at a time
+        residual = values - relative(recorded.displacement(part[:, None, None] + exposure_starts))
+        along = (weight * drift * residual).sum(-2) / norm
+        # both axes together, as one of them may be at rest; without the largest fifth: clouds
+        size = (weight * (residual - along[:, None] * drift).square()).sum(-1)
+        kept = size.sort(dim=-1).values[:, : math.ceil(0.8 * size.shape[-1])]
+        costs.append(kept.sum(-1))
+    cost = torch.cat(costs)
+    best = int(cost.argmin())
+    padded = torch.nn.functional.pad(cost, (1, 1), value=math.inf)
+    valleys = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (cost < 2.0 * cost[best] + 1e-300)
+    valleys[best] = False
+    others = valleys.nonzero()[:, 0]
+    other = float(grid[others[cost[others].argmin()]]) if len(others) else None
+    return float(grid[best]), other
+
+
+def fit_clock(
+    measured: Measurements,
+    recorded: FreeMotion,
+    clock: FittedClock,
+    fit_scale: bool,
+    fit_gain: bool,
+    rows: Array | None = None,
+) -> tuple[FittedClock, Array, float]:
+    """Gauss-Newton on clock reading, scale, gain and drift, and on the row time, from start values.
+
+    To fit the row time, give the frame rows (1, N, G): the exposure of row r starts r row times after a time that is
+    known. The result has the fitted values, the covariance (7, 7) of clock reading, scale, gain and drift of x and y,
+    and row time, and the change of the row time in s.
+    """
+    row_time = 0.0
+    exposure_starts = measured.exposure_starts
+    free = np.array([True, fit_scale, fit_gain, fit_gain, True, True, rows is not None])
+    places = np.zeros_like(exposure_starts) if rows is None else rows
+    for _ in range(12):
+        # 1. Displacement and velocity of the recording at the measured rows.
+        measured = replace(measured, exposure_starts=exposure_starts + places * row_time)
+        starts = measured.exposure_starts
+        middle = starts + 0.5 * measured.exposure_time - clock.middle
+        in_time = recorded.retimed(clock.offset, clock.scale)
+        speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) * clock.gain / clock.scale
+        value = table(in_time.mean_displacement(tensor(starts), measured.exposure_time))
+        # 2. Derivatives (1, N, G, 2, 7) of the displacements by the parameters.
+        x, y = np.eye(2)
+        columns = [
+            speed,
+            speed * middle[..., None],
+            value * x,
+            value * y,
+            middle[..., None] * x,
+            middle[..., None] * y,
+            clock.scale * speed * places[..., None],
+        ]
+        jacobian = measured.relative(np.stack(columns, -1)) * free
+        # 3. The normal equations, in units of the sizes of the columns, and the step.
+        residual = residual_of_motion(measured, clock.motion(recorded))
+        weighted = np.einsum("bnac,bngcq->bngaq", measured.information, jacobian)
+        gram = np.einsum("bngap,bngaq->pq", jacobian, weighted)
+        right = np.einsum("bngap,bnga->p", weighted, residual)
+        scale = np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1.0))
+        inverse = np.linalg.pinv(gram / scale / scale[:, None], rcond=1e-10, hermitian=True) / scale / scale[:, None]
+        change = inverse @ right
+        known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
+        covariance = inverse * (measured.square(residual).sum() / known)
+        at, speedup, gain_x, gain_y, drift_x, drift_y, later = change.tolist()
+        row_time += later
+        clock = FittedClock(
+            clock.at + at,
+            max(clock.scale + speedup, 0.1 * clock.scale),
+            (clock.gain[0] + gain_x, clock.gain[1] + gain_y),
+            (clock.drift[0] + drift_x, clock.drift[1] + drift_y),
+            clock.middle,
+        )
+        if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
+            break
+    return clock, covariance, row_time

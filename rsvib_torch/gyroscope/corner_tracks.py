@@ -1,0 +1,111 @@
+"""Corners that are followed between consecutive frames, with the times at which their rows were exposed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.registration.corners import CornerFollower, Corners, Grey
+
+CELL_ROWS, CELL_COLUMNS = 6, 8  # cells of a frame, in which residuals may be alike
+_MOST_CORNERS = 480  # of a pair of frames
+_LEAST_CORNERS = 12  # of a pair of frames; 3 angles and 3 components of a translation are fitted to each
+_BORDER = 11  # px, half of the patch that OpenCV compares, in which no pixel may be missing
+
+
+@dataclass(frozen=True, eq=False)
+class CornerTracks:
+    """M corners of P pairs of consecutive frames, on the CPU in float64, in image axes."""
+
+    pair: Tensor  # (M,) index of the pair of frames, ascending
+    cell: Tensor  # (M,) index of the cell of the frame
+    starts: Tensor  # (M, 2) s, exposure starts of the first rows of both frames
+    rows: Tensor  # (M, 2) row times from there to the rows of the corner, in both frames
+    place: Tensor  # (M, 2) px from the centre of the frame, (x, y) in the earlier frame
+    offsets: Tensor  # (M, 2) px, (x, y)
+    num_pairs: int  # pairs of frames
+    radius: float  # px, root-mean-square distance of the pixels from the centre
+
+    def times(self, row_time: float) -> Tensor:
+        """(M, 2) s, exposure starts of the corners in both frames."""
+        return self.starts + self.rows * row_time
+
+    def roughly(self) -> Tensor:
+        """(M, 2, 2) information for a start: 1 for displacements near the median of their pair, and 0."""
+        used, index = self.pair.unique(return_inverse=True)
+        middle = torch.stack([self.offsets[self.pair == pair].median(0).values for pair in used])
+        rest = (self.offsets - middle[index]).abs()
+        near = (rest < 5 * 1.4826 * rest.median(0).values.clamp(min=0.1)).all(-1)
+        return near[:, None, None] * torch.eye(2, dtype=rest.dtype)
+
+
+def corner_tracks(frames: Tensor, valid: Tensor | None, timing: SensorTiming) -> CornerTracks:
+    """Follow the corners of every frame to the next one, in grey frames (T, H, W) in image axes.
+
+    Raises:
+        ValueError: If fewer than half of the pairs of frames have enough corners.
+    """
+    follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
+    starts = timing.frame_starts(len(frames)).tolist()
+    # The same scale for all frames, so that places keep their grey level.
+    low, high = np.percentile(frames[0].cpu().numpy(), (0.1, 99.9))
+    pairs: list[Corners] = []
+    for number, start in enumerate(starts):
+        levels = (frames[number].cpu().numpy() - low) / max(high - low, 1e-12)
+        grey = (255 * levels.clip(0, 1)).round().astype(np.uint8)
+        followed = follower.next(grey, start, None if valid is None else _inner(valid[number]))
+        pairs += [] if followed is None else [followed]
+    return tracks_of_pairs(pairs, np.stack([starts[:-1], starts[1:]], -1), timing, (frames.shape[1], frames.shape[2]))
+
+
+def followed_pair(first: Grey, second: Grey, starts: Sequence[float], timing: SensorTiming) -> Corners:
+    """Corners between two grey frames (H, W), whose exposures start at ``starts`` (2,) in s."""
+    follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
+    follower.next(first, starts[0])
+    followed = follower.next(second, starts[1])
+    assert followed is not None
+    return followed
+
+
+def tracks_of_pairs(
+    pairs: Sequence[Corners], starts: Array, timing: SensorTiming, size: tuple[int, int]
+) -> CornerTracks:
+    """The corners of pairs of frames (height, width) = ``size`` whose exposures start at ``starts`` (P, 2) in s.
+
+    Raises:
+        ValueError: If fewer than half of the pairs have enough corners.
+    """
+    enough = np.array([len(pair.rows) >= _LEAST_CORNERS for pair in pairs])
+    if enough.mean() < 0.5:
+        raise ValueError(
+            f"only {enough.sum()} of {len(pairs)} pairs of frames have {_LEAST_CORNERS} corners that can be followed: "
+            "the frames have too little detail, or show different scenes"
+        )
+    (height, width), corners = size, Corners.joined(pairs)
+    used = enough[corners.pairs]
+    pair, offsets, times = corners.pairs[used], corners.offsets[used], corners.times[used]
+    place = corners.places[used] - 0.5 * offsets
+    of_frames = starts[pair]
+    cells = np.floor((place / [width, height] + 0.5) * [CELL_COLUMNS, CELL_ROWS]).astype(np.int64)
+    return CornerTracks(
+        pair=torch.from_numpy(pair),
+        cell=torch.from_numpy(cells @ [1, CELL_COLUMNS]),
+        starts=tensor(of_frames),
+        rows=tensor((times - of_frames - 0.5 * timing.exposure_time) / timing.row_time),
+        place=tensor(place),
+        offsets=tensor(offsets),
+        num_pairs=len(pairs),
+        radius=float((height**2 + width**2 - 2) / 12) ** 0.5,
+    )
+
+
+def _inner(valid: Tensor) -> NDArray[np.uint8]:
+    """Pixels (H, W) around which no pixel of the patch that is compared is missing."""
+    side = 2 * _BORDER + 1
+    return cv2.erode(valid.cpu().numpy().astype(np.uint8), np.ones((side, side)), borderValue=1).astype(np.uint8)

@@ -1,0 +1,307 @@
+"""Alignment of the angular rates of a gyroscope with frames: clock, axes, bias, focal length, row time."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.detection.verdict import recording_reasons
+from rsvib_torch.gyroscope.clock_range import offset_range, outside
+from rsvib_torch.gyroscope.corner_tracks import CornerTracks
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
+from rsvib_torch.gyroscope.rotation_search import (
+    OrientationSearch,
+    Start,
+    orientation_matrix,
+    search_orientations,
+)
+from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.results.presentation import JudgedResult
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text, text_table, wrapped
+
+_CERTAIN = 25.0  # chi-square by which other axes or offsets fit worse: 5 standard deviations of one parameter
+# Starts that are worse by less than this factor are fitted, at most three: with a dashboard and parallax, other axes
+# were better by 1 % in a simulated clip; without both, the second ones are worse by 16 % and more.
+_NEAR_COST = 1.05
+_MAX_COST, _MOST_OTHERS = 4.0, 5  # starts that are worse by this factor in the search, and further ones, are not fitted
+_MAX_FOCAL_LENGTH_STD, _MAX_ROW_TIME_STD = 0.05, 0.2  # of the value; less accurate ones are not determined
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RotationAlignment(
+    JudgedResult,
+    units={
+        "offset": "s",
+        "offset_std": "s",
+        "bias": "rad/s",
+        "bias_std": "rad/s",
+        "focal_length": "px",
+        "focal_length_std": "px",
+        "row_time": "s",
+        "row_time_std": "s",
+        "corner_std": "px",
+        "times": "s",
+    },
+    shapes={
+        "bias": "3",
+        "bias_std": "3",
+        "translation": "P 3",
+        "unexplained": "3",
+        "times": "P",
+        "measured": "P 3",
+        "predicted": "P 3",
+    },
+):
+    """The motion of the image by the rotation that a gyroscope recorded. Its clock reads ``scale t + offset``.
+
+    Attributes:
+        motion: X and Y in px and roll in rad in image axes on the clock of the frames, with the camera.
+        orientation: Axes of the gyroscope that are the axes x (right), y (down) and z (forward) of the camera, a small
+            letter for a negative axis: with "yxZ", the camera turns about its x axis by minus the rate about y.
+        offset: Reading of the gyroscope's clock at time 0 of the frames, in seconds.
+        offset_std: Its standard deviation.
+        scale: Seconds on the gyroscope's clock per second of the frames.
+        scale_std: Its standard deviation; 0 if it was not fitted.
+        bias: (3,) rad/s about the axes of the gyroscope, to be subtracted from its rates.
+        bias_std: Their standard deviations.
+        focal_length: px.
+        focal_length_std: Its standard deviation; 0 if it was not fitted.
+        row_time: s.
+        row_time_std: Its standard deviation; 0 if it was not fitted.
+        translation: (P, 3) translation of the camera between consecutive frames over the mean distance of the content,
+            camera axes.
+        unexplained: (3,) px, px, rad: standard deviation of X, Y and roll from frame to frame that the gyroscope does
+            not explain, beyond the noise of the measurements.
+        corner_std: px, standard deviation of the place of a corner across the line of its parallax.
+        times: (P,) s, mid-times of consecutive frames.
+        measured: (P, 3) px, px, rad: X, Y and roll between consecutive frames, from the images.
+        predicted: (P, 3) The same by the gyroscope.
+        reliable: Whether the gyroscope explains the frames, with this clock and these axes only.
+        findings: Each ``Reason`` why not; ``reasons`` has their texts.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=80e-6, exposure_rows=10, frame_rows=420)
+        >>> times = torch.arange(-0.02, 0.12, 0.001, dtype=torch.float64)
+        >>> angles = [5e-3 * torch.sin(50 * times), 4e-3 * torch.sin(70 * times + 1), 6e-3 * torch.sin(45 * times + 2)]
+        >>> pitch, yaw, roll = angles  # rad, of the camera
+        >>> path = torch.stack([-400 * yaw, 400 * pitch, -roll], -1)
+        >>> motion = rsv.FreeMotion.from_samples(times, path, camera=rsv.Camera(400.0))
+        >>> frames = rsv.simulate_frames(city_and_fields(224, 240, seed=2), timing, motion, num_frames=3)
+        >>> turned = torch.stack([roll, pitch, yaw], -1)  # the gyroscope is mounted in another direction
+        >>> rates = rsv.AngularRates(times[1:-1] + 0.5, (turned[2:] - turned[:-2]) / 0.002)
+        >>> found = rsv.align_motion(frames, timing, rates)
+        >>> found.orientation, round(found.offset, 3), round(found.focal_length / 10)
+        ('YZX', 0.5, 40)
+    """
+
+    motion: FreeMotion
+    orientation: str
+    offset: float
+    offset_std: float
+    scale: float
+    scale_std: float
+    bias: Tensor
+    bias_std: Tensor
+    focal_length: float
+    focal_length_std: float
+    row_time: float
+    row_time_std: float
+    translation: Tensor
+    unexplained: Tensor
+    corner_std: float
+    times: Tensor
+    measured: Tensor
+    predicted: Tensor
+    reliable: bool
+    findings: tuple[Reason, ...]
+
+    def summary(self) -> str:
+        """Clock, axes, bias and focal length with standard deviations, what is not explained, and the verdict."""
+        second = measured_text(self.scale, self.scale_std or None, digits=8)
+        axes = [letter.lower() if letter.isupper() else f"-{letter}" for letter in self.orientation]
+        verdict = "reliable" if self.reliable else f"not reliable: {'; '.join(self.reasons)}"
+        bias, std = self.bias.tolist(), self.bias_std.tolist()
+        moved, rest = (self.predicted - self.predicted.mean(0)).square().mean(0).sqrt(), self.unexplained
+        names = ("X (px)", "Y (px)", "roll (rad)")
+        return "\n".join(
+            [
+                f"time 0 of the frames is {measured_text(self.offset, self.offset_std)} s of the gyroscope",
+                f"1 s of the frames is {second} s of the gyroscope",
+                f"axes x, y, z of the camera are {', '.join(axes)} of the gyroscope",
+                f"bias {', '.join(measured_text(b, s) for b, s in zip(bias, std, strict=True))} rad/s, focal length "
+                f"{measured_text(self.focal_length, self.focal_length_std or None)} px, row time "
+                f"{measured_text(1e6 * self.row_time, 1e6 * self.row_time_std or None)} us",
+                text_table(
+                    ["between frames", "by the gyroscope (rms)", "not explained"],
+                    [[names[k], measured_text(moved[k]), measured_text(rest[k], digits=2)] for k in range(3)],
+                ),
+                wrapped(verdict),
+            ]
+        )
+
+
+def align_rates(
+    tracks: CornerTracks,
+    starts: Tensor,
+    size: Sequence[int],
+    timing: SensorTiming,
+    rates: AngularRates,
+    camera: Camera | None = None,
+    *,
+    offsets: tuple[float, float] | None = None,
+    fit_scale: bool = True,
+    fit_focal_length: bool = True,
+    fit_row_time: bool = False,
+) -> RotationAlignment:
+    """``align_motion`` for angular rates, from the corners of pairs of frames.
+
+    The frames have ``size`` (rows, pixels of a row); their exposures start at ``starts`` (P, 2) in s.
+    """
+    height, width = size
+    if camera is not None:
+        camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
+    begin, last = float(starts[0, 0]), float(starts[-1, 1]) + height * timing.row_time + timing.exposure_time
+    limits = offset_range(rates, begin, last, offsets)
+    middle = 0.5 * (begin + last)
+    known = None if fit_focal_length else camera
+    free = [True, True, True, True, fit_scale, fit_focal_length, fit_row_time]
+
+    def parameters(start: Start, row_time: float) -> Tensor:
+        values = [0.0, 0.0, 0.0, start.offset + middle, 1.0, start.focal_length, row_time]
+        return torch.tensor(values, dtype=torch.float64)
+
+    # 1. Axes and offsets that explain the displacements best, and the fit from there with the smallest residuals.
+    search = search_orientations(tracks, tracks.roughly(), rates, timing.row_time, timing.exposure_time, limits, known)
+    lens = camera or Camera(search.starts[0].focal_length)
+    first = search.starts[0]
+    near = [first, *(start for start in search.starts[1:3] if start.cost < _NEAR_COST * first.cost)]
+    model = RotationModel(tracks, rates, first.orientation, lens, timing.exposure_time, middle)
+    fits = [
+        fit_robustly(replace(model, orientation=start.orientation), parameters(start, timing.row_time), free)
+        for start in near
+    ]
+    fit = min(fits, key=lambda one: one.errors.sigma / float((one.errors.weight > 0).double().mean()))
+    first = near[fits.index(fit)]
+
+    # 2. What does not follow the gyroscope has no weight in a second search, and parallax little.
+    row_time = float(fit.parameters[6])
+    lens = replace(lens, focal_length=float(fit.parameters[5]))
+    again = search_orientations(tracks, fit.information(), rates, row_time, timing.exposure_time, limits, lens)
+    best = again.starts[0]
+    if best.orientation != first.orientation or abs(best.offset - first.offset) > 5 / rates.sample_rate:
+        model = replace(model, orientation=best.orientation)
+        fit = fit_robustly(model, parameters(best, timing.row_time), free)
+
+    # 3. Other axes and offsets that explain the frames as well.
+    def explains(start: Start) -> bool:
+        near = start.cost < _MAX_COST * best.cost
+        return near and fit.significance(start.orientation, parameters(start, row_time), free) < _CERTAIN
+
+    others = [start for start in again.starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
+    axes = [start.orientation for start in others if explains(start)]
+    other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
+    return _result(fit, again, axes, other, free, starts, height, offsets)
+
+
+def _result(
+    fit: RotationFit,
+    search: OrientationSearch,
+    axes: list[str],
+    other: float | None,
+    free: list[bool],
+    starts: Tensor,
+    height: int,
+    offsets: tuple[float, float] | None,
+) -> RotationAlignment:
+    model, radius = fit.model, fit.model.tracks.radius
+    values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
+    std = fit.covariance.diagonal().clamp(min=0.0).sqrt()
+    at, scale, focal_length, row_time = (values[name] for name in ("at", "scale", "focal length", "row time"))
+    gradient = torch.zeros(7, dtype=torch.float64)
+    gradient[3], gradient[4] = 1.0, -model.middle  # offset = at - scale * middle
+    offset, offset_std = at - scale * model.middle, float(gradient @ fit.covariance @ gradient) ** 0.5
+    middles = starts + 0.5 * (height - 1) * row_time + 0.5 * model.exposure_time
+    predicted = components_of(model.rates, model.orientation, fit.parameters, middles, model.middle)
+    units = torch.tensor([1.0, 1.0, 1 / radius], dtype=torch.float64)
+    unexplained = fit.errors.effects[:3] * units
+    first, last = float(middles[0, 0]) - 0.5 * height * row_time, float(middles[-1, 1]) + 0.5 * height * row_time
+    clock = scale * (torch.tensor([first, last], dtype=torch.float64) - model.middle) + at
+
+    moved = (predicted - predicted.mean(0)).square().mean(0).sqrt()
+    reasons = recording_reasons(moved[:2].tolist(), unexplained[:2].tolist(), other)
+    if search.mirrored is not None:
+        reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
+    if axes:
+        reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
+    reasons += _uncertain(fit, free, std) + outside(offset, offset_std, offsets)
+    steps = model.rates.times.diff()
+    inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
+    longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
+    if longest > allowed:
+        reasons.append(Reason("gap_in_recording", None, longest, allowed))
+    readout, shortest = row_time * height, float(starts.diff(dim=1).amin())
+    if readout > shortest:
+        reasons.append(Reason("readout_too_long", None, readout, shortest, {"rows": height}))
+    translation = fit.translation + fit.effects[:, 3:]
+    return RotationAlignment(
+        motion=_motion(fit, clock),
+        orientation=model.orientation,
+        offset=offset,
+        offset_std=offset_std,
+        scale=scale,
+        scale_std=float(std[4]),
+        bias=fit.parameters[:3],
+        bias_std=std[:3],
+        focal_length=focal_length,
+        focal_length_std=float(std[5]),
+        row_time=row_time,
+        row_time_std=float(std[6]),
+        translation=translation / torch.tensor([-focal_length, -focal_length, radius], dtype=torch.float64),
+        unexplained=unexplained,
+        corner_std=fit.errors.sigma,
+        times=middles.mean(1),
+        measured=predicted + fit.unshrunk() * units,
+        predicted=predicted,
+        reliable=not reasons,
+        findings=tuple(reasons),
+    )
+
+
+def _uncertain(fit: RotationFit, free: list[bool], std: Tensor) -> list[Reason]:
+    """Reasons against parameters that are not determined."""
+    reasons = []
+    focal_length, row_time = fit.parameters[5:7].tolist()
+    focal_length_std, row_time_std = std[5:7].tolist()
+    allowed = _MAX_FOCAL_LENGTH_STD * focal_length
+    if focal_length_std > allowed:
+        details = {"focal_length": focal_length}
+        reasons.append(Reason("focal_length_uncertain", None, focal_length_std, allowed, details))
+    if free[6] and row_time_std > _MAX_ROW_TIME_STD * row_time:
+        reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
+    if not math.isfinite(float(std.sum())):
+        reasons.append(Reason("fit_not_converged"))
+    return reasons
+
+
+def _motion(fit: RotationFit, clock: Tensor, margin: int = 4) -> FreeMotion:
+    """The motion on the clock of the frames, relative to their mid-time, with ``margin`` samples beyond the frames."""
+    model, parameters = fit.model, fit.parameters
+    times = model.rates.times.cpu()
+    low = max(int(torch.searchsorted(times, clock[0])) - margin, 0)
+    high = min(int(torch.searchsorted(times, clock[1])) + margin, len(times))
+    part = AngularRates(times[low:high], model.rates.rates[low:high].cpu() - parameters[:3])
+    pitch, yaw, roll = (part.attitude(float(parameters[3])) @ orientation_matrix(model.orientation).T).unbind(-1)
+    focal_length = float(parameters[5])
+    moved = torch.stack([-focal_length * yaw, focal_length * pitch, -roll], -1)
+    recorded_times = (part.times - parameters[3]) / parameters[4] + model.middle
+    camera = replace(model.camera, focal_length=focal_length)
+    return FreeMotion.from_samples(recorded_times, moved, spacing=float(recorded_times.diff().median()), camera=camera)

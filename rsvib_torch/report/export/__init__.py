@@ -1,1 +1,0 @@
-"""Motions in the file formats of other programs: angular rates, sampling maps, and image support data."""

@@ -1,0 +1,391 @@
+"""What all results have: a summary as text and HTML, a dictionary, a figure, and moves between devices.
+
+A result is a dataclass of tensors, numbers, texts and other results. ``Result`` gives it the methods; the class writes
+its own ``summary`` with the functions below.
+"""
+
+import html
+import itertools
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_methods
+from rsvib_torch.checks.validation import read_json
+from rsvib_torch.checks.values import check_number, described, needed_package
+from rsvib_torch.files.reading import Table
+from rsvib_torch.results.figures import FIGURES, figure_of
+from rsvib_torch.results.reason import texts
+from rsvib_torch.results.result_files import figure_png, result_of, save_result, write_figure
+from rsvib_torch.text import AXES, data_uri, text_table, wrapped
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.figure import Figure
+
+# Text
+
+
+AXIS_NAMES = AXES
+AXIS_UNITS = ("px", "px", "rad", "of the scale")
+
+
+def axis_rows(batch_shape: Sequence[int], axes: int = 2) -> list[tuple[tuple[int, ...], list[str]]]:
+    """Index (..., axis) of each axis of each result of a batch, and the first cells of its row in a table."""
+    indices = itertools.product(*map(range, batch_shape), range(axes))
+    return [(at, [", ".join(map(str, at[:-1]))] * bool(batch_shape) + [AXIS_NAMES[at[-1]]]) for at in indices]
+
+
+def axis_head(batch_shape: Sequence[int]) -> list[str]:
+    """First cells of the head of a table with ``axis_rows``."""
+    return ["index"] * bool(batch_shape) + ["axis"]
+
+
+def verdict_table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    batch_shape: Sequence[int],
+    reliable: Tensor,
+    reasons: tuple[Any, ...],
+) -> list[str]:
+    """A table with rows that begin as in ``axis_rows``, and the verdict: lines with reasons, or a column in a batch."""
+    head = [*axis_head(batch_shape), *head]
+    if not batch_shape:
+        return [text_table(head, rows), *verdict_lines(reliable, reasons)]
+    verdicts = {
+        tuple(labels): "reliable" if bool(reliable[at]) else "not reliable"
+        for at, labels in axis_rows(batch_shape, reliable.shape[-1])
+    }
+    return [text_table([*head, "verdict"], [[*row, verdicts[tuple(row[:2])]] for row in rows])]
+
+
+def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
+    """Whether each axis (x, y, roll, zoom) is reliable, with the reasons."""
+    lines = []
+    for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):
+        lines.append(f"{name}: reliable" if bool(good) else f"{name}: not reliable:")
+        lines += [wrapped(f" - {reason}") for reason in why]
+    return lines
+
+
+# Dictionaries
+
+
+def plain_values(value: object) -> Any:
+    """A value as JSON can store it: tensors as nested lists, None for numbers that are not finite, results as tables.
+
+    Example:
+        >>> plain_values({"amplitude": torch.tensor([1.5, float("nan")]), "reasons": ("blind",)})
+        {'amplitude': [1.5, None], 'reasons': ['blind']}
+    """
+    if isinstance(value, Tensor):
+        return plain_values(value.detach().cpu().tolist())
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if is_dataclass(value):
+        return {field.name: plain_values(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# Tables
+
+
+def joined_columns(lines: Sequence[Mapping[str, object]]) -> dict[str, list[object]]:
+    """Columns of a table from its lines; a cell that a line does not have is None."""
+    names = dict.fromkeys(name for line in lines for name in line)
+    return {name: [line.get(name) for line in lines] for name in names}
+
+
+def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict[str, float]:
+    """Amplitude A in px, and those of velocity 2 pi f A and acceleration (2 pi f)^2 A, with units in the names.
+
+    The size of a pixel is in m.
+    """
+    angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
+    return {
+        "amplitude_um": 1e6 * metres,
+        "velocity_um_per_s": 1e6 * angular * metres,
+        "acceleration_m_per_s2": angular**2 * metres,
+    }
+
+
+PHYSICAL_HEAD = ("amplitude (µm)", "velocity (µm/s)", "acceleration (m/s²)")  # of ``physical_tone``
+
+
+def check_pixel_size(pixel_size: float | None) -> float | None:
+    """The size of a pixel in m, which a number in another unit is not."""
+    if pixel_size is None:
+        return None
+    # a pixel of 1 km shows the Earth in 12,742 px; 1 nm is a tenth of the smallest structures of light microscopes
+    return check_number("pixel_size (in m)", pixel_size, at_least=1e-9, at_most=1e3)
+
+
+_DIMENSIONS = {"A": "axis", "F": "frequency", "K": "tone", "N": "row", "P": "pair", "R": "row", "T": "frame"}
+Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dimensions, values, attributes
+
+
+def _dimensions(stated: str, count: int, name: str) -> tuple[str, ...]:
+    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``."""
+    symbols = [entry.partition("=")[0] for entry in stated.split() if "..." not in entry]
+    batch = count - len(symbols)
+    leading = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
+    named = [_DIMENSIONS.get(symbol, f"{name}_{symbol.lower()}") for symbol in symbols]
+    return (*leading, *named)
+
+
+# Results
+
+
+class Summarised:
+    """A class whose objects print as their summary, in the terminal and in notebooks."""
+
+    def summary(self) -> str:
+        """The result in a few lines."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+    def _repr_html_(self) -> str:
+        """HTML for notebooks: the summary, and the figure if there is one."""
+        return f'<pre style="white-space: pre-wrap">{html.escape(self.summary())}</pre>'
+
+
+@checked_methods
+class Result(Summarised):
+    """Methods of a dataclass of tensors, numbers, texts and other results.
+
+    The decorator of the class needs ``repr=False``, so that objects print as their summary. Arguments of the class:
+    ``units``, the units of its fields, which are written into files; ``shapes``, the axes of its tensors as in
+    ``check_shapes``, where ``"..."`` alone marks a tuple or table with one entry for each result of a batch; and
+    ``file_format``, the first entry of its files, by default the name of the class.
+    """
+
+    units: ClassVar[Mapping[str, str]] = {}
+    shapes: ClassVar[Mapping[str, str]] = {}
+    file_format: ClassVar[str] = ""
+
+    def __init_subclass__(
+        cls,
+        *,
+        units: Mapping[str, str] | None = None,
+        shapes: Mapping[str, str] | None = None,
+        file_format: str | None = None,
+    ) -> None:
+        super().__init_subclass__()
+        cls.units = cls.units if units is None else units
+        cls.shapes = cls.shapes if shapes is None else shapes
+        cls.file_format = f"rsvib {cls.__name__}" if file_format is None else file_format
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        check_shapes(vars(self), self.shapes)
+        reliable = getattr(self, "reliable", None)
+        if isinstance(reliable, Tensor) and reliable.dtype != torch.bool:
+            raise TypeError(f"reliable must be a tensor of booleans, got {reliable.dtype}")
+        for name in self.units:  # quantities with a unit
+            value = getattr(self, name, None)
+            if isinstance(value, Tensor) and not value.is_floating_point():
+                raise TypeError(f"{name} must be a floating-point tensor, got {value.dtype}")
+
+    def summary(self) -> str:
+        """The result in a few lines: here the shapes of its tensors and its other values."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        shown = {name: f"tensor {tuple(v.shape)}" if isinstance(v, Tensor) else str(v) for name, v in values.items()}
+        return "\n".join([type(self).__name__, *(f"  {name}: {text}" for name, text in shown.items())])
+
+    @property
+    def batch_shape(self) -> Sequence[int]:
+        """Leading dimensions: empty for one result, (B,) for a batch of stacks."""
+        for name, stated in self.shapes.items():
+            value = getattr(self, name)
+            if stated.startswith("... ") and isinstance(value, Tensor):
+                return value.shape[: value.ndim + 1 - len(stated.split())]
+        return ()
+
+    def _fields_of_batch(self) -> Table:
+        """Fields that have one entry for each result of a batch, by the leading dimensions that their shapes state."""
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if isinstance(value, Result)
+            or (value is not None and self.shapes.get(name, "").split(" ")[0] in ("...", "[...]"))
+        }
+
+    def __getitem__(self, index: int) -> Self:
+        """One result of a batch."""
+        if not self.batch_shape:
+            raise IndexError(f"this {type(self).__name__} is not a batch")
+        result = copy(self)
+        for name, value in self._fields_of_batch().items():
+            if isinstance(value, Tensor) and value.ndim < len(self.shapes[name].split()):
+                continue  # all results have it in common
+            selected = {k: v[index] for k, v in value.items()} if isinstance(value, dict) else value[index]
+            object.__setattr__(result, name, selected)
+        return result
+
+    @classmethod
+    def stacked(cls, results: Sequence[Self]) -> Self:
+        """Results of the same shape as a batch; the new dimension is the first. Other values are those of the first."""
+        if not isinstance(results, (list, tuple)) or not results or not all(isinstance(one, cls) for one in results):
+            raise TypeError(f"results must be a list of {cls.__name__}, at least one, got {described(results)}")
+        result: Self = copy(results[0])
+        for name, first in result._fields_of_batch().items():
+            values = [getattr(one, name) for one in results]
+            joined: Any = tuple(values)
+            if isinstance(first, Tensor):
+                joined = torch.stack(values)
+            elif isinstance(first, Result):
+                joined = type(first).stacked(values)
+            elif isinstance(first, dict):
+                joined = {key: torch.stack([value[key] for value in values]) for key in first}
+            object.__setattr__(result, name, joined)
+        return result
+
+    def to_dict(self) -> Table:
+        """All values as nested lists, numbers and texts, which JSON can store; None for numbers that are not finite."""
+        return {field.name: plain_values(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as JSON, which ``load`` reads; an existing file is replaced."""
+        save_result(self, Path(path))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file that ``save`` wrote."""
+        result: Self = result_of(cls, read_json(Path(path), f"file of {cls.__name__}.save"), Path(path))
+        return result
+
+    def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
+        """The result as columns by name, with the unit in each name; None for unknown values.
+
+        ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file.
+
+        Args:
+            pixel_size: Size of a pixel in m, in the plane in which the motion is wanted (sensor or object); columns in
+                um, um/s and m/s^2 are added then.
+
+        Raises:
+            TypeError: If this kind of result has no table.
+        """
+        raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
+
+    def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
+        """``table`` as a ``pandas.DataFrame``; missing values are NaN."""
+        frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
+            self.table(pixel_size=pixel_size)
+        )
+        return frame
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The tensors as an ``xarray.Dataset`` with names of dimensions, and units.
+
+        The coordinates are ``axis`` and, from 1 on as in tables, ``tone``. Tensors of a result within this one have the
+        name of its field in front (``std_amplitude``); those of a motion have their own. ``index`` counts the results
+        of a batch.
+        """
+        package = needed_package("xarray", "to_xarray", "tables")
+        variables = dict(self._variables(()))
+        sizes: dict[str, int] = {}
+        for names, values, _ in variables.values():
+            sizes |= zip(names, values.shape, strict=True)
+        coordinates = {"axis": np.array(AXIS_NAMES[: sizes["axis"]], object)} if "axis" in sizes else {}
+        if "tone" in sizes:
+            coordinates["tone"] = np.arange(1, sizes["tone"] + 1)
+        dataset: xarray.Dataset = package.Dataset(variables, coordinates)
+        return dataset
+
+    def _variables(self, inside: tuple[str, ...]) -> Iterator[tuple[str, Variable]]:
+        """Names and values of the tensors for ``to_xarray``; ``inside`` names the fields around this result."""
+        for name, value in vars(self).items():
+            own = () if name in ("vibration", "motion") else (name,)
+            if isinstance(value, Result):
+                yield from value._variables((*inside, *own))
+            elif isinstance(value, Tensor) and name in self.shapes:
+                full = "_".join(dict.fromkeys((*inside, name)))  # offsets of the curve "offsets" are "offsets"
+                unit = {"units": self.units[name]} if name in self.units else {}
+                yield full, (_dimensions(self.shapes[name], value.ndim, full), value.detach().cpu().numpy(), unit)
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The same result with ``function``, which must preserve values, applied to every tensor.
+
+        Values are not checked again, so that no device is synchronised.
+        """
+        result = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                object.__setattr__(result, name, function(value))
+            elif isinstance(value, Result):
+                object.__setattr__(result, name, value.mapped(function))
+            elif isinstance(value, dict):
+                object.__setattr__(result, name, {key: function(entry) for key, entry in value.items()})
+        return result
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same result with its tensors on another device."""
+        return self.mapped(lambda values: values.to(device))
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
+        """Draw the result, and write the picture (PNG, SVG, PDF) if a path is given; notebooks show the figure."""
+        draw = figure_of(type(self), len(self.batch_shape))
+        if draw is None:
+            drawn = sorted({kind.__name__ for kind, _ in FIGURES})
+            if type(self).__name__ in drawn:
+                raise ValueError(
+                    f"a batch of shape {tuple(self.batch_shape)} has no figure: select one, result[0].plot()"
+                )
+            raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
+        figure = draw(self)
+        if path is not None:
+            write_figure(figure, path)
+        return figure
+
+    def _repr_html_(self) -> str:
+        text = super()._repr_html_()
+        if figure_of(type(self), len(self.batch_shape)) is None:
+            return text
+        return f'{text}<img src="{data_uri(figure_png(self.plot(), dpi=70), "image/png")}">'
+
+
+class JudgedResult(Result):
+    """A result with a verdict. Its field ``findings`` has the ``Reason`` objects against it, or against each axis."""
+
+    findings: tuple[Any, ...]
+
+    @property
+    def reasons(self) -> tuple[Any, ...]:
+        """Texts of ``findings``."""
+        return texts(self.findings)
+
+    def codes(self, place: Sequence[int]) -> str:
+        """Codes of the reasons at an index (..., axis) of ``reliable``, separated by spaces."""
+        against = self.findings
+        for index in place:
+            against = against[index]
+        return " ".join(reason.code for reason in against)
+
+    def _variables(self, inside: tuple[str, ...]) -> Iterator[tuple[str, Variable]]:
+        for name, (dimensions, values, attributes) in super()._variables(inside):
+            yield name, (dimensions, values, attributes)
+            if name == "reliable" and dimensions[-1:] == ("axis",):
+                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object).reshape(
+                    values.shape
+                )
+                yield "reasons", (dimensions, codes, {})

@@ -1,0 +1,486 @@
+"""Reasons against a result as data, and the table from which their texts follow.
+
+A new reason is an entry of the table below and the comparison that returns a ``Reason`` with its code. docs/reasons.md
+is written from the table.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from string import Formatter
+from typing import Any
+
+from rsvib_torch.text import quoted
+
+
+@dataclass(frozen=True)
+class ReasonKind:
+    """The reasons of one code: their text, and what they compare.
+
+    Sentence and remedy are templates with the fields ``value``, ``limit``, ``axis``, ``other`` (the axis across it) and
+    the names of the details. A part in square brackets is omitted if one of its details is not given.
+    """
+
+    sentence: str  # template of the sentence
+    remedy: str = ""  # template of what the user can do; empty if nothing is known
+    compares: str = ""  # the quantity, and from which limit on it is a reason; empty if there is no limit
+    unit: str = ""  # unit of value and limit; empty for a ratio, a count, or nothing
+    refuses: str = "the axis"  # what is refused
+    free_model: bool = False  # whether ``detect_motion`` may explain the frames
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a result, or one axis of it, is not reliable.
+
+    Example:
+        >>> reason = Reason("tone_averaged_out", "x", 2600.0, 2500.0)
+        >>> print(reason)
+        tone of 2600 Hz is above 1/T_e = 2500 Hz, where the exposure averages it out; use a shorter exposure
+    """
+
+    code: str  # key of the table ``REASONS``
+    axis: str | None = None  # ``"x"``, ``"y"``, ``"roll"`` or ``"zoom"``; None for all axes
+    value: float | None = None  # the compared quantity in the unit of the table; None if nothing is compared
+    limit: float | None = None  # its limit in the same unit
+    details: Mapping[str, float | str] = field(default_factory=dict)  # further numbers and texts of the sentence
+
+    def __post_init__(self) -> None:
+        if self.code not in REASONS:
+            raise ValueError(f"code must be one of {', '.join(REASONS)}, got {quoted(self.code)}")
+        try:
+            str(self)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"value, limit or details of the reason {quoted(self.code)} do not fit its text"
+            ) from error
+
+    @property
+    def kind(self) -> ReasonKind:
+        """Entry of the table."""
+        return REASONS[self.code]
+
+    def __str__(self) -> str:
+        """The sentence with its remedy, without the axis."""
+        values = {"axis": self.axis, "other": {"x": "y", "y": "x"}.get(self.axis or ""), **self.details}
+        # JSON has no infinity: a number that is missing in a file was infinite
+        values |= {name: getattr(self, name) if getattr(self, name) is not None else math.inf for name in _COMPARED}
+        remedy = str(self.details.get("instead", self.kind.remedy))  # another remedy than that of the table
+        template = "; ".join(filter(None, (self.kind.sentence, remedy))) + _AT_RADIUS
+
+        def part(match: re.Match[str]) -> str:
+            names = {name for _, name, _, _ in Formatter().parse(match[1]) if name}
+            return match[1] if names <= values.keys() else ""
+
+        return re.sub(r"\[([^]]*)\]", part, template).format_map(values)
+
+    @property
+    def with_axis(self) -> str:
+        """The text after the name of the axis."""
+        return str(self) if self.axis is None else f"{self.axis}: {self}"
+
+    def to_dict(self) -> dict[str, object]:
+        """The reason as JSON can store it, with its text; None for numbers that are not finite."""
+        numbers = {
+            name: None if isinstance(number, float) and not math.isfinite(number) else number
+            for name, number in {"value": self.value, "limit": self.limit, **self.details}.items()
+        }
+        compared = {name: numbers.pop(name) for name in _COMPARED}
+        return {"code": self.code, "axis": self.axis, **compared, "details": numbers, "text": str(self)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Reason":
+        """Inverse of ``to_dict``; a code that this version does not know becomes ``"unspecified"`` with its text."""
+        code, axis = values.get("code"), values.get("axis")
+        if code not in REASONS:
+            return cls("unspecified", axis, details={"text": str(values.get("text", code))})
+        details = {name: math.inf if value is None else value for name, value in (values.get("details") or {}).items()}
+        return cls(code, axis, values.get("value"), values.get("limit"), details)
+
+
+_COMPARED = ("value", "limit")
+_AT_RADIUS = "[ (px: at {radius:.0f} px from the centre)]"  # for components of roll and zoom
+
+
+def texts(findings: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Texts of reasons: of those in the tuple of an axis without its name, of others with it."""
+
+    def without_axis(findings: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(str(one) if isinstance(one, Reason) else without_axis(one) for one in findings)
+
+    return tuple(one.with_axis if isinstance(one, Reason) else without_axis(one) for one in findings)
+
+
+def read_findings(values: Any) -> Any:
+    """Reasons in nested lists as JSON files have them."""
+    if isinstance(values, Mapping):
+        return Reason.from_dict(values)
+    if not isinstance(values, (list, tuple)):
+        raise ValueError(f"findings: expected a list of reasons, got {quoted(values)}")
+    return tuple(map(read_findings, values))
+
+
+_MORE_FRAMES = "use more frames"
+_FOLLOW = "use follow=True if the vibration changes"
+_TONES_OR_FREE = f"{_FOLLOW}, try more tones or model='free'"
+_CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
+_UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
+
+_TONES = {
+    "rows_not_registered": ReasonKind(
+        "only {value:.0%} of {what} can be registered, {limit:.0%} are needed: the motion is beyond the search range, "
+        "or the frames lack detail or show different scenes",
+        "increase search",
+        "fraction of the visible rows or bands that were registered and of the registered bands that correlate more "
+        "than independent noise, below 0.5",
+        refuses="all axes",
+    ),
+    "no_tone": ReasonKind(
+        "no significant tone: the offsets are those of a uniform motion, or below their noise",
+        "use more frames if a vibration is expected",
+    ),
+    "too_many_tones": ReasonKind(
+        "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
+        "is wrong",
+        "try model='free'",
+        "number of tones, if it is the largest that is tried (4)",
+        free_model=True,
+    ),
+    "tone_uncertainty_unknown": ReasonKind(
+        "the uncertainty of the tone of {frequency:.4g} Hz is unknown: too few rows were measured", _MORE_FRAMES
+    ),
+    "tone_not_significant": ReasonKind(
+        "tone of {frequency:.4g} Hz is not significant: its amplitude is {value:.3g} ± {std:.2g} px, and 4 standard "
+        "deviations, {limit:.3g} px, are needed",
+        _MORE_FRAMES,
+        "amplitude of the only tone, below 4 standard deviations",
+        "px",
+    ),
+    "tone_too_small": ReasonKind(
+        "tone of {frequency:.4g} Hz is too small: its offsets of {value:.2g} px are below {limit:g} px, where errors "
+        "of interpolation may cause them",
+        compares="amplitude of the offsets of a tone, below 0.01 px",
+        unit="px",
+    ),
+    "tone_blind": ReasonKind(
+        "tone of {frequency:.4g} Hz is nearly blind: its offset gain is {value:.3f}, {limit:g} is needed, because "
+        "every frame is displaced alike",
+        "use frames at other or unequal intervals[; its frequency equals {multiple}the frame rate of {frame_rate:.5g} "
+        "Hz, which a wrong frame_rows also causes: check that frame_rows counts the blanking rows and is not the image "
+        "height]",
+        "offset gain of a tone, below 0.1; in two frames below 0.3, where an image motion and another tone explain the "
+        "rows as well",
+    ),
+    "tones_alias": ReasonKind(
+        "tones of {value:.5g} and {limit:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
+        "because the rows are read in another time than stated",
+        "check row_time and the readout direction",
+        "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
+        "Hz",
+    ),
+    "tone_averaged_out": ReasonKind(
+        "tone of {value:.4g} Hz is above 1/T_e = {limit:.4g} Hz, where the exposure averages it out",
+        "use a shorter exposure",
+        "frequency of a tone, above 1 / exposure time",
+        "Hz",
+    ),
+    "displacement_ambiguous": ReasonKind(
+        f"{_UNCERTAIN}, {{limit:.2g}} px are allowed, because the frames also agree with other tones",
+        f"{_FOLLOW}, or use more frames",
+        "standard deviation of the displacement of the rows, above 4 % of it and 0.01 px, with several tones or if it "
+        "exceeds 1.5 times the one of the fit alone",
+        "px",
+    ),
+    "displacement_uncertain": ReasonKind(
+        f"{_UNCERTAIN}; the standard deviation must be at most 25 % of the displacement, {{limit:.2g}} px",
+        _MORE_FRAMES,
+        "standard deviation of the displacement of the rows, above 25 % of it",
+        "px",
+    ),
+    "rows_unexplained": ReasonKind(
+        "rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
+        f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
+        "rms residual of the rows without their noise, above 0.05 px and 0.6 % of the rms offsets",
+        "px",
+        free_model=True,
+    ),
+    "neighbours_unexplained": ReasonKind(
+        "neighbouring rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
+        f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
+        "the part of the residual that neighbouring rows have in common, above 0.01 px and 0.25 % of the rms offsets, "
+        "with 95 % confidence",
+        "px",
+        free_model=True,
+    ),
+    "halves_apart": ReasonKind(
+        "left and right halves of the rows move apart by {value:.3g} px along {other}, {limit:.2g} px are allowed: the "
+        "camera rolls or zooms (pass roll={remedy}, zoom={remedy} and no columns), or the scene has parallax (select a "
+        "part of the frame with one distance)",
+        compares="rms difference between the halves of the rows along the other axis, above 0.035 px and 0.9 % of the "
+        "rms offsets",
+        unit="px",
+    ),
+    "strips_apart": ReasonKind(
+        "strips of columns move apart by {value:.3g} px that roll and zoom do not explain, {limit:.2g} px are allowed: "
+        "the scene has parallax, or the lens is distorted",
+        "select a part of the frame with one distance",
+        "with roll or zoom: rms difference between strips of columns, above 0.035 px and 0.9 % of the rms offsets",
+        "px",
+    ),
+    "blur_contradicts_exposure": ReasonKind(
+        "the difference of the blur between frames is {value:.2g} times the value expected for an exposure of "
+        "{exposure_rows:g} rows, the limit is {limit:g}",
+        "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
+        "determine the motion",
+        "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
+        refuses="all axes",
+    ),
+    "bands_unexplained": ReasonKind(
+        "the fit does not explain the offset curve: mean residual {value:.3g} px, {limit:.3g} px are allowed for "
+        "offsets of {size:.3g} px",
+        _TONES_OR_FREE,
+        "method='bands': mean residual of the best three quarters of the bands, above 0.05 px and 30 % of the offsets",
+        "px",
+        free_model=True,
+    ),
+    "motion_within_row_time": ReasonKind(
+        "the image moves {value:.2g} px within a row time, condition (24) allows {limit:g} px: the camera does not "
+        "move as a whole, or row_time is wrong",
+        "check row_time",
+        "method='bands': motion within a row time, above 0.1 px, condition (24) of the paper",
+        "px",
+    ),
+    "other_frame_rows": ReasonKind(
+        "the frames agree with frame_rows={limit:.5g}, not with {value:g}: frame_rows counts the blanking rows and is "
+        "not the image height",
+        "if the frame rate is known, row_time is 1 / (frame rate x frame_rows), with {frame_rate:.5g} frames/s "
+        "{row_time:.5g} s",
+        "the stated frame_rows (value), and the one with which detection is reliable (limit)",
+        "row times",
+        "all axes",
+    ),
+    "other_row_time": ReasonKind(
+        "the frames agree with row_time={limit:.5g} s, not with {value:g} s, if the start times of frames are right",
+        compares="the stated row time (value), and the one with which detection is reliable (limit)",
+        unit="s",
+        refuses="all axes",
+    ),
+    "other_readout_direction": ReasonKind(
+        "the frames agree with readout_direction='{agreeing}', not with '{stated}'", refuses="all axes"
+    ),
+    "other_scan_axis": ReasonKind(
+        "the frames agree with scan_axis='{agreeing}', not with '{stated}'", refuses="all axes"
+    ),
+}
+_FOLLOWED = {
+    "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),
+    "directions_differ": ReasonKind(
+        "forwards and backwards in time, the displacement of the rows differs by {value:.2g} px, {limit:.2g} px are "
+        "allowed",
+        "use more frames, or frames at shorter intervals",
+        "rms difference of the displacements that both trackers find, above 0.01 px, 3 % and 4 standard deviations",
+        "px",
+    ),
+    "tones_contradicted": ReasonKind(
+        "in {value:.0%} of the frames the rows contradict the tones, {limit:.0%} are allowed: tones are missing",
+        "use more frames, or frames at shorter intervals",
+        "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ or "
+        "not_followed, above 5 %",
+    ),
+    "other_tone": ReasonKind(
+        "a tone of {frequency:.4g} Hz explains the frames as well",
+        "use more frames, or frames at other intervals",
+    ),
+}
+_SHAPES = {
+    "motion_unexplained": ReasonKind(
+        "rows move by {value:.3g} px that no {model} explains, {limit:.2g} px are allowed",
+        compares="rms residual of the rows, above 15 % of their motion and 0.03 px",
+        unit="px",
+    ),
+    "bands_contradict": ReasonKind(
+        "the offsets of row bands differ by {value:.3g} px from it, {limit:.3g} px are allowed: noise hides the scene",
+        compares="mean difference of the best three quarters of the row bands, above 0.1 px and 30 % of the offsets",
+        unit="px",
+    ),
+    "motion_uncertain": ReasonKind(
+        "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
+        compares="rms standard deviation of the visible part of the motion, above 0.3 px",
+        unit="px",
+    ),
+    "too_few_frames_for_sweep": ReasonKind(
+        "{value:g} frames do not determine decay and sweep of a tone, {limit:g} are needed: several swept tones fit",
+        "use more frames, or a steady tone (detect_vibration)",
+        "number of frames, below 3",
+    ),
+    "tone_of_chance": ReasonKind(
+        "the best of so many tones explains as much of noise with a probability of {value:.2g}, {limit:g} is allowed",
+        _MORE_FRAMES,
+        "probability that noise in the offsets of row bands is explained as well, above 0.01",
+    ),
+    "other_swept_tone": ReasonKind(
+        "another tone fits the rows as well: {frequency:.4g} Hz with a decay of {decay:.3g} /s in the middle of the "
+        "record",
+        _MORE_FRAMES,
+    ),
+}
+_of_result = partial(ReasonKind, refuses="the result")
+_RECORDED = {
+    "recorded_motion_too_small": _of_result(
+        "the recorded motion moves rows by {value:.2g} px between frames, too little: {limit:g} px are needed",
+        compares="rms motion of the rows between frames by the recording, below 0.05 px",
+        unit="px",
+    ),
+    "recording_incomplete": _of_result(
+        "rows move by {value:.3g} px that the recording does not explain, {limit:.2g} px are allowed",
+        compares="motion of the rows beside the recorded one, above 25 % of the recorded motion and 0.05 px",
+        unit="px",
+    ),
+    "recording_explains_nothing": _of_result("the recording does not explain the frames"),
+    "motion_repeats": _of_result("an offset of {offset:.6g} s explains the frames as well: the motion repeats"),
+    "offset_outside": _of_result(
+        "the frames begin at {value:.6g} s of the recording, and offsets ends at {limit:.6g} s",
+        compares="offset of the best fit, beyond a limit of those given by more than 4 standard deviations",
+        unit="s",
+    ),
+    "axes_mirrored": _of_result(
+        "the mirrored axes {axes} fit better than every rotation: the frames are mirrored, or the recording has "
+        "left-handed axes"
+    ),
+    "axes_ambiguous": _of_result("the axes {axes} explain the frames as well", "rotate the camera about all axes"),
+    "focal_length_uncertain": _of_result(
+        "the focal length is not determined, {focal_length:.4g} ± {value:.2g} px, at most ± {limit:.2g} px is allowed",
+        "give camera=",
+        "standard deviation of the focal length, above 5 % of it",
+        "px",
+    ),
+    "fit_not_converged": _of_result("the fit does not converge"),
+    "gap_in_recording": _of_result(
+        "the recording has a gap of {value:.3g} s within the frames, {limit:.3g} s are allowed",
+        compares="longest interval between samples within the frames, above 4 times the median",
+        unit="s",
+    ),
+    "readout_too_long": _of_result(
+        "the readout of {rows:g} rows takes {value:.4g} s, longer than the interval of {limit:.4g} s between frames",
+        compares="duration of the readout, above the shortest interval between frames",
+        unit="s",
+    ),
+    "motion_enlarges_offsets": ReasonKind(
+        "rows are further apart without the motion: {value:.3g} px instead of {moved:.3g} px, at most {limit:.3g} px",
+        compares="offsets of the rows without the motion, above those with it by 0.05 px",
+        unit="px",
+        refuses="the motion, if it does not reduce the offsets of both axes together",
+    ),
+    "motion_leaves_offsets": ReasonKind(
+        "the motion leaves {value:.3g} px of the {moved:.3g} px that rows move, {limit:.3g} px are allowed",
+        compares="offsets of the rows without the motion, above half of those with it and 0.05 px",
+        unit="px",
+        refuses="the motion, if it does not reduce the offsets of both axes together",
+    ),
+    "offsets_not_reduced": ReasonKind(
+        "the motion does not reduce the offsets of rows between frames: {value:.3g} px remain of {limit:.3g} px",
+        compares="offsets of both axes together without the motion, not below those with it",
+        unit="px",
+        refuses="the motion",
+    ),
+}
+_ROW_TIME = {
+    "row_time_uncertain": _of_result(
+        "the standard deviation is {value:.2g} of the row time, and {limit:g} is allowed: the motion is too small, or "
+        "nearly the same in all frames",
+        compares="standard deviation of the row time over the row time, above 0.01; with a gyroscope above 0.2",
+    ),
+    "row_times_ambiguous": _of_result(
+        "{value:g} row times explain the frames instead of {limit:g}: {row_time:.4f} us as well as {others} us "
+        "(negative: reverse readout)",
+        "pass row_time=(low, high) with limits around the right one, or use frames with vibrations of other, unrelated "
+        "frequencies",
+        "number of row times that explain the frames, above 1",
+    ),
+    "too_few_frames_for_row_time": _of_result(
+        "{value:g} frames determine the product of row time and frequency only, {limit:g} are needed",
+        _MORE_FRAMES,
+        "number of frames, below 3",
+    ),
+    "no_motion_for_row_time": _of_result(
+        "no vibration, and no motion that is smooth over the blanking time, determines the row time",
+        "shake the camera while it records, and use more frames",
+    ),
+}
+_RESTORATION = {
+    "axis_not_reliable": ReasonKind("[stack {stack:g}: ]{axis} is not {action}: its vibration is not reliable ({why})"),
+    "axis_not_accurate": ReasonKind(
+        "[stack {stack:g}: ]{axis} is not {action}: its displacement of {size:.2g} {unit} has a standard deviation of "
+        "{value:.2g} {unit}, {limit:.2g} {unit} are allowed",
+        "detect it from more frames",
+        "standard deviation of the displacement of the rows, above its rms over the square root of 2",
+        "px; roll: rad; zoom: 1",
+    ),
+    "motion_remains": ReasonKind(
+        "frames lie {before:.2g} px apart, {value:.2g} px remain unexplained, {limit:.2g} px are allowed",
+        compares="displacement between the prediction from a restored frame and the next raw frame, above 0.35 "
+        "(partly) or 0.8 (worse) of that of the raw frames",
+        unit="px",
+        refuses="the pair: partly or worse",
+    ),
+    "no_contrast": ReasonKind("the frames have no contrast", refuses="the pair: unknown"),
+    "displaced_alike": ReasonKind(
+        "frames lie {value:.2g} px apart, less than {limit:.2g} px: all are displaced alike",
+        compares="displacement between the raw frames, at most 0.03 px or what can be distinguished from zero",
+        unit="px",
+        refuses="the pair: unknown",
+    ),
+    "nothing_undone": ReasonKind("no vibration was undone", refuses="the pair: unknown"),
+    "noise_outweighs": ReasonKind(
+        "noise and artefacts outweigh the restored sharpness (estimated improvement {value:.1f} dB, below {limit:g})",
+        compares="estimated improvement, below -2 dB",
+        unit="dB",
+        refuses="the pair: worse",
+    ),
+    "improvement_uncertain": ReasonKind(
+        "the estimated improvement of {value:.1f} dB is negative, and above {limit:g} dB within its error",
+        compares="estimated improvement, between -2 dB (its error) and 0",
+        unit="dB",
+        refuses="the pair: unknown",
+    ),
+    "pixels_missing": ReasonKind(
+        "{value:.0%} of the pixels are missing, {limit:.0%} are allowed",
+        compares="fraction of the pixels that are missing, above 0.5",
+        refuses="the pair: unknown",
+    ),
+}
+
+# The codes by what they refuse; a code belongs to one group.
+GROUPS = {
+    "Tones (`detect_vibration`)": _TONES,
+    "A vibration that is followed (`follow=True`)": _FOLLOWED,
+    "Other motions (`detect_motion`, `detect_swept_tone`)": _SHAPES,
+    "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
+    "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,
+    "Restoration (`restore`, `judge_restoration`)": _RESTORATION,
+    "Files of later versions": {"unspecified": ReasonKind("{text}")},
+}
+REASONS = {code: kind for kinds in GROUPS.values() for code, kind in kinds.items()}
+
+# How the command line calls what texts name as in Python.
+_NAMES = {
+    "follow=True": "--follow",
+    "model='free'": "rsvib motion",
+    "check frame_rows, row_time": "check --frame-rate, --row-time",
+    "check exposure_rows": "check --exposure",
+    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
+    "check row_time": "check --row-time",
+    "increase search": "increase search in [detection]",
+    "pass row_time=(low, high)": "give --row-time twice",
+    "scan_axis=": "--scan-axis ",
+    "readout_direction=": "--readout-direction ",
+    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
+}
+_NAME = re.compile("|".join(re.escape(name).replace(r"\ ", r"\s+") for name in _NAMES))
+
+
+def on_command_line(text: str) -> str:
+    """A text with the options of the command line instead of those of Python."""
+    return _NAME.sub(lambda match: _NAMES[" ".join(match[0].split())], text)

@@ -1,0 +1,113 @@
+"""Files of results: JSON, which ``Result.load`` reads again, and pictures of figures."""
+
+import io
+import math
+import os
+import types
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_origin
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.checks.arguments import check_fields, hints_of
+from rsvib_torch.checks.validation import members_of
+from rsvib_torch.files.atomic import whole_file, write_json
+from rsvib_torch.files.reading import Table
+from rsvib_torch.results.reason import read_findings
+from rsvib_torch.text import quoted
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def save_result(result: Any, path: Path) -> None:
+    """Write a ``Result`` as JSON, see ``Result.save``."""
+    write_json(path, {"format": result.file_format, "version": 1, **result.to_dict(), "units": dict(result.units)})
+
+
+def result_of(kind: type[Any], data: Table, path: Path) -> Any:
+    """A result of a class from the content of a file that ``save_result`` wrote, see ``Result.load``."""
+    if data.get("format") != kind.file_format or data.get("version") != 1:
+        raise ValueError(
+            f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "
+            f"{quoted(data.get('format'))} of version {quoted(data.get('version'))}"
+        )
+    try:
+        return decode(kind, data, "")
+    except (ValueError, RuntimeError, OverflowError) as error:  # of PyTorch and of conversions, for impossible values
+        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
+
+
+def decode(kind: object, value: object, path: str, missing: float = math.nan) -> Any:
+    """A value of an annotated type from what ``plain_values`` made of it; ``check_fields`` checks the other types.
+
+    ``path`` is its place in the file, for messages; ``missing`` is what None stands for in a tensor.
+    """
+    kind = next(iter(members_of(kind)))
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind is Tensor:
+        return _tensor(value, path, missing)
+    if is_dataclass(kind):
+        return _dataclass(kind, value, path)
+    if origin is dict and isinstance(value, dict):
+        return {key: decode(parts[1], entry, f"{path}.{key}", missing) for key, entry in value.items()}
+    if origin is tuple and is_dataclass(parts[0]) and isinstance(value, list):
+        return tuple(decode(parts[0], entry, f"{path}[{number}]") for number, entry in enumerate(value))
+    return value if kind is Any else _tuples(value)
+
+
+def _dataclass(kind: Any, value: object, path: str) -> Any:
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: expected a table, got {quoted(value)}")
+    hints, start, missing = hints_of(kind), f"{path}." if path else "", getattr(kind, "_MISSING", math.nan)
+    values: Table = {}
+    for field in fields(kind):
+        if field.name in value:
+            stated, hint = value[field.name], hints[field.name]
+            if field.name in ("findings", "left_alone"):
+                values[field.name] = read_findings(stated)
+            elif stated is not None or types.NoneType not in get_args(hint):
+                values[field.name] = decode(hint, stated, start + field.name, missing)
+            else:
+                values[field.name] = None
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise ValueError(f"{start}{field.name}: missing key")
+    try:
+        made = kind(**values)
+        check_fields(made)
+        return made
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}" if path else str(error)) from error
+
+
+def _tensor(value: object, path: str, missing: float) -> Tensor:
+    def filled(entry: object) -> object:
+        return [filled(part) for part in entry] if isinstance(entry, list) else missing if entry is None else entry
+
+    values = filled(value)
+    try:
+        tensor = torch.tensor(values, device="cpu")
+        if tensor.is_floating_point() or not tensor.numel():
+            tensor = torch.tensor(values, dtype=torch.float64, device="cpu")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected numbers in lists of equal lengths: {error}") from error
+    return tensor
+
+
+def _tuples(value: object) -> object:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def figure_png(figure: "Figure", dpi: int) -> bytes:
+    """A figure as PNG image."""
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=dpi, facecolor="white", format="png")
+    return picture.getvalue()
+
+
+def write_figure(figure: "Figure", path: str | os.PathLike[str], dpi: int = 150) -> None:
+    """Write a figure as an image file; its ending selects the format."""
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=dpi, facecolor="white")

@@ -1,0 +1,159 @@
+"""Row time from frames with a smooth motion of any shape.
+
+A motion that is smooth over the blanking time continues from the end of one frame to the begin of the next. A spline
+in time with as few knots as explain the displacements of the rows is fitted together with the row time: at a wrong row
+time, the continuation fails and more knots are needed.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from rsvib_torch.detection.shapes.free import normal_bands
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.numerics.splines import spline_taps
+from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.row_time.joint_fit import FramePlaces
+from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
+
+DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
+_GRID_FRAMES = 24  # frames whose minima over the grid of row times are refined with all frames
+GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wider for motions that are accepted
+
+
+@dataclass(frozen=True, eq=False)
+class SplineRowTime:
+    """Row time of a spline fit."""
+
+    row_time: float  # seconds, negative for a reverse readout
+    std: float  # its standard deviation
+    others: tuple[Candidate, ...]  # other row times at which a spline with as few knots explains the displacements
+    spacing: float  # seconds between knots
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """Weighted least squares of a spline at one row time."""
+
+    chi_square: float  # weighted square of the residuals
+    parameters: int  # number of coefficients of both axes
+    step: float  # Gauss-Newton step of the row time in s, with the coefficients fitted again
+    information: float  # inverse variance of the row time, for measurements of unit variance
+
+
+def row_time_of_splines(
+    places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
+) -> SplineRowTime | None:
+    """Row time from ``low`` to ``high`` s at which the fewest knots explain the displacements; None if no motion does.
+
+    ``places`` are rows from the top of the image; readout directions are 1.0 and -1.0.
+    """
+    problem = _Problem.of(places, num_rows, high)
+    coarse_problem = _Problem.of(places.of_first_frames(_GRID_FRAMES), num_rows, high)
+    count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
+    sizes = [low * (high / low) ** (i / count) for i in range(count + 1)]
+    grid = sorted(direction * size for direction in directions for size in sizes)
+    period, spacing = places.period, places.period
+    blank = period - num_rows * high
+    while spacing > max(0.7 * blank, 0.1 * period):
+        advance, costs = steps(len(grid), "row times"), []
+        for tried in grid:
+            costs.append(coarse_problem.evaluate(tried, spacing).chi_square)
+            advance()
+        minima = [i for i, cost in enumerate(costs) if cost <= min(costs[max(i - 1, 0) : i + 2])]
+        lowest = sorted(minima, key=costs.__getitem__)[:6]
+        found = sorted((problem.refined(grid[i], spacing, low, high) for i in lowest), key=lambda one: one.chi_square)
+        # knots twice as close explain noise only
+        closer = problem.refined(found[0].row_time, 0.5 * spacing, low, high)
+        coarse, fine = (problem.evaluate(found[0].row_time, step).parameters for step in (spacing, 0.5 * spacing))
+        noise = closer.chi_square / max(1.0, problem.known - fine)
+        added = fine - coarse
+        if found[0].chi_square - closer.chi_square < noise * (added + 3.0 * math.sqrt(2.0 * added)):
+            break
+        spacing /= 2**0.25
+    else:
+        return None
+    if spacing < 0.7 * (period - num_rows * abs(found[0].row_time)):
+        return None
+    # with knots that are a little closer, the errors of the spline are below the noise
+    finer = spacing / 2**0.25
+    best = problem.refined(found[0].row_time, finer, low, high)
+    std = best.std * math.sqrt(noise)
+    others = tuple(
+        one
+        for one in found[1:]
+        if one.chi_square < found[0].chi_square + noise * MAX_CHI_SQUARE
+        and abs(one.row_time - best.row_time) > 5 * (std + one.std * math.sqrt(noise))
+    )
+    return SplineRowTime(best.row_time, std, others, finer)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Displacements of both axes."""
+
+    records: tuple[RowRecord, RowRecord]  # of x and y
+    period: float  # frame period in s
+    known: float  # number of independent measurements
+
+    @classmethod
+    def of(cls, places: FramePlaces, num_rows: int, row_time: float) -> "_Problem":
+        x, y = (places.of_axis(axis, num_rows, row_time) for axis in range(2))
+        return cls((x, y), places.period, x.num_measurements + y.num_measurements)
+
+    def evaluate(self, row_time: float, spacing: float) -> _Evaluation:
+        """Splines of both axes at a row time, with knots about ``spacing`` apart."""
+        # 1. The coefficients that each row depends on.
+        record = self.records[0]
+        rows, seen = table(record.rows), table(record.visible)
+        times = table(record.frames) * self.period + rows * row_time
+        first, last = float(times.min()), float(times.max())
+        cells = max(1, math.ceil((last - first) / spacing))
+        grid = first, (last - first) / cells, cells + DEGREE
+        index, basis = spline_taps(times, *grid, degree=DEGREE)
+        _, slope = spline_taps(times, *grid, degree=DEGREE, derivative=1)
+        weights = np.stack([table(one.weights) for one in self.records])
+        bands = normal_bands(index, basis, seen, weights, cells + DEGREE)
+        cost, step, information = 0.0, 0.0, 0.0
+        for one, weight, band in zip(self.records, weights[..., None], bands, strict=True):
+            # 2. The spline.
+            band[0] += 1e-10 * band[0].mean() + 1e-300
+            factor = linalg.cholesky_banded(band, lower=True, check_finite=False)
+            solution, residual = _fitted(table(one.values), one, index, basis, factor)
+            # 3. The change of the displacements by the row time that no change of the coefficients cancels.
+            by_row_time = table(one.relative(tensor((slope * solution[index]).sum(-1) * rows)))
+            _, unexplained = _fitted(by_row_time, one, index, basis, factor)
+            independent = float(one.independent)
+            cost += float((weight * np.square(residual)).sum()) * independent
+            step += float((weight * unexplained * residual).sum()) * independent
+            information += float((weight * np.square(unexplained)).sum()) * independent
+        information = max(information, 1e-300)
+        return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
+
+    def refined(self, row_time: float, spacing: float, low: float, high: float) -> Candidate:
+        """Gauss-Newton on the row time from a start in s."""
+        size, sign = abs(row_time), math.copysign(1.0, row_time)
+        for _ in range(8):
+            found = self.evaluate(sign * size, spacing)
+            change = min(max(sign * found.step, -GRID_STEP * size), GRID_STEP * size)
+            size = min(max(size + change, low), high)
+            if abs(change) < 1e-2 * found.information**-0.5:
+                break
+        found = self.evaluate(sign * size, spacing)
+        return Candidate(sign * size, found.information**-0.5, found.chi_square)
+
+
+def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor: Array) -> tuple[Array, Array]:
+    """Coefficients of a spline that is fitted to displacements (N, G) of a record, and its residual (N, G).
+
+    Displacements depend on coefficients ``index`` (N, G, M) by the factors ``basis``; ``factor`` is the banded Cholesky
+    factor of the normal matrix.
+    """
+    weighted = table(record.weights)[:, None, None] * values[..., None]
+    right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
+    solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)
+    return solution, values - table(record.relative(tensor((basis * solution[index]).sum(-1))))

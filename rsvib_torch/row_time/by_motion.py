@@ -1,0 +1,249 @@
+"""``calibrate_row_time_by_motion``: row time and readout direction of a camera from the motion in its frames.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, ParamSpec, Protocol
+
+from pydantic import Field
+
+from rsvib_torch.checks.validation import Number, Positive
+from rsvib_torch.checks.validation import options as option_group
+from rsvib_torch.checks.values import check_number, check_single
+from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
+from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.frames.entry_points import entry_point
+from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.frames.orientation import reasons_from_row_order
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import OffsetOptions, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.row_time import RowTimeCalibration
+from rsvib_torch.row_time.by_free_motion import row_time_of_splines
+from rsvib_torch.row_time.by_recording import row_time_of_recording
+from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
+from rsvib_torch.row_time.joint_fit import FramePlaces, rows_of_frames
+
+P = ParamSpec("P")
+
+MAX_RELATIVE_STD = 0.01  # of the row time; frequencies and the distortion of frames have the same relative error
+_MIN_FRAMES = 3  # two frames determine the product of row time and frequency only
+SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
+
+
+@option_group
+class RowTimeOptions(OffsetOptions):
+    """Options of ``calibrate_row_time_by_motion``; bands are those of the start."""
+
+    frame_rate: Positive = Field(description="Frames per second.")
+    row_time: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="Shortest and longest possible row time in s. By default the rows of a frame are read within a "
+        "tenth to the whole of the frame period.",
+    )
+    exposure_time: Positive | None = Field(
+        default=None,
+        description="Exposure in s. None to measure it from the blur, if possible; it hardly affects the row time.",
+    )
+    scan_axis: Literal[-2, -1, "y", "x"] = Field(
+        default=-2, description="Axis along which rows follow each other, as in ``SensorTiming``."
+    )
+    readout_direction: Literal["forward", "reverse"] | None = Field(
+        default=None, description="None to determine it as well."
+    )
+    recorded: FreeMotion | None = Field(
+        default=None,
+        description="Motion that another instrument recorded, on its own clock, in image axes; its offset is then "
+        "fitted together with the row time, and two frames are enough.",
+    )
+    offsets: tuple[Number, Number] | None = Field(
+        default=None,
+        strict=False,
+        description="With ``recorded``: smallest and largest reading of its clock in s at the time when the middle row "
+        "of frame 0 is exposed; by default all for which the recording covers the frames.",
+    )
+    fit_gain: bool = Field(
+        default=False, description="With ``recorded``: whether to fit a factor of each axis (focal length)."
+    )
+
+
+class _CalibratesByMotion(Protocol[P]):
+    """Type of ``calibrate_row_time_by_motion``."""
+
+    def __call__(self, frames: FramesOrFiles, *args: P.args, **kwargs: P.kwargs) -> RowTimeCalibration:
+        """Call the function."""
+
+
+def _row_time_options(
+    options: Callable[P, RowTimeOptions],
+) -> Callable[[Callable[..., RowTimeCalibration]], _CalibratesByMotion[P]]:
+    return lambda function: entry_point(options, function)
+
+
+@_row_time_options(RowTimeOptions)
+@full_precision
+@without_gradients
+def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions) -> RowTimeCalibration:
+    """Row time and readout direction from the motion of the camera, without a lamp.
+
+    A tone of frequency f advances by ``f T_row`` cycles from row to row, and by ``f P`` cycles, of which the whole
+    number k is unknown, from frame to frame of known period P. One tone therefore has one row time for each k; two
+    tones of unrelated frequencies have one row time in common. Without tones, a smooth motion determines the row time,
+    because it continues from the end of a frame to the begin of the next. The row displacements are measured directly
+    on the images, and the row time is fitted together with all parameters of the motion.
+
+    The result is reliable only if a single row time within the given limits, and a single readout direction, explains
+    the frames. Other row times that explain them are listed in ``candidates``.
+
+    Args:
+        frames: Stack (T, H, W) or (T, C, H, W) of three or more consecutive frames, as in ``detect_vibration``.
+        options: Options; tones of more than ``0.5 / band_step`` cycles per row are not found.
+
+    Returns:
+        Row time with its standard deviation, readout direction, and the exposure where it is known. ``reliable`` is
+        False, with ``findings``, if the row time is not determined; it is None if nothing is known about it.
+
+    Raises:
+        ValueError: If frames cannot be registered, or an option is out of range.
+
+    Example:
+        >>> import torch
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=60e-6, exposure_rows=8, frame_rows=240)
+        >>> vibration = rsv.Vibration(amplitude=[3.1, 2.2], frequency=[131.0, 97.0], phase=[0.4, 2.0])
+        >>> frames = rsv.simulate_frames(city_and_fields(220, 190, seed=3), timing, vibration, num_frames=5)
+        >>> found = rsv.calibrate_row_time_by_motion(frames, frame_rate=timing.frame_rate, row_time=(30e-6, 70e-6))
+        >>> f"{1e6 * found.row_time:.2f} us, {found.readout_direction}"
+        '60.00 us, forward'
+        >>> two = rsv.calibrate_row_time_by_motion(frames[:2], frame_rate=timing.frame_rate)
+        >>> two.reliable, two.findings[0].code
+        (False, 'too_few_frames_for_row_time')
+    """
+    period, exposure, recorded = 1 / options.frame_rate, options.exposure_time, options.recorded
+    if exposure is not None and exposure > period:
+        raise ValueError(f"exposure_time={exposure:g} s exceeds the frame period of {period:.6g} s; give it in seconds")
+    if recorded is None and (options.offsets is not None or options.fit_gain):
+        raise ValueError("offsets and fit_gain belong to a recorded motion: pass recorded")
+    if recorded is not None:
+        check_single("recorded", recorded)
+    # frames are converted with any row time: only scan axis and readout direction matter
+    sensor = SensorTiming(1e-9, 1.0, 10.0 * 2**20, options.scan_axis)
+    stack = grey_frames(frames, sensor, options, timed=False)
+    if stack.batched:
+        raise ValueError(f"calibrate_row_time_by_motion takes one stack, got a batch of {len(stack.images)}")
+    num_frames, num_rows = stack.images.shape[1:3]
+    low, high = _limits(options.row_time, period, num_rows)
+    directions = {None: (1.0, -1.0), "forward": (1.0,), "reverse": (-1.0,)}[options.readout_direction]
+    clock = CameraClock(period, num_rows, low, high, directions, exposure)
+    notes = []
+    if options.row_time is None:
+        notes.append(
+            f"row times of {1e6 * low:.3f} to {1e6 * high:.3f} us were considered, a readout within a tenth to the "
+            "whole of the frame period; pass row_time=(low, high) for other ones"
+        )
+    if exposure is not None:
+        notes.append("the exposure time is the given one")
+    curve, bands = bands_of_frames(stack, clock, options)
+    if recorded is not None:
+        places = _measured_freely(stack, clock, options, curve)
+        turned = recorded.to_row_order(sensor).to(stack.images.device)
+        found = row_time_of_recording(
+            places, turned, clock, num_frames, offsets=options.offsets, fit_gain=options.fit_gain
+        )
+    elif num_frames < _MIN_FRAMES:
+        found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
+    else:
+        by_tones = row_time_of_tones(stack, clock, options, bands)
+        found = by_tones or _undetermined(Reason("no_motion_for_row_time"))
+        if found.findings:
+            places = _measured_freely(stack, clock, options, curve)
+            spline = row_time_of_splines(places, num_rows, low, high, directions)
+            if spline is not None and spline.std < MAX_RELATIVE_STD * abs(spline.row_time):
+                notes.append(
+                    f"the motion is no sum of few tones: a spline with knots {1e3 * spline.spacing:.3g} ms apart"
+                )
+                found = RowTimeFit(spline.row_time, spline.std, spline.others, None, None, ())
+    return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)
+
+
+def _limits(row_time: tuple[float, float] | None, period: float, num_rows: int) -> tuple[float, float]:
+    """Shortest and longest possible row time in s."""
+    longest = period / num_rows
+    if row_time is None:
+        return SHORTEST_READOUT * longest, longest
+    low, high = (check_number("row_time", value, above=0.0) for value in row_time)
+    if low >= high:
+        raise ValueError(f"row_time=({low:g}, {high:g}): the first must be smaller")
+    if low >= longest:
+        raise ValueError(
+            f"row_time=({low:g}, {high:g}) s: {num_rows} rows take longer than the frame period of {period:.6g} s; "
+            f"row times are in seconds, and at most {longest:.4g}"
+        )
+    return low, min(high, longest)
+
+
+def _measured_freely(
+    stack: GreyFrames, clock: CameraClock, options: RegistrationOptions, curve: OffsetCurve
+) -> FramePlaces:
+    """Displacements of rows, measured around a motion of any shape, which any assumed row time allows."""
+    # the blanking time, over which the spline continues, is half of the period
+    timing = clock.timing(0.5 * clock.period / clock.num_rows)
+    starts = timing.frame_starts(stack.images.shape[1], stack.images.device)
+    record = (0.0, float(starts[-1]) + clock.num_rows * timing.row_time + timing.exposure_time)
+    timed = replace(
+        curve,
+        times=starts[:-1, None] + curve.rows * timing.row_time,
+        later_times=starts[1:, None] + curve.rows * timing.row_time,
+    )
+    measured_rows, motion, _ = measure_freely(stack, timing, timed, record, options, 24, 4)
+    measured = measured_rows.measurements
+    measured = measured.reweighted(residual_of_motion(measured, motion[0]))
+    residual = residual_of_motion(measured, motion[0])
+    measured = replace(measured, independent=measured.independent_fraction(residual))
+    return rows_of_frames(measured, clock.period, timing.row_time, clock.num_rows)
+
+
+def _undetermined(reason: Reason) -> RowTimeFit:
+    return RowTimeFit(math.nan, math.nan, (), None, None, (reason,))
+
+
+def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:
+    """The calibration with its verdict."""
+    findings = list(found.findings)
+    known = math.isfinite(found.row_time)
+    if found.others:
+        listed = ", ".join(f"{1e6 * one.row_time:.4f}" for one in found.others[:8])
+        details: dict[str, float | str] = {"row_time": 1e6 * found.row_time, "others": listed}
+        findings.append(Reason("row_times_ambiguous", None, len(found.others) + 1, 1, details))
+    if known and found.std > MAX_RELATIVE_STD * abs(found.row_time):
+        findings.append(Reason("row_time_uncertain", None, found.std / abs(found.row_time), MAX_RELATIVE_STD))
+    exposure, exposure_std = (found.exposure_time, found.exposure_std) if known else (None, None)
+    if clock.exposure_time is not None:
+        exposure, exposure_std = clock.exposure_time, 0.0
+    elif exposure is None and known:
+        notes = [*notes, "exposure unknown: the blur hardly differs between the frames"]
+    directions: tuple[Literal["forward", "reverse"], ...] = ("forward", "reverse")
+    signs = {one.row_time > 0 for one in found.others} | {found.row_time > 0}
+    return RowTimeCalibration(
+        row_time=abs(found.row_time) if known else None,
+        row_time_std=found.std if known else None,
+        period_rows=None,
+        contrast=None,
+        flicker_frequency=None,
+        frame_rows=clock.period / abs(found.row_time) if known else None,
+        readout_direction=directions[found.row_time < 0] if known and len(signs) == 1 else None,
+        exposure_time=exposure,
+        exposure_time_std=exposure_std,
+        notes=tuple(notes),
+        candidates=tuple(sorted((found.row_time, *(one.row_time for one in found.others)))) if known else (),
+        reliable=not findings,
+        findings=tuple(findings),
+    )

@@ -1,0 +1,336 @@
+"""Row time, readout direction and exposure of a camera from frames of flickering light."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.checks.arrays import Array, Channels
+from rsvib_torch.checks.validation import Positive
+from rsvib_torch.checks.values import check_number
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.results.presentation import JudgedResult
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.row_time.flicker import MIN_PERIODS, BandFit, Profiles, find_bands, row_profiles
+from rsvib_torch.row_time.strobe import exposure_from_contrast, fit_strobe
+from rsvib_torch.text import measured_text, wrapped
+
+Gamma = Annotated[float, Field(gt=0, le=4)]
+ScanAxis = Literal[-2, -1, "y", "x"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RowTimeCalibration(
+    JudgedResult,
+    units={
+        "row_time": "s",
+        "row_time_std": "s",
+        "period_rows": "rows",
+        "flicker_frequency": "Hz",
+        "frame_rows": "row times",
+        "exposure_time": "s",
+        "exposure_time_std": "s",
+        "candidates": "s",
+    },
+):
+    """Result of a calibration; undetermined values are None, with the reason in ``notes``.
+
+    Attributes:
+        row_time: T_row in seconds; None if it is not determined.
+        row_time_std: Its standard deviation, without that of the flicker frequency or frame rate.
+        period_rows: Period of the bands in rows; None without flickering light.
+        contrast: Amplitude of the bands' fundamental over their mean, at most 2; None without flickering light.
+        flicker_frequency: In Hz, as given or found; None without flickering light.
+        frame_rows: Row times from one frame to the next, where the frame rate is known.
+        readout_direction: ``"forward"`` or ``"reverse"``, from bands that move between frames.
+        exposure_time: T_e in seconds.
+        exposure_time_std: Its standard deviation.
+        notes: Reasons for undetermined values, and warnings.
+        candidates: Row times in seconds that explain the motion of the frames, negative for a reverse readout; empty
+            for a calibration with flickering light.
+        reliable: Whether a single row time explains the frames.
+        findings: Each ``Reason`` why not; ``reasons`` has their texts.
+        light: (T, H) light of the rows of each frame over its mean, without the brightness of the scene; None without
+            flickering light.
+        fitted_light: (T, H) the bands that were fitted to it.
+    """
+
+    row_time: float | None
+    row_time_std: float | None
+    period_rows: float | None
+    contrast: float | None
+    flicker_frequency: float | None
+    frame_rows: float | None
+    readout_direction: Literal["forward", "reverse"] | None
+    exposure_time: float | None
+    exposure_time_std: float | None
+    notes: tuple[str, ...]
+    candidates: tuple[float, ...] = ()
+    reliable: bool = True
+    findings: tuple[Reason, ...] = ()
+    light: Tensor | None = None
+    fitted_light: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.row_time is not None:
+            check_number("row_time", self.row_time, above=0.0)
+
+    def summary(self) -> str:
+        """The measured values of the sensor, and what is not determined."""
+        lines = ["row time unknown"]
+        if self.row_time is not None and self.row_time_std is not None:
+            lines = [f"row time {measured_text(1e6 * self.row_time, 1e6 * self.row_time_std)} us"]
+        if self.flicker_frequency is not None:
+            lines += [
+                f"flicker {self.flicker_frequency:.6g} Hz",
+                f"bands of {self.period_rows:.3f} rows, contrast {self.contrast:.3g}",
+            ]
+        if self.exposure_time is not None:
+            std = None if self.exposure_time_std is None else 1e6 * self.exposure_time_std
+            rows = "" if self.row_time is None else f", {self.exposure_time / self.row_time:.2f} row times"
+            lines.append(f"exposure {measured_text(1e6 * self.exposure_time, std or None)} us{rows}")
+        if self.frame_rows is not None:
+            lines.append(f"frame period {self.frame_rows:.2f} row times")
+        if self.readout_direction is not None:
+            lines.append(f"readout direction {self.readout_direction}")
+        if not self.reliable:
+            lines += ["not reliable:", *(wrapped(f" - {reason}") for reason in self.reasons)]
+        return "\n".join([*lines, *map(wrapped, self.notes)])
+
+
+@checks_arguments
+def calibrate_row_time(
+    frames: FramesOrFiles,
+    flicker_frequency: Positive,
+    *,
+    frame_rate: Positive | None = None,
+    on_fraction: Annotated[float, Field(gt=0, le=0.999)] | None = None,
+    light_contrast: Annotated[float, Field(gt=0, le=2)] | None = None,
+    scan_axis: ScanAxis = -2,
+    gamma: Gamma = 1.0,
+    full_scale: float | None = None,
+    channels: Channels = None,
+) -> RowTimeCalibration:
+    """Row time from frames of a light that flickers at a known frequency: ``T_row = 1 / (f P)``, bands of P rows.
+
+    The brightness of the rows is fitted as that of the scene times a waveform that repeats every P rows, with the
+    number of harmonics that maximises the evidence. Shading along the rows is part of the fit; several frames of a
+    still scene whose bands lie at different rows eliminate its texture.
+
+    With a frame rate the bands' phase from frame to frame, ``f / frame_rate`` turns, determines the readout direction,
+    unless it is close to a whole or half number of turns. The exposure follows from the shape of the bands
+    of a light that is on for a known fraction of time, or from the contrast of the bands of a light whose own
+    contrast is known: ``sinc(f T_e)`` of it.
+
+    Args:
+        frames: (T, H, W) or (T, C, H, W); floats of full scale 1, integers, or files.
+        flicker_frequency: f in Hz. Mains light flickers at twice the frequency of the mains.
+        frame_rate: Frames per second, T >= 2 consecutive ones.
+        on_fraction: Fraction of time that an on-off light is on (0.5 for a square wave).
+        light_contrast: Amplitude over mean of the light's own fundamental, for a sinusoidal light.
+        scan_axis: Axis along which rows follow each other, as in ``SensorTiming``.
+        gamma: Pixels are raised to this power to make them proportional to light (about 2.2 for photographs). The
+            row time does not depend on it, the exposure does.
+        full_scale: Count that means 1.0, for integers other than 8 bit.
+        channels: As in ``detect_vibration``.
+
+    Returns:
+        Row time with its standard deviation, and the other values that the arguments determine.
+
+    Raises:
+        ValueError: If there is no flicker in the frames, it is too fast or too slow for the camera, or the frames are
+            black or saturated.
+
+    Example:
+        >>> rows = torch.arange(512)
+        >>> light = 0.4 + 0.2 * torch.cos(2 * torch.pi * rows / 64)
+        >>> found = calibrate_row_time(light[None, :, None].expand(1, 512, 16), 1000.0)
+        >>> round(1e6 * found.row_time, 3)
+        15.625
+    """
+    frequency = float(flicker_frequency)
+    if frame_rate is not None and frequency < MIN_PERIODS * frame_rate:
+        raise ValueError(
+            f"flicker_frequency={frequency:g} Hz is slower than a frame of {frame_rate:g} per second: fewer than "
+            f"{MIN_PERIODS:g} periods fit into one; use a faster flicker"
+        )
+    if on_fraction is not None and light_contrast is not None:
+        raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")
+    profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
+    bands, scene = find_bands(profiles)
+    height = profiles.rows.shape[1]
+    row_time = 1 / (frequency * bands.period)
+    notes: list[str] = []
+    if frame_rate is not None:
+        _check_readout(row_time, frequency, height, frame_rate)
+    if scene == "smooth" and len(profiles.rows) > 1:
+        notes.append("the bands lie at the same rows in all frames, or the scene moves: its texture is not eliminated")
+    direction, contrast, why = _direction(bands, frequency, frame_rate)
+    notes += [f"readout direction unknown: {why}"] if why else []
+    exposure, exposure_std, why = _exposure(profiles, bands, contrast, row_time, on_fraction, light_contrast)
+    notes += [f"exposure unknown: {why}"] if why else []
+    return RowTimeCalibration(
+        row_time=row_time,
+        row_time_std=row_time * bands.period_std / bands.period,
+        period_rows=bands.period,
+        contrast=contrast,
+        flicker_frequency=frequency,
+        frame_rows=None if frame_rate is None else 1 / (frame_rate * row_time),
+        readout_direction=direction,
+        exposure_time=exposure,
+        exposure_time_std=exposure_std,
+        notes=tuple(notes),
+        light=torch.from_numpy(bands.fitted + bands.residual),
+        fitted_light=torch.from_numpy(bands.fitted),
+    )
+
+
+@checks_arguments
+def calibrate_row_time_by_exposure(
+    frames: FramesOrFiles,
+    exposure_times: Sequence[Annotated[float, Field(gt=0, le=10)]],
+    *,
+    scan_axis: ScanAxis = -2,
+    gamma: Gamma = 1.0,
+    full_scale: float | None = None,
+    channels: Channels = None,
+) -> RowTimeCalibration:
+    """Row time from frames of a strobe of unknown frequency taken with different known exposures.
+
+    A row is lit if its exposure overlaps the pulse: the height of a bright band is the sum of pulse and exposure, and a
+    longer exposure increases it by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
+    the brightness of the rows of all frames, with pulse, period and row time in common. ``exposure_times`` are those of
+    the frames in seconds, not all the same; the other arguments are as in ``calibrate_row_time``, and ``gamma`` matters
+    here.
+
+    Returns:
+        Row time with its standard deviation, and the frequency of the strobe.
+    """
+    exposures = [float(exposure) for exposure in exposure_times]
+    profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
+    if len(exposures) != len(profiles.rows):
+        raise ValueError(f"{len(exposures)} exposure times do not fit {len(profiles.rows)} frames; one a frame")
+    if max(exposures) < 1.05 * min(exposures):
+        raise ValueError(
+            f"exposure_times {exposures} must differ by at least 5 %: the row time follows from the change of the bands"
+        )
+    # the waveform depends on the exposure, so each frame is fitted by itself
+    singles = [
+        find_bands(Profiles(r[None], p[None], 0.0))[0] for r, p in zip(profiles.rows, profiles.parts, strict=True)
+    ]
+    period = sum(s.period / s.period_std**2 for s in singles) / sum(1 / s.period_std**2 for s in singles)
+    phases = np.concatenate([s.phases for s in singles])
+    fit = fit_strobe(profiles.rows, period, phases, np.array(exposures))
+    row_time = max(exposures) / fit.exposure_rows
+    shortest = int(np.argmin(exposures))
+    return RowTimeCalibration(
+        row_time=row_time,
+        row_time_std=row_time * fit.exposure_std / fit.exposure_rows,
+        period_rows=fit.period,
+        contrast=float(np.abs(singles[shortest].coefficients[0, 0])),
+        flicker_frequency=1 / (fit.period * row_time),
+        frame_rows=None,
+        readout_direction=None,
+        exposure_time=exposures[shortest],
+        exposure_time_std=0.0,
+        notes=("readout direction unknown: it requires the flicker frequency and the frame rate",),
+        light=torch.from_numpy(np.concatenate([s.fitted + s.residual for s in singles])),
+        fitted_light=torch.from_numpy(np.concatenate([s.fitted for s in singles])),
+    )
+
+
+def _check_readout(row_time: float, frequency: float, height: int, frame_rate: float) -> None:
+    """Raise if the rows do not fit into a frame, or if another row time would cause the same bands."""
+    longest = 1 / (frame_rate * height)
+    if row_time > 1.001 * longest:
+        raise ValueError(
+            f"a row time of {1e6 * row_time:.3f} us does not fit: {height} rows would take longer than a frame at "
+            f"frame_rate={frame_rate:g} per second; check flicker_frequency={frequency:g} Hz"
+        )
+    others = [
+        turns / frequency + sign * row_time
+        for turns in (1, 2)  # the shortest ones
+        for sign in (-1, 1)
+    ]
+    possible = sorted(time for time in (row_time, *others) if time <= longest)
+    if len(possible) > 1:
+        listed = ", ".join(f"{1e6 * time:.3f}" for time in possible)
+        raise ValueError(
+            f"flicker_frequency={frequency:g} Hz is ambiguous: row times of {listed} us cause the same bands; "
+            f"use at most {0.5 / longest:.0f} Hz"
+        )
+
+
+def _direction(
+    bands: BandFit, frequency: float, frame_rate: float | None
+) -> tuple[Literal["forward", "reverse"] | None, float, str]:
+    """Readout direction from consecutive frames, contrast of the light, and why the direction is undetermined.
+
+    The phase of the light advances by ``f / frame_rate`` turns per frame, the pattern of the scene does not move: the
+    fundamental of frame p is ``d + a exp(-2 pi j p f / frame_rate)`` for forward readout, with the opposite sign of the
+    exponent for reverse readout.
+    """
+    first = bands.coefficients[:, 0]
+    contrast = float(np.abs(first).mean())
+    if len(first) < 2:
+        return None, contrast, "it requires two consecutive frames"
+    if frame_rate is None:
+        return None, contrast, "it requires the frame rate"
+    turns = frequency / frame_rate
+    # turns from the nearest whole or half number; the clocks of light and camera may differ by 1e-4
+    if abs((2 * turns + 0.5) % 1.0 - 0.5) / 2 < 0.03 + 1e-4 * turns * (len(first) - 1):
+        return None, contrast, f"the light makes {turns:.3f} turns a frame, too close to a whole or half number"
+    misfits, amplitudes = zip(*(_turning(first, sign * turns) for sign in (-1, 1)), strict=True)
+    good, bad = min(misfits), max(misfits)
+    if good > 0.1:
+        why = "the motion of the bands does not agree with flicker frequency and frame rate (29.97 is not 30)"
+        return None, contrast, f"{why}: {turns % 1:.3f} turns a frame"
+    if bad < 4.0 * good + 0.01:
+        return None, contrast, "texture of the scene hides the motion of the bands; use more frames, or a plain scene"
+    forward = misfits[0] < misfits[1]
+    return ("forward" if forward else "reverse"), amplitudes[0 if forward else 1], ""
+
+
+def _turning(values: Array, turns: float) -> tuple[float, float]:
+    """Misfit of ``d + a exp(2 pi j p turns)`` to values (T,) over their power with a penalty on d, and |a|."""
+    count = len(values)
+    columns = np.stack([np.ones(count), np.exp(2j * math.pi * turns * np.arange(count))], 1)
+    penalty = 0.3 if count == 2 else 0.03  # two frames alone cannot separate d from a
+    solution = np.linalg.solve(columns.conj().T @ columns + np.diag([penalty, 0.0]), columns.conj().T @ values)
+    cost = (np.abs(values - columns @ solution) ** 2).sum() + penalty * np.abs(solution[0]) ** 2
+    return float(cost / (np.abs(values) ** 2).sum()), float(np.abs(solution[1]))
+
+
+def _exposure(
+    profiles: Profiles,
+    bands: BandFit,
+    contrast: float,
+    row_time: float,
+    on_fraction: float | None,
+    light_contrast: float | None,
+) -> tuple[float | None, float | None, str]:
+    """Exposure in seconds with its standard deviation, or why it is undetermined."""
+    if on_fraction is None and light_contrast is None:
+        return None, None, "it requires on_fraction of an on-off light, or light_contrast of a sinusoidal one"
+    if profiles.clipped > 0.02:
+        return None, None, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
+    if light_contrast is not None:
+        noise = math.sqrt((np.abs(bands.coefficients[:, 0]) ** 2).sum() / max(bands.certainty, 1e-9))
+        exposure, further = (
+            exposure_from_contrast(value, light_contrast, bands.period * row_time)
+            for value in (contrast, max(contrast - noise / math.sqrt(2), 1e-6))
+        )
+        return exposure, abs(further - exposure), ""
+    even = profiles.rows / (bands.scene / bands.scene.mean(1, keepdims=True))
+    try:
+        fit = fit_strobe(even, bands.period, bands.phases, np.ones(len(even)), on_fraction)
+    except ValueError as error:
+        return None, None, str(error)
+    return fit.exposure_rows * row_time, fit.exposure_std * row_time, ""

@@ -1,0 +1,27 @@
+from .frame_outputs import FrameOutput, PipeOutput, PreviewOutput, VideoOutput
+from .live_page import PageOutput
+from .process_video import process_video
+from .session import LiveReport, run_live
+from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
+from .spectrogram import Spectrogram, save_spectrogram
+from .video_border import Margins, VideoBorder
+
+__all__ = [
+    "CameraSource",
+    "FileSource",
+    "FrameOutput",
+    "FrameSource",
+    "LiveReport",
+    "Margins",
+    "PageOutput",
+    "PipeOutput",
+    "PipeSource",
+    "PreviewOutput",
+    "Spectrogram",
+    "TimedFrame",
+    "VideoBorder",
+    "VideoOutput",
+    "process_video",
+    "run_live",
+    "save_spectrogram",
+]

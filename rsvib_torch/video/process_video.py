@@ -1,0 +1,280 @@
+"""Videos from file to file, followed from frame to frame: ``process_video``."""
+
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import asdict, replace
+from itertools import count, groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rsvib_torch.checks.validation import fields_of
+from rsvib_torch.execution.prefetch import in_threads
+from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.frames.entry_points import file_options
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.read_gyroscope import read_gyroscope
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
+from rsvib_torch.io.stack_info import StackInfo, split_range
+from rsvib_torch.io.stack_reading import PathLike, open_stack
+from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
+from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
+from rsvib_torch.results.presentation import plain_values
+from rsvib_torch.stacks.heap import share_one_heap
+from rsvib_torch.stacks.job import plan_job, single_frame_options
+from rsvib_torch.stacks.manifest import fingerprint, manifest_header, rms_shaking
+from rsvib_torch.stacks.run_folder import (
+    RunFolder,
+    StackReport,
+    disk_errors_named,
+    run_to_file,
+)
+from rsvib_torch.video import Margins
+from rsvib_torch.video.video_frames import FrameTrack, RestoredFrame, VideoFrames
+from rsvib_torch.video.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
+
+# A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible. Rows are
+# measured less well, because objects at other distances move beside them.
+_MORE_SHAKING, _VISIBLE_SHAKING = {"frame_to_frame": 1.1, "rows": 1.5}, 0.1  # -, px
+
+# What the manifest states of the alignment of a gyroscope.
+_OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
+
+Frame = NDArray[Any]
+Planes = list[Frame]
+_Restored = tuple[FrameTrack, Frame | str, RestoredFrame]  # a frame as stored, or why it cannot be read, and restored
+
+
+class _Output(NamedTuple):
+    """The video to write."""
+
+    path: Path
+    info: StackInfo
+    border: str  # as in ``process_video``
+    margins: Margins | None  # that are cut off
+
+
+@file_options(ProcessVideoOptions)
+def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessVideoOptions) -> StackReport:
+    """Restore a video of any length from file to file, and steady it.
+
+    The video is read twice. The first pass follows corners from frame to frame and fits, in overlapping windows of 96
+    frames, the path of the camera (x, y, roll, zoom) and the tones of its vibration, each corner at the time of its
+    row: hands, pans, parallax and moving objects do not disturb them. The second pass restores the frames: tones, and
+    with ``steady`` also the skew and wobble by the path, are undone, and the frames are moved to a smooth path. With
+    ``gyroscope``, corners of 48 pairs of frames align its rates as in ``align_motion``; the path is the rotation of the
+    camera at the time of every row, with the vibration that the gyroscope resolves, and no tones are fitted. Frames
+    of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
+    ``"dewarp"``. Decoding, restoration and encoding run in threads.
+
+    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
+    parts of 32 frames in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
+    the first frames of each part is compared with that of the input: a video that shakes more is not written.
+
+    Args:
+        source: A video, or another stack as in ``read_stack``.
+        sink: The video to write: .mp4, .mov, .m4v (H.264) or .mkv (FFV1, without loss). Times, sound and metadata
+            are those of the source.
+        timing: As in ``process_stack``.
+        options: Options. A part of the video is a window in the manifest; its detection is that of its middle, with the
+            time origin ``start_time``.
+
+    Returns:
+        Summary of the run.
+
+    Raises:
+        FileExistsError: If there is an interrupted run and ``resume`` is False.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        OSError: If a file cannot be read or written; the run can then be resumed.
+        ValueError: If a value is out of range, the source is not readable, margins leave nothing, an output would
+            replace the input, input, settings or versions differ from those of the run to resume, frames have no motion
+            in common, the alignment of the gyroscope is not reliable, or the result shakes more than the source.
+
+    Example:
+        >>> process_video("shaky.mp4", "steady.mp4", timing, steady=1.0, border="crop")  # doctest: +SKIP
+    """
+    source, sink = Path(source), Path(sink)
+    border = options.border
+    recording = None if options.gyroscope is None else Path(options.gyroscope)
+    if recording == Path("auto"):
+        recording = split_range(source)[0]
+    rates = None if recording is None else read_gyroscope(recording)
+    video, at_once = _planned(source, timing, options, rates)
+    job = video.frames.job
+    if sink.suffix.lower() not in CONTAINERS:
+        raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
+    content = job.content(job.info, timing)
+    if border != "crop":
+        check_info_target(sink, content, check_folder=False)
+    header = manifest_header(job, sink.name, None)
+    header["settings"] |= {
+        "window": None,  # for the commands that read manifests: parts are not windows of their own
+        "video": {
+            "border": border,
+            "steady": options.steady,
+            "crop_limit": options.crop_limit,
+            "gyroscope": None if recording is None else fingerprint(recording),
+        },
+    }
+
+    def compute(folder: RunFolder) -> dict[str, Any]:
+        nonlocal content
+        done = count(1)  # both passes through the video count as half of it each
+
+        def progress() -> None:
+            if options.progress is not None:
+                options.progress(next(done) // 2, len(video.starts))
+
+        if options.progress is not None:
+            options.progress(0, len(video.starts))
+        motion = video.motion(progress)
+        margins = video.margins(motion) if border == "crop" else None
+        if margins is not None:
+            kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
+            content = replace(content, shape=(*content.shape[:-2], *kept))
+        check_info_target(sink, content, check_folder=False)
+        output = _Output(sink, content, border, margins)
+        with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
+            for part, frames in parts:
+                _encode_part(video, motion, folder, part, frames, output, progress)
+        _check_shaking(folder)
+        gyroscope = None
+        if isinstance(motion.path, RotationAlignment):
+            gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
+        not_kept = metadata_not_kept(job.info, sink, content.shape)
+        return {"margins": margins and asdict(margins), "gyroscope": gyroscope, "not_kept": not_kept}
+
+    def write(folder: RunFolder) -> None:
+        with whole_file(sink) as part:
+            join_parts(part, content, (folder.open(name) for name in folder.files() if not name.endswith(".npy")))
+
+    return run_to_file(
+        sink,
+        options,
+        header,
+        inputs=[*stack_files(source), *([] if recording is None else [recording])],
+        windows=video.parts,
+        compute=compute,
+        write=write,
+    )
+
+
+def _check_shaking(folder: RunFolder) -> None:
+    """Raise a ``ValueError`` if the restored frames shake more than those of the input; nothing is kept."""
+    names = {"frame_to_frame": "from frame to frame", "rows": "between the rows"}
+    for key, (before, after) in rms_shaking(record["shaking"] for record in folder.records()).items():
+        if after > _MORE_SHAKING[key] * before + _VISIBLE_SHAKING:
+            folder.remove()
+            raise ValueError(
+                f"the restored video would shake more than the input: {after:.2g} px {names[key]}, {before:.2g} px "
+                "before. Check the timing (row_time, readout_direction, scan_axis), or whether the camera has "
+                "stabilised the frames already"
+            )
+
+
+def _planned(
+    source: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
+) -> tuple[VideoPasses, int]:
+    """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
+    given = single_frame_options(options.restoration)
+    resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
+    job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
+    with closing(open_stack(source)) as reader:
+        picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
+    frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
+    times = job.timing.frame_starts(job.info.shape[0]).tolist()
+    starts = [start - times[0] for start in times]
+    return VideoPasses(frames, starts, options.steady, options.crop_limit, rates), at_once
+
+
+def _restored_parts(
+    video: VideoPasses, motion: VideoMotion, folder: RunFolder, at_once: int, progress: Callable[[], None]
+) -> Generator[tuple[int, Iterator[_Restored]], None, None]:
+    """Number and restored frames of each part that is not in the folder."""
+
+    def missing() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
+        with closing(video.decoded()) as decoded:
+            for index, frame in enumerate(decoded):
+                if index // PART_FRAMES not in folder:
+                    yield video.track(motion, index), frame
+                else:
+                    progress()
+
+    def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
+        return track, frame, video.frames.restored(frame, track)
+
+    share_one_heap()
+    threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
+    with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
+        yield from groupby(frames, lambda one: one[0].index // PART_FRAMES)
+
+
+def _encode_part(
+    video: VideoPasses,
+    motion: VideoMotion,
+    folder: RunFolder,
+    part: int,
+    frames: Iterator[_Restored],
+    output: _Output,
+    progress: Callable[[], None],
+) -> None:
+    """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
+    layout, name = video.frames, f"{part:06d}{output.path.suffix.lower()}"
+    tracks: list[FrameTrack] = []
+    written: list[Frame] = []  # the first frames
+    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames without fault
+    before: Planes | None = None  # the frame before, without margins cut off
+    if part > 0:
+        with folder.open(f"{part - 1:06d}.npy") as file:
+            before = layout.planes(np.load(file, allow_pickle=False))
+    with ExitStack() as opened:
+        with disk_errors_named(folder):
+            encoded = part_of_video(folder.create(name), output.path, output.info, layout.picture)
+            write = opened.enter_context(encoded)
+        for track, frame, restored in frames:
+            if tracks:
+                progress()  # the frame before is complete
+            before = _without_gaps(restored, before, layout, output.border)
+            final = layout.frame(_cut(before, output.margins))
+            with disk_errors_named(folder):
+                write(final)
+            if len(tracks) < CHECKED_FRAMES:
+                written.append(final)
+            tracks.append(track)
+            if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
+                follows = bool(pair) and pair[-1][0].index == track.index - 1
+                pair = [*pair, (track, frame)] if follows else [(track, frame)]
+        with disk_errors_named(folder):
+            opened.close()  # the file is complete
+    assert before is not None
+    verdict = video.verdict(pair) if len(pair) == 2 else None
+    record = video.record(part, tracks, motion, verdict, written)
+    folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
+    progress()
+
+
+def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: VideoFrames, border: str) -> Planes:
+    """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
+    planes = restored.planes
+    if planes is None or (restored.fault is not None and before is not None):
+        return layout.black() if before is None else before
+    if border == "mirror" or restored.visible is None or before is None:
+        return planes
+    pairs = zip(restored.visible, planes, before, strict=True)
+    return [np.where(visible, plane, old) for visible, plane, old in pairs]
+
+
+def _cut(planes: Planes, margins: Margins | None) -> Planes:
+    """Planes without margins; those of chroma are half as wide."""
+    if margins is None:
+        return planes
+    first, *others = planes
+    luma = margins.cut(first)
+    rows, columns = luma.shape[-2] // 2, luma.shape[-1] // 2  # even, as the margins are, see ``VideoFrames.margins``
+    top, left = margins.top // 2, margins.left // 2
+    return [luma, *(plane[..., top : top + rows, left : left + columns] for plane in others)]

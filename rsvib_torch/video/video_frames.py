@@ -1,0 +1,199 @@
+"""Restoration of one frame of a video: its planes, the pixels that the sensor did not record, and margins.
+
+Invariant: the displacement depends on the row only (docs/architecture.md); with roll and zoom also linearly on the
+column.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rsvib_torch.frames.prepare import prepare_frames
+from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
+from rsvib_torch.io.video import Picture
+from rsvib_torch.motion.sampling import source_map
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.options import RestorationOptions
+from rsvib_torch.restoration.restore import METHODS, restore_prepared
+from rsvib_torch.stacks.job import StackJob
+from rsvib_torch.video import Margins
+
+Frame = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTrack:
+    """What is removed from a frame of a video."""
+
+    index: int  # number of the frame
+    time: float  # s, exposure start of its first row, from the first frame
+    motion: Vibration | FreeMotion  # the motion to remove, in image axes; its time origin is the middle of the frame
+    fault: str | None = None  # why the frame could not be used; None if it was used
+
+
+@dataclass(frozen=True, eq=False)
+class RestoredFrame:
+    """A restored frame."""
+
+    planes: list[Frame] | None  # those of the frame as taken if it could not be used, if there are any
+    visible: list[NDArray[np.bool_]] | None  # of each plane, the pixels (H, W) that the sensor recorded; None: all
+    fault: str | None = None  # why the frame could not be used
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrames:
+    """How the frames of a video are stored, and how they are restored one by one.
+
+    ``"dewarp"`` interpolates once, in the frame as stored. Of other methods, the vibration is undone first, and then
+    the frame is moved; chroma of half the resolution is only dewarped, because its blur is half as wide.
+    """
+
+    job: StackJob  # source and settings
+    options: RestorationOptions
+    picture: Picture | None  # if frames are the planes Y, U and V of a 4:2:0 video (``VideoReader.planes``)
+    masks: bool  # whether ``RestoredFrame.visible`` is needed
+
+    @property
+    def planar(self) -> bool:
+        """Whether a frame is the planes of a video instead of pixels."""
+        return self.picture is not None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the frames in px."""
+        return self.job.info.shape[-2], self.job.info.shape[-1]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Data type of the counts."""
+        return np.dtype(self.job.info.dtype)
+
+    @property
+    def full_scale(self) -> float | None:
+        """Count that corresponds to 1.0; None for floats."""
+        return self.job.full_scale if self.picture is None else 255.0
+
+    @property
+    def white(self) -> float | None:
+        """Count from which pixels are saturated; None for none."""
+        if not isinstance(self.options.saturation, float):
+            return None
+        black, full = (0.0, self.job.full_scale or 1.0) if self.picture is None else self.picture.levels
+        return black + self.options.saturation * (full - black)
+
+    def luma(self, frame: Frame) -> Frame:
+        """The part of a frame in which motion is measured."""
+        return frame[: self.size[0]] if self.planar else frame
+
+    def grey(self, frame: Frame) -> NDArray[np.uint8]:
+        """The frame as 8-bit counts (H, W), in which corners are followed."""
+        luma: NDArray[Any] = self.luma(frame)
+        luma = luma if luma.ndim == 2 else luma.mean(0)
+        if luma.dtype == np.uint8:
+            return luma.astype(np.uint8, copy=False)
+        low, high = np.nanpercentile(luma[::4, ::4], (0.1, 99.9))  # the full scale may be far beyond the content
+        counts: NDArray[np.float64] = (np.nan_to_num(luma, nan=low) - low) * (255.0 / max(high - low, 1e-30))
+        return counts.round().clip(0, 255).astype(np.uint8)
+
+    def planes(self, frame: Frame) -> list[Frame]:
+        """Planes (..., H, W): all pixels, or Y (H, W) and the chroma (2, H / 2, W / 2)."""
+        if not self.planar:
+            return [frame]
+        height, width = self.size
+        return [frame[:height], frame[height:].reshape(2, height // 2, width // 2)]
+
+    def frame(self, planes: list[Frame]) -> Frame:
+        """The frame with these planes."""
+        return np.concatenate([planes[0], planes[1].reshape(-1, planes[0].shape[1])]) if self.planar else planes[0]
+
+    def black(self) -> list[Frame]:
+        """Planes of a frame without content."""
+        if not self.planar:
+            return [np.zeros(self.job.info.shape[1:], self.dtype)]
+        height, width = self.size
+        return [np.full((height, width), 16, self.dtype), np.full((2, height // 2, width // 2), 128, self.dtype)]
+
+    def margins(self, margins: Margins) -> Margins:
+        """The margins, widened to whole pixels of every plane."""
+        if not self.planar:
+            return margins
+        return Margins(*(side + side % 2 for side in (margins.top, margins.bottom, margins.left, margins.right)))
+
+    def restored(self, frame: Frame | str, track: FrameTrack) -> RestoredFrame:
+        """Restore a frame as stored, or the reason why it cannot be read."""
+        if isinstance(frame, str):
+            return RestoredFrame(None, None, frame)
+        planes = self.planes(frame)
+        if track.fault is not None or not bool(track.motion.moving_axes().any()):
+            return RestoredFrame(planes, None, track.fault)
+        results: list[Frame] = []
+        visible: list[NDArray[np.bool_]] = []
+        for number, plane in enumerate(planes):
+            motion, timing = (track.motion if number == 0 else _on_half_pixels(track.motion)), self.timing_of(number)
+            separately = number == 0 and self.options.method != "dewarp"
+            if separately and isinstance(motion, Vibration) and bool((motion.amplitude > 0).any()):
+                # The method undoes what varies between the rows along x and y, and the rest is moved afterwards.
+                rowwise = motion.translation()
+                plane = self._without_vibration(plane, timing, replace(rowwise, image_shift=torch.zeros(2)))  # noqa: PLW2901
+                rest = {name: getattr(motion, name).clone() for name in ("image_motion", "image_acceleration")}
+                for values in rest.values():
+                    values[:2] = 0.0
+                motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
+            source = source_map(motion, timing, plane.shape[-2:])
+            results.append(moved_back(plane, source))
+            limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
+            visible.append(np.all((source >= 0) & (source <= limits), axis=0))
+        return RestoredFrame(results, visible if self.masks else None)
+
+    def timing_of(self, plane: int) -> SensorTiming:
+        """Timing of one frame, with the time origin in its middle; rows of chroma lie between two of luma."""
+        timing = self.job.timing
+        rows = self.size[0 if timing.scan_axis == -2 else 1]
+        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        if plane == 0:
+            return replace(timing, frame_start_times=(-half,))
+        return replace(
+            timing,
+            row_time=2.0 * timing.row_time,
+            exposure_rows=0.5 * timing.exposure_rows,
+            frame_rows=0.5 * timing.frame_rows,
+            frame_start_times=(0.5 * timing.row_time - half,),
+        )
+
+    def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
+        scale = self.full_scale
+        level = self.white if "clipped" in METHODS[self.options.method].masks else None
+        images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.device)
+        saturation = None if level is None else level / (scale or 1.0)
+        prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
+        with torch.no_grad():
+            restored = restore_prepared(prepared, motion, self.options)
+        return frames_to_counts(prepared.from_row_order(restored)[0], self.dtype, scale)
+
+
+def moved_back(plane: Frame, source: NDArray[np.float32]) -> Frame:
+    """Pixels (..., H, W) interpolated at places (2, H, W); beyond the border, the plane is mirrored."""
+    stored = plane if plane.dtype in (np.uint8, np.uint16, np.float32) else plane.astype(np.float32)
+    x, y = np.ascontiguousarray(source[0]), np.ascontiguousarray(source[1])
+    flat = stored.reshape(-1, *stored.shape[-2:])
+    moved = np.stack([cv2.remap(one, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT) for one in flat])
+    if stored.dtype != plane.dtype and plane.dtype.kind in "iu":
+        limits = np.iinfo(plane.dtype)
+        moved = np.clip(np.rint(moved), limits.min, limits.max)
+    return moved.reshape(plane.shape).astype(plane.dtype)
+
+
+def _on_half_pixels(motion: Vibration | FreeMotion) -> Vibration | FreeMotion:
+    """The motion in pixels of chroma, which are twice as large; roll and zoom are the same."""
+    factors = torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64)
+    if isinstance(motion, Vibration):
+        return motion.scaled(factors)
+    camera = motion.camera and replace(motion.camera, focal_length=0.5 * motion.camera.focal_length)
+    return FreeMotion(motion.coefficients * factors[:, None], motion.start, motion.spacing, camera=camera)

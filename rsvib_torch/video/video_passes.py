@@ -1,0 +1,301 @@
+"""Passes through a video: the motion of all frames, where they are moved to, verdict and record of the parts."""
+
+import math
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rsvib_torch.execution.prefetch import prefetched
+from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
+from rsvib_torch.io.full_scale import counts_to_frames
+from rsvib_torch.io.video import VideoReader
+from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.sampling import recorded_offsets
+from rsvib_torch.motion.spline import FreeMotion
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, tensor
+from rsvib_torch.registration.corners import CornerFollower, Corners
+from rsvib_torch.restoration import RestorationVerdict
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.stacks.job import stored_frame
+from rsvib_torch.stacks.window_restoration import pair_verdict
+from rsvib_torch.stacks.windows import window_record
+from rsvib_torch.video import Margins
+from rsvib_torch.video.camera_path import CameraPath, Tone, camera_path, shake
+from rsvib_torch.video.recorded_rotation import RecordedRotation
+from rsvib_torch.video.steadying import steady_shifts
+from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
+
+PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
+_COMPARED_PAIRS = 48  # of frames, over the whole video, by which a gyroscope is aligned
+CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
+_AHEAD = 4  # frames decoded before they are used
+_GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
+_SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
+_SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
+
+Frame = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class VideoMotion:
+    """The motion of all frames of a video."""
+
+    path: CameraPath | RotationAlignment  # of the camera, from corners or by a gyroscope
+    times: Array  # (N,) s, middle of every frame
+    removed: Callable[[int], Vibration | FreeMotion]  # from a frame, the middle of which is the time origin
+    faults: dict[int, str]  # number of each frame that could not be used, with the reason
+    shakes: dict[int, tuple[Array, float]]  # ``shake`` between the frame of this number and the next one
+
+
+@dataclass(frozen=True, eq=False)
+class VideoPasses:
+    """What the passes through a video have in common: how frames are read, moved, judged and recorded."""
+
+    frames: VideoFrames  # source, settings, and how frames are restored
+    starts: list[float]  # s, exposure start of every frame, from the first one
+    steady: float  # as in ``process_video``
+    crop_limit: float  # as in ``process_video``
+    rates: AngularRates | None  # of a gyroscope, whose rotation is the path
+
+    @property
+    def parts(self) -> int:
+        """Number of parts."""
+        return -(-len(self.starts) // PART_FRAMES)
+
+    def decoded(self) -> Generator[Frame | str, None, None]:
+        """Every frame, or why it cannot be read; decoded ahead in a thread."""
+        return prefetched(self._decoded(), _AHEAD)
+
+    def _decoded(self) -> Generator[Frame | str, None, None]:
+        with closing(self.frames.job.open()) as reader:
+            read = reader.planes if self.frames.planar and isinstance(reader, VideoReader) else reader.frame
+            for index in range(len(self.starts)):
+                yield stored_frame(read, index)
+
+    # First pass: the motion
+
+    def motion(self, progress: Callable[[], None]) -> VideoMotion:
+        """The motion of all frames, from corners that are followed from each usable frame to the next one."""
+        faults: dict[int, str] = {}
+        shakes: dict[int, tuple[Array, float]] = {}
+        chosen = np.linspace(0, len(self.starts) - 2, _COMPARED_PAIRS).astype(int) if self.rates is not None else ()
+        compared: dict[int, Corners] = {}  # with a gyroscope, corners between the chosen frames and the next ones
+
+        def pairs() -> Iterator[Corners | None]:
+            before: tuple[int, NDArray[np.uint8]] | None = None
+            follower = CornerFollower(self.frames.job.timing)
+            with closing(self.decoded()) as frames:
+                for index, frame in enumerate(frames):
+                    progress()
+                    if isinstance(frame, str):
+                        faults[index] = frame
+                        continue
+                    grey = self.frames.grey(frame)
+                    if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
+                        faults[index] = f"frame {index} is constant, or a copy of the frame before"
+                        continue
+                    corners = follower.next(grey, self.starts[index])
+                    if before is not None:
+                        if corners is not None and before[0] == index - 1:
+                            shakes[index - 1] = shake(corners)
+                        if before[0] == index - 1 in chosen:
+                            starts = self.starts[index - 1 : index + 1]
+                            compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
+                        yield corners
+                    before = index, grey
+
+        timing = self.frames.job.timing
+        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
+        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        times = np.array(self.starts) + half
+        if self.rates is None:
+            path = camera_path(pairs(), timing, self.frames.size)
+            places = path.places(times)
+            shift = self._to_steady(times, lambda number, others: places[others] - places[number])
+            polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
+
+            def by_corners(index: int) -> Vibration:
+                return self._removed(path.tones(float(times[index])), polynomials[index])
+
+            return VideoMotion(path, times, by_corners, faults, shakes)
+        for _ in pairs():  # for ``compared``, and for the shaking
+            pass
+        found = self._alignment(self.rates, compared)
+        rotation = RecordedRotation.aligned(self.rates, found, times)
+        turned = self._to_steady(times, rotation.apart)
+        return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
+
+    def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
+        return steady_shifts(times, apart, self.steady, self.frames.size, self.crop_limit)
+
+    def _alignment(self, rates: AngularRates, pairs: dict[int, Corners]) -> RotationAlignment:
+        """The alignment of the gyroscope by the corners between some frames, by number, and the next ones."""
+        source = f"the gyroscope ({rates.source})"
+        if not pairs:
+            raise ValueError(f"{source} cannot be compared with the video: it has no two different frames in sequence")
+        timing, size = self.frames.job.timing, self.frames.size
+        starts = np.array([self.starts[index : index + 2] for index in pairs])
+        tracks = tracks_of_pairs(list(pairs.values()), starts, timing, size)
+        found = align_rates(tracks, tensor(starts), size if timing.scan_axis == -2 else size[::-1], timing, rates)
+        if not found.reliable:
+            raise ValueError(f"{source} does not fit the video: {'; '.join(found.reasons)}")
+        return found
+
+    def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
+        """The tones, skew and wobble by the path, and what the path is not smooth by."""
+        if self.steady == 0:  # axes without vibration stay as taken
+            polynomial = polynomial * np.array([any(tone.axis == axis for tone in tones) for axis in range(4)])
+        height, width = self.frames.size
+        seconds = 0.5 * self.frames.job.timing.row_time * max(height, width)
+        reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
+        axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
+        amplitude, frequency, phase = tone_tables(tones, axes)
+        return Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
+
+    def track(self, motion: VideoMotion, index: int) -> FrameTrack:
+        """What is removed from a frame."""
+        return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index))
+
+    def margins(self, motion: VideoMotion) -> Margins:
+        """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
+        widest = np.zeros(4)
+        for index in range(len(self.starts)):
+            if index not in motion.faults:
+                track, timing = self.track(motion, index), self.frames.timing_of(0)
+                (x, y), _ = recorded_offsets(track.motion, timing, self.frames.size)
+                x, y = (x, y) if timing.scan_axis == -2 else (x.T, y.T)
+                sides = [-y[0].min(), y[-1].max(), -x[:, 0].min(), x[:, -1].max()]
+                widest = np.maximum(widest, sides)
+        return self.frames.margins(Margins(*(math.ceil(side + 0.5) if side > 0.01 else 0 for side in widest)))
+
+    # Verdict and record of a part
+
+    def shaking(self, motion: VideoMotion, first: int, frames: list[Frame]) -> dict[str, list[float]] | None:
+        """``WindowRecord.shaking`` from frames of the output, the first of which has a number; None if unknown."""
+        measured: list[tuple[tuple[Array, float], tuple[Array, float]]] = []  # of neighbouring frames, before and after
+        follower = CornerFollower(self.frames.job.timing)
+        for number, frame in enumerate(frames, first):
+            corners, raw = follower.next(self.frames.grey(frame), self.starts[number]), motion.shakes.get(number - 1)
+            if number > first:
+                if raw is None or corners is None:
+                    break
+                measured.append((raw, shake(corners)))
+        if len(measured) < 2:
+            return None
+        changes = np.diff([[moved for moved, _ in pair] for pair in measured], axis=0)  # (pairs - 1, 2, 2) px
+        rows = np.array([[rows for _, rows in pair] for pair in measured])  # (pairs, 2) px
+        return {
+            "frame_to_frame": np.sqrt(np.square(changes).sum(-1).mean(0)).tolist(),
+            "rows": np.sqrt(np.square(rows).mean(0)).tolist(),
+        }
+
+    def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
+        """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
+        (first, one), (_, other) = frames
+        if not isinstance(first.motion, Vibration):
+            return None
+        pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
+        images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)
+        motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
+        interval = frames[1][0].time - first.time
+        return pair_verdict(images, self.frames.job.timing, motion, interval, self.frames.options)
+
+    def record(
+        self,
+        part: int,
+        tracks: list[FrameTrack],
+        motion: VideoMotion,
+        verdict: RestorationVerdict | None,
+        first_frames: list[Frame],
+    ) -> dict[str, Any]:
+        """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
+        path = motion.path
+        detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
+        left = [
+            Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
+            for name, why in zip(AXIS_NAMES, detection.reasons if detection else (), strict=False)
+            if why
+        ]
+        return window_record(
+            verdict,
+            {track.index: track.fault for track in tracks if track.fault is not None},
+            restored=any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None),
+            window=part,
+            first=tracks[0].index,
+            last=tracks[-1].index,
+            start_time=tracks[0].time,
+            written=len(tracks),
+            detection=detection,
+            left_alone=left,
+            error=None,
+            shaking=self.shaking(motion, tracks[0].index, first_frames),
+        )
+
+    def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
+        """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
+        window = path.nearest(float(times[tracks[len(tracks) // 2].index]))
+        tones = [tone.at(tracks[0].time - window.origin) for tone in window.tones]
+        amplitude, frequency, phase = tone_tables(tones, 2)
+        size, rate = (np.full_like(amplitude, math.inf) for _ in range(2))
+        for axis in (0, 1):
+            of_axis = sorted((tone for tone in tones if tone.axis == axis), key=lambda tone: -abs(tone.coefficient))
+            size[axis, : len(of_axis)] = [
+                math.hypot(tone.amplitude_std, _GAIN_ERROR * abs(tone.coefficient)) for tone in of_axis
+            ]
+            rate[axis, : len(of_axis)] = [tone.frequency_std for tone in of_axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            phase_std = np.where(amplitude > 0, size / amplitude, math.inf)
+            period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
+        unknown = np.full(2, math.inf)
+        values = (size, rate, period_std, phase_std, unknown, unknown)
+        begin = times[[tracks[0].index]]
+        velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
+        vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
+        findings = tuple(self._findings(axis, tones) for axis in (0, 1))
+        return DetectedVibration(
+            vibration=vibration,
+            std=VibrationStd(*(torch.from_numpy(np.array(value)) for value in values)),
+            gain=vibration.gain(self.frames.job.timing.frame_period),
+            residual=torch.full((2,), window.residual, dtype=torch.float64),
+            reliable=torch.tensor([not reasons for reasons in findings]),
+            findings=findings,
+            assumptions=(),
+        )
+
+    def _findings(self, axis: int, tones: list[Tone]) -> tuple[Reason, ...]:
+        """Reasons against an axis: no tone, or two that only a wrong row time tells apart.
+
+        Between frames, tones of f and f + n / T are the same. With a row time that is wrong by 5 to 40 %, a tone of
+        93 Hz was explained by two, of 93 and 63 or 123 Hz.
+        """
+        frequencies = [tone.frequency for tone in tones if tone.axis == axis]
+        if not frequencies:
+            return (Reason("no_tone", AXIS_NAMES[axis]),)
+        for first, second in combinations(frequencies, 2):
+            cycles = abs(first - second) * self.frames.job.timing.frame_period
+            if round(cycles) > 0 and abs(cycles - round(cycles)) < _SAME_ALIAS:
+                return (Reason("tones_alias", AXIS_NAMES[axis], first, second),)
+        return ()
+
+
+def tone_tables(tones: list[Tone], axes: int) -> tuple[Array, Array, Array]:
+    """Amplitude (px), frequency (Hz) and phase (rad) of ``Vibration``, (axes, K), of tones, the largest first."""
+    of_axes = [[tone for tone in tones if tone.axis == axis] for axis in range(axes)]
+    amplitude, frequency, phase = np.zeros((3, axes, max(1, *map(len, of_axes))))
+    for axis, of_axis in enumerate(of_axes):
+        for number, tone in enumerate(sorted(of_axis, key=lambda tone: -abs(tone.coefficient))):
+            amplitude[axis, number], frequency[axis, number] = abs(tone.coefficient), tone.frequency
+            phase[axis, number] = (
+                np.angle(tone.coefficient) + 0.5 * math.pi
+            )  # Re c exp(i a) = |c| sin(a + arg c + pi/2)
+    return amplitude, frequency, phase

@@ -1,0 +1,78 @@
+"""Layers of the package: the only list. The import test, the drawing and the table of docs/architecture.md use it."""
+
+# From the highest layer to the lowest. A part imports from lower layers only; the parts of one layer do not import each
+# other. The text says what a part contains.
+LAYERS: tuple[dict[str, str], ...] = (
+    {"commands": "the rsvib program: options, progress, output on the terminal"},
+    {"video": "process_video.py: videos in two passes; camera_path.py, steadying.py; session.py: a running camera"},
+    {
+        "report": "results on disk: JSON, CSV, figures (plots.py), HTML page (html/)",
+        "export": "motions for other programs: angular rates, sampling maps, image support data",
+    },
+    {"config": "TOML files ↔ groups of options"},
+    {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, its journal, resume"},
+    {
+        "evaluation": "image quality, slanted edge (mtf/), Cramér–Rao bound",
+        "tracking": "tracker.py: vibration frame by frame; following.py: through a stack, forwards and backwards",
+        "row_time": "row time of a camera from flickering light or motion",
+        "augmentation": "training data for Kornia pipelines",
+        "datasets": "drawn scenes and example frames",
+    },
+    {"gyroscope": "recorded motions: files, alignment of clock and axes with frames, comparison (accelerometer.py)"},
+    {
+        "detection": "detect.py: frames → motion, standard deviations, verdict",
+        "restoration": "restore.py: frames and motion → frames, verdict; one file per method",
+    },
+    {"registration": "offsets of bands (register.py, methods.py) and of rows (gradients.py) between frames"},
+    {"imaging": "image formation: trajectory, point spread function, blur, optics, noise, simulator"},
+    {"frames": "prepare.py: files and arrays, dtypes, full scale, masks, orientation; entry_points.py: flat options"},
+    {"io": "stack_reading.py, stack_writing.py, formats.py (table of formats), one module per format"},
+    {"motion": "SensorTiming, Camera, readout times of camera models, Motion, Vibration, FreeMotion, recorded motion"},
+    {
+        "results": "summary, dictionary, files, figures and reasons of all results",
+        "options": "type, bounds, default and description of every option",
+    },
+    {"checks": "checks of what users give: values, arrays, arguments, groups of options (validation.py)"},
+    {
+        "numerics": "splines, Fourier transforms, banded systems, tables of fits",
+        "files": "durable writes, bounded reads, paths of outputs, free memory",
+    },
+    {"execution": "chunks, threads, progress, precision", "text": "numbers, tables and JSON as text"},
+)
+# Parts of packages, from the lowest layer to the highest; packages that are not listed have one layer.
+INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
+    "detection": (
+        {"spectrum"},
+        {"measurements", "result"},
+        {"strips"},
+        {"tones"},
+        {"start"},
+        {"rows", "sensitivity", "verdict"},
+        {"assemble", "convergence"},
+        {"refinement"},
+        {"pipeline"},
+        {"diagnosis"},
+        {"attempts"},
+        {"shapes"},
+        {"detect"},
+    ),
+    "evaluation": ({"quality", "mtf", "bound"},),
+    "report": ({"results", "plots"}, {"html"}),
+    "restoration": (
+        {"frame_motion", "restoration_warning"},
+        {"scene_model"},
+        {"noise"},
+        {"exact", "banded", "dewarp", "verdict"},
+        {"richardson_lucy"},
+        {"restore"},
+        {"noise_gain", "restoration_mtf"},
+    ),
+}
+
+
+def table_of_packages() -> list[str]:
+    """Rows of the table of docs/architecture.md."""
+    parts = {name: content for layer in LAYERS for name, content in layer.items()}
+    files = {"config", "options", "text"}
+    rows = [f"| `{name}{'.py' if name in files else '/'}` | {content} |" for name, content in parts.items()]
+    return ["| package | contains |", "|---|---|", *rows]

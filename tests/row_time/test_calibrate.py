@@ -1,0 +1,251 @@
+"""Row time, readout direction and exposure from flickering light, in frames computed from the definition with NumPy."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+from program import refused, rsvib
+from refusals import refuses
+from truth import draw_scene
+
+from rsvib_torch.config import read_config
+from rsvib_torch.io import write_stack
+from rsvib_torch.row_time import calibrate_row_time, calibrate_row_time_by_exposure
+
+ROW_TIME = 14.578e-6
+HEIGHT, WIDTH = 480, 160
+
+
+def sine(time, frequency=1000.0, contrast=0.6):
+    return 1 + contrast * np.sin(2 * np.pi * frequency * time + 0.7)
+
+
+def blink(time, frequency=1000.0, fraction=0.5):
+    return 2.0 * ((time * frequency) % 1.0 < fraction)
+
+
+def record_frames(
+    light,
+    *,
+    frames=1,
+    frame_rate=29.97,
+    exposure=65e-6,
+    row_time=ROW_TIME,
+    scene=0.3,
+    noise=0.002,
+    reverse=False,
+    seed=0,
+    start=0.0123,
+):
+    """Frames (T, H, W) of light over time, summed over the exposure of each row in small steps."""
+    height = HEIGHT if np.ndim(scene) == 0 else len(scene)
+    rows = np.arange(height)[::-1] if reverse else np.arange(height)
+    shots = exposure if np.ndim(exposure) else [exposure] * frames
+    steps = (np.arange(100) + 0.5) / 100
+    begin = start + np.arange(len(shots))[:, None] / frame_rate + rows * row_time
+    lit = np.stack([light(b[:, None] + e * steps).mean(-1) * e / shots[0] for b, e in zip(begin, shots, strict=True)])
+    picture = scene * np.ones((height, WIDTH)) if np.ndim(scene) == 0 else scene
+    taken = lit[:, :, None] * picture
+    noisy = taken + noise * np.random.default_rng(seed).standard_normal(taken.shape)
+    return torch.from_numpy(np.clip(noisy, 0, 1)).float()
+
+
+def shaded(height=HEIGHT, width=WIDTH):
+    """A uniform wall with vignetting and a light spot."""
+    v, u = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    return 0.35 * (1 - 0.5 * (u**2 + v**2)) + 0.1 * np.exp(-((u - 0.4) ** 2 + (v + 0.3) ** 2) / 0.3)
+
+
+@pytest.mark.parametrize("light", [sine, blink])
+def test_row_time_of_one_frame_agrees_within_its_standard_deviation(light):
+    found = calibrate_row_time(record_frames(light, scene=shaded()), 1000.0)
+    assert found.row_time == pytest.approx(ROW_TIME, rel=5e-4)
+    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
+    assert found.row_time_std < 3e-3 * ROW_TIME
+    assert found.period_rows == pytest.approx(1 / (1000 * ROW_TIME), rel=5e-4)
+    assert found.readout_direction is None
+    assert found.frame_rows is None
+
+
+def test_standard_deviations_agree_with_scatter():
+    ratios = []
+    for seed in range(0, 12, 2):
+        row_time = 1e-6 * (9 + 0.9 * seed)
+        frames = record_frames(sine, row_time=row_time, noise=0.06, seed=seed)
+        found = calibrate_row_time(frames, 1000.0)
+        ratios.append((found.row_time - row_time) / found.row_time_std)
+    spread = math.sqrt(np.mean(np.square(ratios)))
+    assert 0.3 < spread < 1.6
+
+
+def test_texture_is_removed_by_several_frames():
+    """Flicker of 2 % in a textured scene: not detectable in one frame, accurate in four."""
+    scene = 0.6 * draw_scene(HEIGHT, WIDTH, 3)
+    frames = record_frames(lambda t: sine(t, 997.0, 0.02), frames=4, scene=scene)
+    found = calibrate_row_time(frames, 997.0)
+    assert found.row_time == pytest.approx(ROW_TIME, rel=2e-3)
+    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
+    with pytest.raises(ValueError, match="no flicker found"):
+        calibrate_row_time(frames[:1], 997.0)
+
+
+def test_periodic_texture_is_not_detected_as_flicker():
+    """A pattern with twice the period also fits the texture, but it does not move between frames."""
+    frequency, row_time = 583.7, 19.47e-6  # the phase changes by a third of a period per frame; the period is 88 rows
+    frames = record_frames(
+        lambda t: sine(t, frequency, 0.1),
+        frames=4,
+        scene=0.6 * draw_scene(HEIGHT, WIDTH, 22),
+        row_time=row_time,
+        noise=0.003,
+        frame_rate=frequency / 19.472,
+        seed=22,
+    )
+    found = calibrate_row_time(frames, frequency)
+    assert found.row_time == pytest.approx(row_time, rel=2e-3)
+
+
+@pytest.mark.parametrize(("light", "reverse"), [(sine, False), (blink, True)])
+def test_readout_direction(light, reverse):
+    frames = record_frames(light, frames=3, scene=shaded(), reverse=reverse)
+    found = calibrate_row_time(frames, 1000.0, frame_rate=29.97)
+    assert found.readout_direction == ("reverse" if reverse else "forward")
+    assert found.frame_rows == pytest.approx(1 / (29.97 * ROW_TIME), rel=5e-4)
+
+
+def test_ambiguous_readout_direction_is_none():
+    in_step = record_frames(sine, frames=3, frame_rate=25.0)
+    found = calibrate_row_time(in_step, 1000.0, frame_rate=25.0)
+    assert found.readout_direction is None
+    assert any("whole or half number" in note for note in found.notes)
+    assert any("same rows in all frames" in note for note in found.notes)
+    moving = record_frames(sine, frames=3)
+    wrong = calibrate_row_time(moving, 1000.0, frame_rate=29.9)
+    assert wrong.readout_direction is None
+    assert any("29.97 is not 30" in note for note in wrong.notes)
+
+
+def test_columns_as_scan_axis():
+    frames = record_frames(sine, scene=shaded()).transpose(-2, -1)
+    assert calibrate_row_time(frames, 1000.0, scan_axis="x").row_time == pytest.approx(ROW_TIME, rel=5e-4)
+    with pytest.raises(ValueError, match="scan_axis"):
+        calibrate_row_time(frames, 1000.0, scan_axis="z")
+
+
+@pytest.mark.parametrize("exposure", [65e-6, 420e-6, 730e-6])
+def test_exposure_from_the_shape_of_bands(exposure):
+    found = calibrate_row_time(record_frames(blink, scene=shaded(), exposure=exposure), 1000.0, on_fraction=0.5)
+    assert found.exposure_time == pytest.approx(exposure, rel=0.03)
+    assert abs(found.exposure_time - exposure) < max(5 * found.exposure_time_std, 0.01 * exposure)
+
+
+@pytest.mark.parametrize("exposure", [300e-6, 800e-6])
+def test_exposure_from_the_contrast_of_bands(exposure):
+    frames = record_frames(sine, frames=3, scene=shaded(), exposure=exposure)
+    found = calibrate_row_time(frames, 1000.0, frame_rate=29.97, light_contrast=0.6)
+    assert found.exposure_time == pytest.approx(exposure, rel=0.01)
+    assert found.contrast == pytest.approx(0.6 * abs(np.sinc(1000 * exposure)), rel=0.02)
+
+
+def test_exposure_with_gamma_of_photographs():
+    frames = record_frames(blink, scene=shaded(), exposure=200e-6) ** (1 / 2.2)
+    found = calibrate_row_time(frames, 1000.0, on_fraction=0.5, gamma=2.2)
+    without_gamma = calibrate_row_time(frames, 1000.0, on_fraction=0.5)
+    assert found.exposure_time == pytest.approx(200e-6, rel=0.03)
+    assert without_gamma.row_time == pytest.approx(ROW_TIME, rel=5e-4)
+    assert abs(without_gamma.exposure_time / 200e-6 - 1) > 0.1
+
+
+def test_row_time_from_two_exposures_of_an_unknown_strobe():
+    exposures = [1e-3, 0.25e-3]
+    frames = record_frames(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
+    found = calibrate_row_time_by_exposure(frames, exposures)
+    assert found.row_time == pytest.approx(ROW_TIME, rel=0.01)
+    assert abs(found.row_time - ROW_TIME) < 5 * found.row_time_std
+    assert found.flicker_frequency == pytest.approx(300.0, rel=0.01)
+    refuses(lambda: calibrate_row_time_by_exposure(frames, [1e-3, 1e-3]), "must differ")
+    refuses(lambda: calibrate_row_time_by_exposure(frames, [1e-3]), "do not fit 2 frames")
+
+
+@pytest.mark.parametrize(("seed", "count"), [(0, 1), (1, 2)])
+def test_frames_without_flicker_are_refused(seed, count):
+    frames = record_frames(np.ones_like, frames=count, scene=0.8 * draw_scene(HEIGHT, WIDTH, seed), noise=0.01)
+    with pytest.raises(ValueError, match="no flicker found"):
+        calibrate_row_time(frames, 100.0)
+
+
+def test_slanted_stripes_are_not_flicker():
+    rows, columns = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
+    stripes = 0.5 + 0.3 * np.sin(2 * np.pi * (rows + 0.5 * columns) / 40)
+    with pytest.raises(ValueError, match="no flicker found"):
+        calibrate_row_time(torch.from_numpy(stripes)[None], 1000.0)
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "message"),
+    [
+        (torch.ones(1, 64, 64), {}, "100% of the pixels are saturated"),
+        (torch.zeros(1, 64, 64), {}, "no light"),
+        (torch.full((2, 128, 64), 0.5), {}, "no flicker found"),
+        (torch.rand(1, 16, 64), {}, "16 rows along the scan"),
+        (torch.rand(1, 2, 1, 64, 64), {}, "takes one stack"),
+        (torch.rand(1, 64, 64), {"flicker_frequency": 0.0}, "flicker_frequency must be larger"),
+        (torch.rand(1, 64, 64), {"on_fraction": 1.5}, "on_fraction"),
+        (torch.rand(1, 64, 64), {"on_fraction": 0.5, "light_contrast": 0.5}, "not both"),
+        (torch.rand(1, 64, 64), {"gamma": 0.0}, "gamma"),
+        (torch.rand(1, 64, 64), {"flicker_frequency": 30.0, "frame_rate": 29.97}, "slower than a frame"),
+        (torch.full((1, 64, 64), 900, dtype=torch.int16), {}, "full_scale"),
+    ],
+)
+def test_bad_input(frames, options, message):
+    options = {"flicker_frequency": 1000.0, **options}
+    with pytest.raises(ValueError, match=message):
+        calibrate_row_time(frames, **options)
+
+
+def test_flicker_too_fast_or_too_slow_for_the_rows():
+    fast = record_frames(lambda t: sine(t, 9 / (10 * ROW_TIME)), frames=1, exposure=1e-6)
+    refuses(lambda: calibrate_row_time(fast, 9 / (10 * ROW_TIME), frame_rate=29.97), "is ambiguous: row times of")
+    finest = record_frames(lambda t: sine(t, 1 / (3 * ROW_TIME)), frames=1, exposure=1e-6)
+    refuses(lambda: calibrate_row_time(finest, 1 / (3 * ROW_TIME)), r"repeat every 3\.00 rows")
+    slow = record_frames(lambda t: sine(t, 100.0), frames=3, scene=shaded())  # 0.7 periods per frame
+    refuses(lambda: calibrate_row_time(slow, 100.0), r"slower than a frame|no flicker found")
+    refuses(lambda: calibrate_row_time(record_frames(sine, scene=shaded()), 100.0, frame_rate=29.97), "does not fit")
+
+
+def test_command(tmp_path, capsys):
+    write_stack(tmp_path / "led.tif", record_frames(blink, frames=3, scene=shaded(), reverse=True), dtype="uint8")
+    options = ("--frequency", 1000, "--frame-rate", 29.97, "--on-fraction", 0.5, "--out", tmp_path / "sensor.toml")
+    assert rsvib("calibrate", tmp_path / "led.tif", *options) == 0
+    printed = capsys.readouterr().out
+    assert float(re.search(r"row time ([\d.]+)", printed).group(1)) == pytest.approx(1e6 * ROW_TIME, rel=5e-4)
+    timing = read_config(tmp_path / "sensor.toml").timing
+    assert timing.row_time == pytest.approx(ROW_TIME, rel=5e-4)
+    assert timing.exposure_time == pytest.approx(65e-6, rel=0.05)
+    assert timing.readout_direction == "reverse"
+    assert timing.frame_rate == pytest.approx(29.97, rel=1e-6)
+
+
+def test_command_with_exposures_of_several_files(tmp_path, capsys):
+    exposures = [1e-3, 0.25e-3]
+    frames = record_frames(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
+    for name, frame in zip(("long.png", "short.png"), frames, strict=True):
+        write_stack(tmp_path / name, frame[None], dtype="uint8")
+    options = ("--exposure", 0.001, "--exposure", 0.00025, "--out", tmp_path / "sensor.toml")
+    assert rsvib("calibrate", tmp_path / "long.png", tmp_path / "short.png", *options) == 0
+    assert "row time" in capsys.readouterr().out
+    assert "# frame_rate = " in (tmp_path / "sensor.toml").read_text()
+
+
+def test_errors_on_the_command_line_are_one_line(tmp_path, capsys):
+    write_stack(tmp_path / "plain.png", torch.full((1, 64, 64), 0.5), dtype="uint8")
+    out = tmp_path / "sensor.toml"
+    for arguments, message in (
+        (("--frequency", 100, "--out", out), "no flicker found"),
+        ((), "give --frequency"),
+        (("--frequency", 20, "--frame-rate", 30), "slower than a frame"),
+    ):
+        assert message in refused(capsys, "calibrate", tmp_path / "plain.png", *arguments)
+    assert not out.exists()

@@ -1,0 +1,184 @@
+"""Row time from motion, in frames of an independent camera and in displacements computed from the definition."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from program import refused, rsvib
+from simulated_gpu import SIMULATED_GPU, simulated_gpu
+from truth import Motion, recorded
+
+import rsvib_torch as rsv
+from rsvib_torch.config import read_config
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.row_time.by_free_motion import row_time_of_splines
+from rsvib_torch.row_time.joint_fit import FramePlaces
+
+HEIGHT, WIDTH, FRAMES = 192, 144, 5
+ROW_TIME, FRAME_ROWS = 6e-5, 240
+TIMING = rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=8, frame_rows=FRAME_ROWS)
+RATE = 1 / (FRAME_ROWS * ROW_TIME)
+
+
+class Tones(Motion):
+    """3.1 px at 131 Hz along x and, unless it is off, 2.2 px at 97 Hz along y."""
+
+    def __init__(self, y=2.2):
+        self.y = y
+
+    def displacement(self, times):
+        turn = 2 * np.pi * times
+        return np.stack([3.1 * np.sin(131.0 * turn + 0.4), self.y * np.sin(97.0 * turn + 2.0)], axis=-1)
+
+
+@pytest.fixture(scope="module", name="two_tones")
+def make_two_tones():
+    return recorded((HEIGHT, WIDTH), TIMING, Tones(), FRAMES, 0.005, seed=5)
+
+
+@pytest.fixture(scope="module", name="one_tone")
+def make_one_tone():
+    return recorded((HEIGHT, WIDTH), TIMING, Tones(y=0.0), FRAMES, 0.005, seed=5)
+
+
+def test_row_time_of_two_tones(two_tones):
+    found = rsv.calibrate_row_time_by_motion(two_tones, frame_rate=RATE)
+    assert found.reliable
+    assert found.readout_direction == "forward"
+    assert found.row_time_std < 5e-4 * ROW_TIME
+    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
+    assert found.candidates == (found.row_time,)
+    assert abs(found.frame_rows - FRAME_ROWS) < 4 * FRAME_ROWS * found.row_time_std / ROW_TIME
+
+
+def test_frames_on_another_device(two_tones):
+    limits = {"frame_rate": RATE, "row_time": (5e-5, 7e-5)}
+    here = rsv.calibrate_row_time_by_motion(two_tones, **limits)
+    with simulated_gpu():
+        there = rsv.calibrate_row_time_by_motion(two_tones.to(SIMULATED_GPU), **limits)
+    assert there.reliable
+    assert abs(here.row_time - there.row_time) < 0.05 * here.row_time_std
+
+
+def test_reverse_readout_along_x(two_tones):
+    found = rsv.calibrate_row_time_by_motion(
+        two_tones.transpose(-2, -1).flip(-1), frame_rate=RATE, scan_axis="x", row_time=(2e-5, 7e-5)
+    )
+    assert found.reliable
+    assert found.readout_direction == "reverse"
+    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std < 2e-3 * ROW_TIME
+
+
+def test_one_tone_has_a_row_time_for_every_number_of_turns(one_tone):
+    """f P = k + phi: row times nu P / (k + phi), of which the camera has k = 1."""
+    found = rsv.calibrate_row_time_by_motion(one_tone, frame_rate=RATE, row_time=(2e-5, 7.2e-5))
+    assert not found.reliable
+    assert [reason.code for reason in found.findings] == ["row_times_ambiguous"]
+    assert found.findings[0].value == len(found.candidates)
+    turns = 131.0 / RATE
+    expected = sorted(
+        ROW_TIME * turns / (turns + k) for k in range(-20, 20) if 2e-5 <= abs(ROW_TIME * turns / (turns + k)) <= 7.2e-5
+    )
+    assert len(expected) > 4
+    np.testing.assert_allclose(found.candidates, expected, rtol=5e-3)
+
+
+def test_limits_select_one_of_them(one_tone):
+    found = rsv.calibrate_row_time_by_motion(
+        one_tone, frame_rate=RATE, row_time=(4.5e-5, 7e-5), readout_direction="forward", exposure_time=4.8e-4
+    )
+    assert found.reliable
+    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std < 4e-3 * ROW_TIME
+    assert found.exposure_time == 4.8e-4
+
+
+@pytest.mark.parametrize(
+    ("frames", "code"),
+    [
+        (lambda moving: moving[:2], "too_few_frames_for_row_time"),
+        (lambda moving: moving[:1] + 0.005 * torch.randn(4, HEIGHT, WIDTH), "no_motion_for_row_time"),
+    ],
+)
+def test_what_is_not_identifiable_is_refused(two_tones, tmp_path, frames, code):
+    torch.manual_seed(0)
+    found = rsv.calibrate_row_time_by_motion(frames(two_tones), frame_rate=RATE)
+    assert not found.reliable
+    assert found.row_time is None
+    assert [reason.code for reason in found.findings] == [code]
+    assert "not reliable" in found.summary()
+    found.save(tmp_path / "row_time.json")
+    loaded = rsv.RowTimeCalibration.load(tmp_path / "row_time.json")
+    assert loaded.row_time is None
+    assert loaded.findings == found.findings
+
+
+def test_row_time_of_a_hand_held_camera_with_its_gyroscope(two_tones):
+    clock = torch.arange(-0.05, 0.15, 5e-4, dtype=torch.float64)
+    recorded = rsv.FreeMotion.from_samples(clock + 7.003, torch.from_numpy(Tones().displacement(clock.numpy())))
+    offsets = (7.003 + 0.5 * HEIGHT * ROW_TIME - 2e-3, 7.003 + 0.5 * HEIGHT * ROW_TIME + 2e-3)
+    found = rsv.calibrate_row_time_by_motion(
+        two_tones[:3], frame_rate=RATE, recorded=recorded, offsets=offsets, row_time=(3e-5, 7.2e-5)
+    )
+    assert found.reliable, found.reasons
+    assert found.readout_direction == "forward"
+    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std < 4e-3 * ROW_TIME
+
+
+def smooth_motion(times, highest, seed):
+    generator = np.random.default_rng(seed)
+    frequency = np.linspace(0.5, highest, 60)
+    power = np.exp(-0.5 * (4 * frequency / highest) ** 2)
+    size = 3.0 * np.sqrt(2 * power / power.sum())
+    phase = generator.uniform(-np.pi, np.pi, (2, len(frequency)))
+    return (size * np.cos(2 * np.pi * frequency * times[..., None, None] + phase)).sum(-1)
+
+
+@pytest.mark.parametrize(("highest", "known"), [(30.0, True), (400.0, False)])
+def test_smooth_motion_continues_over_the_blanking_time(highest, known):
+    """Rows of 8 frames at 30 per second, 256 rows of 100 us; within the blanking time, 400 Hz repeat three times."""
+    period, row_time, noise = 1 / 30, 100e-6, 0.004
+    generator = np.random.default_rng(3)
+    rows = np.repeat(np.arange(4.0, 256.0, 8.0)[:, None], 8, axis=1)
+    frames = np.broadcast_to(np.arange(8.0), rows.shape)
+    values = smooth_motion(frames * period + rows * row_time, highest, 1)
+    values = values + noise * generator.standard_normal(values.shape)
+    values, rows, frames = (part[None] for part in (values, rows, frames))
+    information = np.broadcast_to(np.eye(2) / noise**2, (1, rows.shape[1], 2, 2))
+    measured = Measurements(rows * 0.0, values - values.mean(2, keepdims=True), np.ones_like(rows), information, 1e-4)
+    found = row_time_of_splines(FramePlaces(measured, rows, frames, period), 256, 60e-6, period / 256, (1.0, -1.0))
+    assert (found is not None) == known
+    if found is not None:
+        assert not found.others
+        assert abs(found.row_time - row_time) < 4 * found.std < 0.02 * row_time
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"row_time": (6e-5, 5e-5)}, "the first must be smaller"),
+        ({"row_time": (20.0, 60.0)}, "in seconds"),
+        ({"row_time": 6e-5}, "row_time"),
+        ({"exposure_time": 0.5}, "exceeds the frame period"),
+        ({"fit_gain": True}, "pass recorded"),
+    ],
+)
+def test_bad_options(two_tones, options, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        rsv.calibrate_row_time_by_motion(two_tones, **{"frame_rate": RATE, **options})
+
+
+def test_command(two_tones, one_tone, tmp_path, capsys):
+    moving, ambiguous, out = tmp_path / "moving.tif", tmp_path / "one_tone.tif", tmp_path / "sensor.toml"
+    rsv.write_stack(moving, two_tones, dtype="float32")
+    rsv.write_stack(ambiguous, one_tone, dtype="float32")
+    options = ("--by-motion", "--frame-rate", RATE, "--exposure", "480us")
+    assert rsvib("calibrate", moving, *options, "--out", out) == 0
+    sensor = read_config(out)
+    assert abs(sensor.timing.row_time / ROW_TIME - 1) < 2e-3
+    assert sensor.timing.exposure_time == pytest.approx(4.8e-4)
+    error = refused(capsys, "calibrate", ambiguous, *options, "--out", tmp_path / "none.toml")
+    assert re.search(r"error: the row time is not certain: \d+ row times explain", error)
+    assert not (tmp_path / "none.toml").exists()
+    assert "--frame-rate" in refused(capsys, "calibrate", moving, "--by-motion")
+    assert "--by-motion" in refused(capsys, "calibrate", moving, "--frequency", 100, "--row-time", "1us")

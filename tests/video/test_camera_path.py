@@ -1,0 +1,119 @@
+"""The path of a camera and its vibration from corners, on frames of a camera that is held by hand, with parallax."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates, spline_filter
+from truth import draw_scene
+
+from rsvib_torch import SensorTiming
+from rsvib_torch.registration.corners import CornerFollower
+from rsvib_torch.video.camera_path import camera_path, shake
+from rsvib_torch.video.steadying import largest_displacement, steady_shifts
+
+HEIGHT, WIDTH, COUNT, RATE, SAMPLES = 216, 288, 48, 30.0, 3
+TIMING = SensorTiming(row_time=90e-6, exposure_rows=20, frame_rows=1 / RATE / 90e-6)
+TONES = {0: (1.2, 93.0, 0.3), 1: (0.8, 71.0, 1.0)}  # axis: px, Hz, rad
+
+
+def hand(t):
+    """Components (4, ...) of a hand: x, y (px), roll (rad), zoom."""
+    x = 9.0 * np.sin(2 * np.pi * 1.1 * t) + 1.5 * np.sin(2 * np.pi * 7.0 * t + 1.0) + 15.0 * t
+    y = 6.0 * np.sin(2 * np.pi * 0.8 * t + 2.0) + 1.2 * np.sin(2 * np.pi * 9.0 * t)
+    roll = 0.01 * np.sin(2 * np.pi * 1.7 * t) + 0.002 * np.sin(2 * np.pi * 6.0 * t)
+    return np.stack([x, y, roll, 0.01 * np.sin(2 * np.pi * 0.5 * t)])
+
+
+def vibration(t, tones, decay):
+    """(2, ...) px; the tones decay with a time in s."""
+    parts = np.zeros((2, *t.shape))
+    for axis, (size, frequency, phase) in tones.items():
+        parts[axis] = size * np.exp(-t / decay) * np.sin(2 * np.pi * frequency * t + phase)
+    return parts
+
+
+def recorded(tones, subject=True, decay=np.inf):
+    """(T, H, W) counts: a scene whose left part is nearer, with a subject that walks through, as a hand records it."""
+    scene = spline_filter(draw_scene(HEIGHT + 160, WIDTH + 160, 3), order=3)
+    patch = draw_scene(200, 170, 9)
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    from_x, from_y = x - (WIDTH - 1) / 2, y - (HEIGHT - 1) / 2
+    frames = []
+    for number in range(COUNT):
+        total = np.zeros((HEIGHT, WIDTH))
+        for sample in range(SAMPLES):
+            t = number / RATE + y * TIMING.row_time + (sample + 0.5) / SAMPLES * TIMING.exposure_time
+            (dx, dy, roll, zoom), moved = hand(t), vibration(t, tones, decay)
+            near = np.where(x < 0.3 * WIDTH, 3.0 * np.sin(2 * np.pi * 0.7 * t), 0.0)
+            # content at p appears at p + D(p): to first order, as the displacement is defined
+            at_x = from_x - (dx + moved[0] + near - roll * from_y + zoom * from_x)
+            at_y = from_y - (dy + moved[1] + roll * from_x + zoom * from_y)
+            at = [at_y + (HEIGHT - 1) / 2 + 80, at_x + (WIDTH - 1) / 2 + 80]
+            image = map_coordinates(scene, at, order=3, prefilter=False)
+            left = 0.3 * WIDTH + 70.0 * number / RATE
+            inside = (x > left) & (x < left + 60) & (y > 60) & (y < 150)
+            if subject:
+                image = np.where(
+                    inside, map_coordinates(patch, [y - 40, x - left + 20], order=1, mode="reflect"), image
+                )
+            total += image / SAMPLES
+        frames.append(np.clip(np.round(255 * (total + 0.004 * rng.normal(size=total.shape))), 0, 255).astype(np.uint8))
+    return frames
+
+
+def fitted(frames):
+    follower = CornerFollower(TIMING)
+    pairs = [follower.next(frame, number / RATE) for number, frame in enumerate(frames)]
+    return pairs[1:], camera_path(pairs[1:], TIMING, (HEIGHT, WIDTH))
+
+
+def test_tones_and_path_of_a_hand_with_parallax_and_a_subject():
+    pairs, path = fitted(recorded(TONES))
+    tones = {tone.axis: tone for tone in path.tones(0.0)}
+    assert len(path.tones(0.0)) == 2
+    for axis, (size, frequency, phase) in TONES.items():
+        # three samples of the exposure average less than all of it, by 1 to 2 %
+        assert abs(tones[axis].coefficient) == pytest.approx(size, rel=0.05)
+        assert tones[axis].frequency == pytest.approx(frequency, abs=0.05)
+        error = np.angle(tones[axis].coefficient * np.exp(-1j * (phase - np.pi / 2)))
+        assert abs(error) < 0.1
+    times = np.arange(2, COUNT - 2) / RATE + 0.01
+    true = hand(times).T
+    errors = path.places(times) - (true - true[0])
+    # px, changes from frame to frame; a tenth of those of the hand. Parallax adds up slowly, and does not count
+    assert np.abs(np.diff(errors[:, :2], 2, axis=0)).max() < 0.15
+    assert np.abs(np.diff(true[:, :2], 2, axis=0)).max() > 1.5
+    assert np.abs(np.diff(errors[:, 2])).max() < 5e-4  # rad
+    assert np.sqrt(np.mean([shake(pair)[1] ** 2 for pair in pairs])) > 0.3  # the rows vibrate
+
+
+def test_a_hand_without_vibration_has_no_tones():
+    assert fitted(recorded({}, subject=False))[1].tones(0.5) == []
+
+
+def test_a_vibration_that_decays_has_no_tones_that_cancel():
+    tones = fitted(recorded({0: (1.5, 37.0, 0.3), 1: (1.0, 53.0, 1.0)}, subject=False, decay=0.8))[1].tones(0.5)
+    assert tones
+    assert max(abs(tone.coefficient) for tone in tones) < 1.5
+
+
+def test_unrelated_frames_have_no_path():
+    noise = np.random.default_rng(0).integers(0, 255, (6, HEIGHT, WIDTH), dtype=np.uint8)
+    with pytest.raises(ValueError, match="the frames show different scenes, or no detail"):
+        fitted(list(noise))
+
+
+def test_the_smooth_path_keeps_slow_motion_and_the_limit():
+    times = np.arange(150) / RATE
+    places = hand(times).T
+
+    def shifts(duration, limit):
+        return steady_shifts(times, lambda one, others: places[others] - places[one], duration, (HEIGHT, WIDTH), limit)
+
+    steady = places - shifts(0.5, 0.4)
+    jitter = [np.abs(np.diff(path[:, :2], 3, axis=0)).mean() for path in (places, steady)]
+    assert jitter[1] < 0.05 * jitter[0]
+    assert np.abs(steady[:, 0].mean() - places[:, 0].mean()) < 1.0
+    assert largest_displacement(shifts(2.0, 0.4), (HEIGHT, WIDTH)).max() > 0.03
+    assert largest_displacement(shifts(2.0, 0.02), (HEIGHT, WIDTH)).max() <= 0.021
+    assert not shifts(0.0, 0.1).any()

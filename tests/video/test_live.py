@@ -1,0 +1,377 @@
+"""Sources, outputs, page and spectrogram of live sessions."""
+
+import io
+import os
+import resource
+import signal
+import threading
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+import pytest
+from refusals import refuses
+from truth import draw_scene
+
+import rsvib_torch as rsv
+from rsvib_torch import video
+from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.video.sources import FrameCounter, FrameReader
+
+TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1 / 30 / 1e-4)
+
+
+def test_raw_frames_of_a_pipe():
+    colours = np.arange(2 * 3 * 4 * 3, dtype=np.uint8).reshape(2, 3, 4, 3)
+    data = colours[..., ::-1].tobytes() + b"end"
+    source = video.PipeSource(io.BytesIO(data), (3, 4), "bgr24", TIMING)
+    frames = list(source.frames())
+    assert [np.array_equal(one.pixels, np.moveaxis(truth, -1, 0)) for one, truth in zip(frames, colours, strict=True)]
+    assert [one.time for one in frames] == pytest.approx([0.0, 1 / 30])
+    deep = video.PipeSource(io.BytesIO(b"\x01\x02" * 6), (2, 3), "gray16le", TIMING)
+    assert next(deep.frames()).pixels.tolist() == [[513] * 3] * 2
+    assert deep.full_scale == 65535
+
+
+@dataclass
+class Numbers:
+    """Frames of one pixel, as fast as possible."""
+
+    count: int = 50
+    full_scale: float | None = None
+    lost: int = 0
+    closed: bool = False
+    error: Exception | None = None
+
+    def frames(self):
+        try:
+            for index in range(self.count):
+                yield video.TimedFrame(np.full((1, 1), float(index)), index / 30, time.perf_counter())
+            if self.error is not None:
+                raise self.error
+        finally:
+            self.closed = True
+
+
+def values(reader):
+    return [int(frame.pixels[0, 0]) for frame in reader]
+
+
+def test_the_oldest_waiting_frames_are_dropped_and_counted():
+    reader = FrameReader(source := Numbers(), waiting=8)
+    reader.start()
+    time.sleep(0.2)
+    assert values(reader) == list(range(42, 50))
+    assert reader.dropped == 42
+    reader.close()
+    assert source.closed
+
+
+@pytest.mark.parametrize("drops", [True, False])
+def test_a_reader_that_is_stopped_releases_the_source_with_the_next_frame(drops):
+    reader = FrameReader(source := Numbers(10**9), waiting=10**6, drops=drops)
+    reader.start()
+    reader.close()
+    assert source.closed
+
+
+def test_a_source_that_may_wait_loses_no_frame():
+    reader = FrameReader(Numbers(), waiting=8, drops=False)
+    reader.start()
+    time.sleep(0.1)
+    assert values(reader) == list(range(50))
+    assert reader.dropped == 0
+
+
+def test_an_error_of_the_source_arrives_behind_its_frames():
+    reader = FrameReader(Numbers(3, error=OSError("unplugged")), drops=False)
+    reader.start()
+    with pytest.raises(OSError, match="unplugged"):
+        values(reader)
+
+
+@pytest.mark.parametrize("stamps", ["none", "made up", "of the camera"])
+@pytest.mark.parametrize("drift", [-3e-4, 0.0, 3e-4])
+def test_missing_frames_of_a_camera_are_counted_and_late_ones_are_not(stamps, drift):
+    """Delays of arrival are random, with a mean of a fifth of a frame period (5 minutes)."""
+    generator = np.random.default_rng(1)
+    numbers = np.flatnonzero(np.arange(9000) % 1000 != 500)  # nine frames are lost
+    taken = numbers / 30 * (1 + drift)
+    arrived = np.maximum.accumulate(taken + generator.exponential(0.2 / 30, len(taken)))
+    given = {"none": 0 * taken, "made up": np.arange(len(taken)) / 25, "of the camera": 17.3 + taken}[stamps]
+    counter = FrameCounter(1 / 30)
+    found = np.array([counter.number(*times) for times in zip(arrived, given, strict=True)])
+    wrong = np.count_nonzero(np.diff(found - numbers))
+    assert (np.diff(found) > 0).all()
+    if stamps == "of the camera":
+        # the delay of the first frames hides how fast the clock of the stamps runs
+        assert wrong <= 1
+    else:
+        assert wrong <= 25  # rounding of the intervals to whole periods: 350 to 390
+        assert abs(found[-1] - numbers[-1]) <= 10
+
+
+def test_a_camera_at_an_address():
+    """Motion JPEG over HTTP, as network cameras send it."""
+    coloured = np.zeros((12, 48, 64, 3), np.uint8)  # blue, green, red
+    coloured[..., 2] = 20 * np.arange(12)[:, None, None]
+    parts = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in coloured]
+
+    class Stream(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=part")
+            self.end_headers()
+            for part in parts:
+                self.wfile.write(b"--part\r\nContent-Type: image/jpeg\r\n\r\n" + part + b"\r\n")
+                time.sleep(1 / 30)
+
+        def log_message(self, *arguments):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Stream)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        source = video.CameraSource(f"http://127.0.0.1:{server.server_address[1]}/video.mjpg", TIMING)
+        frames = list(source.frames())
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert len(frames) >= 10  # the last one may be incomplete
+    reds = np.array([frame.pixels[0].mean() for frame in frames])
+    assert frames[0].pixels.shape == (3, 48, 64)
+    assert np.abs(reds - 20 * np.arange(len(frames))).max() < 4
+    assert max(frame.pixels[2].max() for frame in frames) < 40  # blue
+    numbers = np.array([frame.time for frame in frames]) * 30
+    assert numbers[-1] == pytest.approx(len(frames) - 1 + source.lost)
+    assert np.diff(numbers).min() > 0.99
+    with pytest.raises(OSError, match="cannot be opened; check its number or URL"):
+        next(video.CameraSource("http://127.0.0.1:1/none", TIMING).frames())
+
+
+def test_the_page_is_served_to_this_machine_only():
+    page = video.PageOutput(0)
+    try:
+        assert page.url.startswith("http://127.0.0.1:")
+        port = urllib.parse.urlsplit(page.url).port
+        with pytest.raises(urllib.error.URLError):  # another address of this machine
+            urllib.request.urlopen(page.url.replace("127.0.0.1", "127.0.0.2"), timeout=5)
+        for host in (f"rebound.example:{port}", f"127.0.0.1.rebound.example:{port}", ""):
+            request = urllib.request.Request(page.url, headers={"Host": host})
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(request, timeout=5)
+        page.show_state("52.0 Hz <x>")
+        assert "52.0 Hz &lt;x&gt;" in urllib.request.urlopen(page.url, timeout=5).read().decode()
+        assert urllib.request.urlopen(page.url + "state", timeout=5).read() == b"52.0 Hz <x>"
+        with pytest.raises(urllib.error.HTTPError):
+            urllib.request.urlopen(page.url + "etc/passwd", timeout=5)
+        refuses(lambda: video.PageOutput(port), "choose another port", OSError)
+        with urllib.request.urlopen(page.url + "frames", timeout=5) as stream:
+            for index in range(50):  # those before the page has noticed the viewer are not encoded
+                page.write(np.full((16, 24), 200, np.uint8), index)
+                time.sleep(0.01)
+            head = stream.read(90)
+        assert b"image/jpeg" in head
+        assert b"\xff\xd8\xff" in head  # the first bytes of a JPEG image
+    finally:
+        page.close()
+
+
+@pytest.mark.parametrize("ending", [".mp4", ".mkv"])
+def test_video_files(tmp_path, ending):
+    frames = (np.random.default_rng(0).random((5, 32, 48, 3)) * 50 + np.arange(5)[:, None, None, None] * 40).astype(
+        "u1"
+    )
+    output = video.VideoOutput(tmp_path / f"video{ending}", 30.0)
+    for index, frame in zip((0, 1, 2, 5, 6), frames, strict=True):  # two are missing
+        output.write(frame, index)
+    assert len(rsv.read_stack(tmp_path / f"video{ending}")) >= 3  # it can be read while it is written
+    output.close()
+    info = rsv.read_stack_info(tmp_path / f"video{ending}")
+    assert info.shape == (5, 3, 32, 48)
+    assert np.diff(info.frame_times) == pytest.approx(np.array([1, 1, 3, 1]) / 30, abs=2e-3)
+    read = rsv.read_stack(tmp_path / f"video{ending}").numpy() * 255
+    tolerance = 0.5 if ending == ".mkv" else 12  # H.264 is lossy
+    assert np.abs(read.mean((1, 2, 3)) - frames.mean((1, 2, 3))).max() < tolerance
+
+
+def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
+    path, frame = tmp_path / "video.mkv", np.zeros((32, 32), np.uint8)
+    output = video.VideoOutput(path, 30.0)
+    assert not path.exists()  # it is created with the first frame
+    output.close()
+    path.write_bytes(b"created during the session")
+    refuses(lambda: output.write(frame, 0), r"video\.mkv was created by another program", FileExistsError)
+    assert path.read_bytes() == b"created during the session"
+    path.rename(tmp_path / "other")
+    path.symlink_to(tmp_path / "other")
+    output = video.VideoOutput(path, 30.0, overwrite=True)
+    output.write(frame, 0)
+    output.close()
+    assert rsv.read_stack_info(path).shape == (1, 32, 32)
+    assert (tmp_path / "other").read_bytes() == b"created during the session"
+    refuses(lambda: video.VideoOutput(tmp_path / "video.gif", 30.0), r"a live video is written to \.mp4")
+
+
+class Tracked:
+    """Offsets of rows by a known displacement, as a tracked frame."""
+
+    def __init__(self, time, displacement):
+        rows = np.arange(4.5, 300.0, 8) * TIMING.row_time
+        starts = np.stack([rows - TIMING.frame_period, rows], -1)
+        middles = starts + 0.5 * TIMING.exposure_time + time
+        moved = displacement(middles[:, 1]) - displacement(middles[:, 0])
+        information = np.broadcast_to(np.eye(2), (1, len(rows), 2, 2))
+        self.time = time
+        self.measurements = Measurements.of_pairs(
+            starts[None, :, 0], starts[None, :, 1], moved[None], information, TIMING.exposure_time
+        )
+
+
+def test_the_spectrogram_has_the_amplitudes_at_their_frequencies_and_times(tmp_path):
+    def displacement(t):
+        x = np.where(t < 2.0, 1.5 * np.sin(2 * np.pi * 52 * t), 0.7 * np.sin(2 * np.pi * 80 * t))
+        return np.stack([x, 0.3 * np.sin(2 * np.pi * 112 * t + 1)], -1)
+
+    spectrogram = video.Spectrogram(TIMING, duration=0.5, max_frequency=150.0)
+    for index in range(1, 121):
+        spectrogram.add(Tracked(index / 30, displacement))
+    times, frequencies, amplitude = spectrogram.result()
+    assert amplitude.shape == (2, len(times), len(frequencies))
+    assert times[1] - times[0] == pytest.approx(0.5, abs=1 / 30)
+    attenuation = np.sinc(np.array([52, 80, 112]) * TIMING.exposure_time)
+    for column, (hertz, size) in ((1, (52, 1.5)), (len(times) - 1, (80, 0.7))):
+        strongest = np.nanargmax(amplitude[0, column])
+        assert frequencies[strongest] == hertz
+        assert amplitude[0, column, strongest] == pytest.approx(size / attenuation[0 if hertz == 52 else 1], rel=0.1)
+    assert frequencies[np.nanargmax(amplitude[1, 3])] == 112
+    assert np.isnan(amplitude[:, :, frequencies == 60]).all()  # blind: twice the frame rate
+    ghosts = np.isin(frequencies, (22, 82, 112))  # 52 Hz and multiples of the frame rate: no larger than 1 %
+    assert np.nanmax(amplitude[0, 1, ghosts]) < 0.01 * np.nanmax(amplitude[0, 1])
+    files = video.save_spectrogram(tmp_path / "spectrum", spectrogram)
+    assert [path.name for path in files] == ["spectrum.png", "spectrum.zarr"]
+    import zarr
+
+    stored = zarr.open_group(str(files[1]), mode="r")
+    np.testing.assert_array_equal(stored["amplitude"][:], amplitude)
+    assert stored["frequency"].attrs["units"] == "Hz"
+    assert stored["time"].shape == times.shape
+
+
+def test_the_memory_of_the_spectrogram_is_bounded():
+    spectrogram = video.Spectrogram(TIMING, duration=0.1, max_frequency=60.0, max_columns=8)
+    for index in range(1, 120):
+        spectrogram.add(Tracked(index / 30, lambda t: np.stack([np.sin(50 * t), np.sin(300 * t)], -1)))
+    assert len(spectrogram.result()[0]) <= 9
+
+
+def test_a_full_disk_is_named_and_leaves_the_frames_before(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    frames = list(np.random.default_rng(0).integers(0, 256, (64, 64, 64), np.uint8))  # 5 kB each
+    for ending in (".mkv", ".mp4"):
+        output = video.VideoOutput(path := tmp_path / f"video{ending}", 30.0)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+        try:
+            with pytest.raises(OSError, match=f"video{ending}: File too large; the video has the frames before"):
+                list(map(output.write, frames, range(64)))
+            output.close()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert rsv.read_stack_info(path).shape[0] > 4
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_end_a_session(tmp_path, number):
+    output, before = video.VideoOutput(tmp_path / "video.mkv", 30.0), signal.getsignal(number)
+
+    def end(tracked, report):
+        if round(tracked.time * 30) == 5:
+            signal.raise_signal(number)
+            signal.raise_signal(number)  # a second one does not end the process
+
+    saved = []
+
+    def save():
+        signal.raise_signal(number)
+        saved.append(rsv.read_stack(tmp_path / "video.mkv"))
+
+    report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
+    assert report.frames == len(saved[0])
+    assert 6 <= report.frames <= 8  # at most two frames are tracked ahead of the written one
+    assert signal.getsignal(number) == before
+
+
+def test_the_end_of_a_reader_ends_a_session():
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb", buffering=0) as stream:
+        report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [video.PipeOutput(stream)], drops=False)
+    assert report.frames == 0
+
+
+class Broken:
+    """An output that cannot write."""
+
+    closed = None
+
+    def write(self, frame, index):
+        raise OSError("disk full")
+
+    def close(self):
+        self.closed = True
+
+
+def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
+    source = Numbers(3, error=OSError("unplugged"))
+    output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
+    with pytest.raises(OSError, match="unplugged"):
+        video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert rsv.read_stack_info(tmp_path / "video.mkv").shape == (3, 1, 1)
+    assert source.closed
+
+
+class Shaking:
+    """Frames of a vibrating camera at its rate."""
+
+    full_scale, lost = None, 0
+
+    def __init__(self, pixels):
+        self.pixels = pixels
+
+    def frames(self):
+        begin = time.perf_counter()
+        for index, pixels in enumerate(self.pixels):
+            time.sleep(max(0.0, begin + index * TIMING.frame_period - time.perf_counter()))
+            yield video.TimedFrame(pixels, index * TIMING.frame_period, time.perf_counter())
+
+
+class SlowTracker(rsv.VibrationTracker):
+    """A tracker that needs 1.2 frame periods to measure a frame."""
+
+    def update(self, *arguments, measure=True):
+        begin = time.perf_counter()
+        tracked = super().update(*arguments, measure=measure)
+        time.sleep(max(0.0, begin + 1.2 * TIMING.frame_period - time.perf_counter()) if measure else 0.0)
+        return tracked
+
+
+@pytest.mark.parametrize("drops", [True, False])
+def test_the_motion_of_late_frames_is_predicted(drops):
+    vibration = rsv.Vibration([2.1, 1.6], [0.37 / TIMING.frame_period] * 2, [0.5, 1.0])
+    frames = rsv.simulate_frames(draw_scene(200, 200, seed=3), TIMING, vibration, 40, frame_size=(160, 160)).numpy()
+    report = video.run_live(Shaking(frames), SlowTracker(TIMING, columns=None), [], drops=drops)
+    assert (report.frames, report.dropped) == (40, 0)
+    assert (report.predicted > 5) == drops
+
+
+def test_an_error_of_an_output_ends_the_session(tmp_path):
+    source, output = Numbers(), Broken()
+    with pytest.raises(OSError, match="disk full"):
+        video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert output.closed
+    assert source.closed

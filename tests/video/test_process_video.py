@@ -1,0 +1,276 @@
+"""Videos followed from frame to frame, from file to file, against the scene of an independent camera."""
+
+import itertools
+import json
+
+import av
+import numpy as np
+import pytest
+import torch
+from refusals import refuses
+from skimage.registration import phase_cross_correlation
+from small_video import sound_of, write_video
+from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
+
+from rsvib_torch import SensorTiming, read_manifest, read_stack, read_stack_info
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.video import process_video
+
+HEIGHT, WIDTH, COUNT, RATE = 168, 144, 40, 30.0
+TIMING = SensorTiming(row_time=150e-6, exposure_rows=4, frame_rows=1 / RATE / 150e-6)
+CAMERA = ("--row-time", "150us", "--exposure", "0.6ms", "--frame-rate", "30")
+VIBRATION = Motion((2.1, 1.6), (52.0, 71.0), (0.5, 1.0))
+TIMES = np.arange(COUNT) / RATE
+PART = 32  # frames
+OPTIONS = {"restoration": {"method": "dewarp"}, "workers": 2}
+
+
+class Shaken:
+    """Vibration on a slow pan with shaking of 3 Hz."""
+
+    def displacement(self, t):
+        x = 2.0 * np.sin(2 * np.pi * 3 * t) + 12.0 * t
+        return VIBRATION.displacement(t) + np.stack([x, 0 * t], -1)
+
+
+def colours(size):
+    """Red, green and blue scene (3, H, W): grey detail, and broad colours."""
+    height, width = (side + 2 * MARGIN for side in size)
+    grey, first, second = (draw_scene(height, width, seed, blur) for seed, blur in ((3, 0.8), (4, 4.0), (5, 4.0)))
+    return np.stack([grey + 0.2 * (first - 0.5), grey, grey + 0.2 * (second - 0.5)]).clip(0.05, 0.95)
+
+
+SCENE = colours((HEIGHT, WIDTH))
+STILL = np.stack([crop(channel) for channel in SCENE])
+
+
+def counts_of(motion, count=COUNT):
+    taken = [take_frames(channel, TIMING, motion, count, 0.004, seed=3) for channel in SCENE]
+    return np.clip(np.round(255 * np.stack(taken, -1)), 0, 255).astype(np.uint8)
+
+
+def write(path, frames, **options):
+    # with threads and its look-ahead, the encoder writes other pixels in every run
+    encoder = {"crf": "6", "threads": "1", "tune": "zerolatency"}
+    settings = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "options": encoder, "rate": 30}
+    write_video(path, frames, TIMES[: len(frames)], **settings | options)
+    return path
+
+
+@pytest.fixture(scope="module", name="frames")
+def make_frames():
+    return counts_of(VIBRATION)
+
+
+@pytest.fixture(scope="module", name="clip")
+def make_clip(frames, tmp_path_factory):
+    return write(tmp_path_factory.mktemp("video") / "clip.mp4", frames, sound="aac")
+
+
+@pytest.fixture(scope="module", name="shaky")
+def make_shaky(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("video") / "shaky.mp4", counts_of(Shaken()))
+
+
+def pixels(path):
+    return read_stack(path).double().numpy()
+
+
+def gains(source, restored, still=STILL):
+    """dB by which every restored frame is closer to the scene at rest than the frame as taken."""
+    return np.array(
+        [decibel(b, still, 16) - decibel(a, still, 16) for a, b in zip(pixels(source), restored, strict=True)]
+    )
+
+
+def shifts(frames):
+    """(T - 1, 2) px, displacements (x, y) of the content of each grey frame against the one before."""
+    height, width = frames.shape[-2:]
+    window = np.hanning(height)[:, None] * np.hanning(width)
+    pairs = itertools.pairwise((frame - 0.5) * window for frame in frames)
+    return -np.array([phase_cross_correlation(a, b, upsample_factor=50, normalization=None)[0][::-1] for a, b in pairs])
+
+
+@pytest.mark.parametrize("method", ["dewarp", "exact"])
+def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path, method):
+    report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS | {"restoration": {"method": method}})
+    restored = pixels(tmp_path / "still.mp4")
+    gain = gains(clip, restored)
+    assert gain.min() > 6  # also of the first frames, which are given before the vibration is known
+    assert np.abs(shifts(restored.mean(1))).max() < 0.05  # px, also at the border of two parts
+    assert np.abs(gain[PART - 1] - gain[PART]) < 3  # dB
+    assert (report.frames, report.windows, report.restored, report.bad_frames) == (COUNT, 2, 2, 0)
+    manifest = read_manifest(report.manifest)
+    for found in manifest.detections():
+        assert found.vibration.frequency[:, 0].tolist() == pytest.approx([52.0, 71.0], abs=0.1)
+    assert [record.outcome for record in manifest.windows] == ["helps", "helps"]
+    assert read_stack_info(tmp_path / "still.mp4").frame_times == read_stack_info(clip).frame_times
+    assert len(sound_of(clip)) > 3
+    assert sound_of(tmp_path / "still.mp4") == sound_of(clip)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["still.mp4", "still.mp4.manifest.json"]
+
+
+def test_colours_are_kept_as_stored(clip, tmp_path):
+    process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    with av.open(str(clip)) as one, av.open(str(tmp_path / "still.mp4")) as other:
+        before, after = next(one.decode(video=0)), next(other.decode(video=0))
+        assert before.format.name == after.format.name == "yuv420p"
+        assert (before.colorspace, before.color_range) == (after.colorspace, after.color_range)
+        means = [[float(np.frombuffer(plane, "u1").mean()) for plane in frame.planes] for frame in (before, after)]
+    assert means[0] == pytest.approx(means[1], abs=0.3)
+
+
+def test_a_steady_video_follows_the_mean_of_its_path(shaky, tmp_path):
+    duration = 1 / 3  # s, one period of the shaking
+    report = process_video(shaky, tmp_path / "steady.mp4", TIMING, border="crop", steady=duration, **OPTIONS)
+    raw, steady = (pixels(path).mean(1) for path in (shaky, tmp_path / "steady.mp4"))
+    height, width = steady.shape[-2:]
+    assert HEIGHT - 16 <= height < HEIGHT - 2
+    assert WIDTH - 24 <= width < WIDTH - 4
+    assert len(steady) == COUNT
+    assert height % 2 == width % 2 == 0
+    pan = 12.0 / RATE
+    inner = slice(5, -6)  # near both ends, the mean is over less than a period of the shaking
+    assert np.abs(shifts(raw)[inner, 0] - pan).max() > 0.8
+    assert np.abs(shifts(steady)[inner, 0] - pan).max() < 0.2  # the video is compressed twice
+    assert np.abs(shifts(steady)[inner, 1]).max() < 0.08
+    margins = json.loads(report.manifest.read_text())["margins"]
+    assert margins["top"] % 2 == margins["left"] % 2 == 0
+    assert min(margins.values()) >= 2
+
+
+def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
+    timing = SensorTiming(row_time=0.73 * 150e-6, exposure_rows=4 / 0.73, frame_rows=1 / RATE / (0.73 * 150e-6))
+    report = process_video(clip, tmp_path / "still.mp4", timing, **OPTIONS)
+    for found in read_manifest(report.manifest).detections():
+        right = (found.vibration.frequency[:, 0] - torch.tensor([52.0, 71.0])).abs() < 0.2
+        assert not (found.reliable & ~right).any()
+
+
+class _StoppedError(KeyboardInterrupt):
+    """Ctrl-C at a chosen frame."""
+
+
+@pytest.mark.parametrize("damage", [None, "damaged part"])
+def test_an_interrupted_run_is_resumed(clip, tmp_path, damage):
+    options = {"border": "hold", "steady": 0.2, **OPTIONS}
+    process_video(clip, tmp_path / "whole.mp4", TIMING, **options)
+
+    def stop(done, total):
+        assert total == COUNT
+        if done == PART + 4:
+            raise _StoppedError
+
+    sink = tmp_path / "again.mp4"
+    with pytest.raises(_StoppedError):
+        process_video(clip, sink, TIMING, progress=stop, **options)
+    assert not sink.exists()
+    with pytest.raises(FileExistsError, match="interrupted here after 1 windows; resume it"):
+        process_video(clip, sink, TIMING, **options)
+    with pytest.raises(ValueError, match=r"cannot resume: settings\.video\.steady was 0\.2, now it is 0\.3"):
+        process_video(clip, sink, TIMING, resume=True, **options | {"steady": 0.3})
+    if damage is not None:
+        part = tmp_path / ".again.mp4.rsvib" / "000000.mp4"
+        part.write_bytes(part.read_bytes()[:-100])
+    report = process_video(clip, sink, TIMING, resume=True, **options)
+    assert report.resumed == (1 if damage is None else 0)
+    assert np.array_equal(pixels(sink), pixels(tmp_path / "whole.mp4"))
+    whole = read_manifest(tmp_path / "whole.mp4.manifest.json").shaking
+    assert read_manifest(report.manifest).shaking == whole
+    assert whole["frame_to_frame"][1] < 0.2 * whole["frame_to_frame"][0]
+    assert process_video(clip, sink, TIMING, resume=True, **options).resumed == 2  # it is complete
+    assert not (tmp_path / ".again.mp4.rsvib").exists()
+
+
+def test_copies_and_constant_frames_repeat_the_frame_before(frames, tmp_path):
+    changed = frames[:20].copy()
+    changed[12] = 128
+    write_video(tmp_path / "clip.mkv", changed, TIMES[:20], layout="rgb24", encoded="bgr0")
+    report = process_video(tmp_path / "clip.mkv", tmp_path / "still.mkv", TIMING, **OPTIONS)
+    restored = pixels(tmp_path / "still.mkv")
+    assert np.array_equal(restored[12], restored[11])
+    assert report.bad_frames == 1
+    assert decibel(restored[12], STILL, 16) > 30
+    assert decibel(restored[13], STILL, 16) > 30
+
+
+@pytest.mark.parametrize("ending", [".mp4", ".mkv"])
+def test_columns_that_are_read_one_after_another(frames, tmp_path, ending):
+    turned = np.ascontiguousarray(frames[:16].transpose(0, 2, 1, 3))
+    encoded = {} if ending == ".mp4" else {"codec": "ffv1", "options": {}, "encoded": "bgr0"}
+    source, sink = write(tmp_path / f"clip{ending}", turned, **encoded), tmp_path / f"still{ending}"
+    timing = SensorTiming(TIMING.row_time, TIMING.exposure_rows, TIMING.frame_rows, scan_axis="x")
+    process_video(source, sink, timing, **OPTIONS)
+    assert gains(source, pixels(sink), STILL.transpose(0, 2, 1)).min() > 6
+
+
+def test_rotation_and_missing_frames_are_kept(frames, tmp_path):
+    kept = [index for index in range(24) if index not in (9, 15)]  # dropped by the camera
+    path = tmp_path / "clip.mp4"
+    options = {"layout": "rgb24", "codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6"}, "rate": 30}
+    write_video(path, frames[kept], TIMES[kept], rotation=-90, **options)
+    process_video(path, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    before, after = read_stack_info(path), read_stack_info(tmp_path / "still.mp4")
+    assert before.orientation == after.orientation == 6
+    assert before.frame_times == after.frame_times
+    assert gains(path, pixels(tmp_path / "still.mp4")).min() > 6
+
+
+def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
+    cases = [
+        ({"border": "zoom"}, "border must be one of"),
+        ({"steady": -1.0}, "steady must be at least 0"),
+        ({"restoration": {"joint": 3}}, "joint is not available for frames that are followed one by one"),
+        ({"restoration": {"method": "exact", "chunk_rows": 3}}, "has no option 'chunk_rows'"),
+        ({"border": "crop", "steady": 60.0, "memory": "1kB"}, "memory of"),
+    ]
+    for options, message in cases:
+        with pytest.raises((ValueError, TypeError), match=message):
+            process_video(clip, tmp_path / "still.mp4", TIMING, **options)
+    refuses(lambda: process_video(clip, tmp_path / "still.tif", TIMING), "videos are written to")
+    refuses(lambda: process_video(clip, clip, TIMING), "same file as the input")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_axis_without_vibration_is_left_as_taken(tmp_path):
+    source = write(tmp_path / "clip.mp4", counts_of(Motion((2.1, 0.0), (52.0, 71.0), (0.5, 1.0)), 20))
+    report = process_video(source, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    assert gains(source, pixels(tmp_path / "still.mp4")).min() > 6
+    (record,) = read_manifest(report.manifest).windows
+    assert record.frames == "restored"
+    assert [(reason.code, reason.axis) for reason in record.left_alone] == [("axis_not_reliable", "y")]
+
+
+def test_a_video_without_a_common_motion_is_refused(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    write(tmp_path / "noise.mp4", noise)
+    with pytest.raises(ValueError, match="no motion was found that the corners of the frames have in common"):
+        process_video(tmp_path / "noise.mp4", tmp_path / "still.mp4", TIMING, **OPTIONS)
+    assert [path.name for path in tmp_path.iterdir()] == ["noise.mp4"]
+
+
+def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
+    arguments = ("run", shaky, tmp_path / "out", *CAMERA, "--method", "dewarp", "--video")
+    steady = (*arguments, "--border", "crop", "--steady", "0.3333")
+    assert run_command([str(argument) for argument in (*steady, "--json")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    # the standard deviation is 0.003 to 0.3 Hz, because the clip is short and its shaking has a period of ten frames
+    assert answer["windows"]["tones"]["x"]["tones"][0]["frequency"] == pytest.approx(52.0, abs=0.5)
+    assert answer["windows"]["tones"]["x"]["reliable_windows"] == 2
+    names = ["before_after.png", "manifest.json", "restored.mp4", "tones.csv", "windows.json", "windows.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    frames = pixels(tmp_path / "out" / "restored.mp4").mean(1)
+    assert np.abs(shifts(frames)[5:-6, 0] - 12.0 / RATE).max() < 0.3  # px; 1.3 px before
+    vibration = ("--vibration", tmp_path / "out" / "manifest.json")
+    wrong = {
+        ("restore", shaky, tmp_path / "again.mp4", *CAMERA, *vibration): "its parts are not windows; detect",
+        steady: "results exist already",
+        (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
+        (*steady, "--overwrite", "--joint", "3"): "method='dewarp' has no option 'joint'",
+        (*steady[:-1], "-1", "--overwrite"): "steady must be at least 0, got -1",
+    }
+    for command, message in wrong.items():
+        assert run_command([str(argument) for argument in command]) == 2
+        shown = capsys.readouterr().err
+        assert message in shown
+        assert shown.count("\n") == 1

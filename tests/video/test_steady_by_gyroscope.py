@@ -1,0 +1,119 @@
+"""Videos steadied by a gyroscope, against an independent camera that turns: a subject fills most of its frame."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+import torch
+from gpmf_file import add_track, packet
+from rotating_camera import FOCAL_LENGTH, OFFSET, TIMING, recorded, take
+from scipy.spatial.transform import Rotation
+from skimage.registration import phase_cross_correlation
+from small_video import sound_of, write_video
+
+import rsvib_torch as rsv
+from rsvib_torch.commands.main import run_command
+from rsvib_torch.video import process_video
+from rsvib_torch.video.recorded_rotation import RecordedRotation
+from rsvib_torch.video.steadying import steady_shifts
+
+COUNT, SHAKING = 24, 2.0
+OPTIONS = {"restoration": {"method": "dewarp"}, "workers": 2, "steady": 1 / 3}
+CAMERA = ("--row-time", "80us", "--exposure", "0.8ms", "--frame-rate", str(1 / TIMING.frame_period))
+STRIP = (slice(6, 44), slice(16, -16))  # of the distant scene, above the subject
+
+
+def walk(times):
+    return np.stack([60 * times - 20, -4 * np.abs(np.sin(2 * np.pi * 1.9 * times))], -1)
+
+
+def rates_of_clip():
+    return recorded("yZx", SHAKING, count=COUNT)
+
+
+@pytest.fixture(scope="module", name="place")
+def make_place(tmp_path_factory):
+    """A clip with a subject that moves by itself, and the rates of the gyroscope."""
+    place = tmp_path_factory.mktemp("place")
+    frames = take(TIMING, SHAKING, subject=walk, count=COUNT).numpy()
+    counts = np.repeat(np.clip(np.round(255 * frames), 0, 255).astype(np.uint8)[..., None], 3, -1)
+    encoder = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6", "threads": "1"}, "sound": "aac"}
+    times = np.arange(COUNT) * TIMING.frame_period
+    write_video(place / "clip.mp4", counts, times, layout="rgb24", rate=30, **encoder)
+    write_rates(place / "rates.csv", rates_of_clip())
+    return place
+
+
+def write_rates(path, rates):
+    rows = [",".join(f"{value:.9g}" for value in row) for row in torch.cat([rates.times[:, None], rates.rates], 1)]
+    path.write_text("time_s,gx_rad_s,gy_rad_s,gz_rad_s\n" + "\n".join(rows))
+
+
+def shaking(path):
+    """Rms displacement (px) of the distant scene from frame to frame."""
+    strips = rsv.read_stack(path).double().mean(1).numpy()[:, *STRIP]
+    window = np.hanning(strips.shape[1])[:, None] * np.hanning(strips.shape[2])
+    pairs = itertools.pairwise((strip - strip.mean()) * window for strip in strips)
+    moved = [phase_cross_correlation(a, b, upsample_factor=50, normalization=None)[0] for a, b in pairs]
+    return np.sqrt(np.square(moved[2:-2]).sum(-1).mean())
+
+
+def test_the_scene_behind_a_large_subject_becomes_steady(place, tmp_path):
+    report = process_video(
+        place / "clip.mp4", tmp_path / "steady.mp4", TIMING, gyroscope=place / "rates.csv", **OPTIONS
+    )
+    assert shaking(place / "clip.mp4") > 4
+    assert shaking(tmp_path / "steady.mp4") < 0.15
+    assert (report.frames, report.restored) == (COUNT, 1)
+    found = rsv.read_manifest(report.manifest).gyroscope
+    assert found["orientation"] == "yZx"
+    assert found["offset"] == pytest.approx(OFFSET, abs=1e-3)
+    assert found["focal_length"] == pytest.approx(FOCAL_LENGTH, rel=0.03)
+    assert sound_of(tmp_path / "steady.mp4") == sound_of(place / "clip.mp4")
+
+
+def test_the_track_of_the_clip_itself(place, tmp_path, capsys):
+    rates = rates_of_clip()
+    clip = tmp_path / "clip.mp4"
+    clip.write_bytes((place / "clip.mp4").read_bytes())
+    arguments = ["run", str(clip), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "0.333", "--method", "dewarp"]
+    arguments += ["--gyroscope", "auto", "--device", "cpu", "--json"]
+    assert run_command(arguments) == 2
+    assert "without a GPMF track" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    firsts = range(0, len(rates.times) - 299, 300)  # samples of 1 ms
+    add_track(clip, [packet(rates.rates[first : first + 300].numpy(), total=first + 300) for first in firsts])
+    assert run_command(arguments) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert shaking(tmp_path / "out" / "restored.mp4") < 0.15
+    before, after = data["shaking"]["frame_to_frame"]
+    assert 0 < after < 1.1 * before + 0.1
+    assert not (tmp_path / "out" / "windows.png").exists()  # it would be empty: no tones are searched for
+
+
+def test_rates_of_another_camera_are_refused(place, tmp_path, capsys):
+    rates = rates_of_clip()
+    noise = np.random.default_rng(4).standard_normal((len(rates.times), 3))
+    smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in noise.T], -1)
+    write_rates(tmp_path / "other.csv", rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
+    arguments = ["run", str(place / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "1"]
+    assert run_command([*arguments, "--gyroscope", str(tmp_path / "other.csv"), "--device", "cpu"]) == 2
+    printed = capsys.readouterr().err.strip()
+    assert "does not fit the video" in printed
+    assert len(printed.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["other.csv"]
+
+
+def test_a_pan_of_any_angle_is_kept():
+    # A camera that pans by 230 degrees and is tilted; its shaking is about an axis that the pan turns.
+    times = np.arange(120) / 30
+    pan = Rotation.from_euler("xy", np.stack([0.4 + 0 * times, times], -1))
+    angle = 0.01 * np.sin(2 * np.pi * 3 * times)
+    shaken = pan * Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 2.0])
+    rates = rsv.AngularRates(torch.arange(8.0), torch.zeros(8, 3))
+    path = RecordedRotation(rates, rsv.Camera(500.0), times, shaken)
+    moved = steady_shifts(times, path.apart, 1 / 3, (360, 640), 0.1)[15:-15]
+    expected = angle[15:-15, None] * [0.0, 500.0, -2.0, 0.0]
+    assert np.abs(expected).max() > 4  # px
+    assert np.abs((moved - expected) * [1, 1, 300, 1]).max() < 0.1  # px, at the border of the frame
