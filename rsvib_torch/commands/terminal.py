@@ -20,7 +20,7 @@ from rich.text import Text
 
 from rsvib_torch.execution.progress import listening
 from rsvib_torch.files.reading import Table
-from rsvib_torch.results.reason import on_command_line
+from rsvib_torch.results.reason import options_of_the_program
 from rsvib_torch.text import json_text, printable, shortened, wrapped
 
 
@@ -57,7 +57,8 @@ def running(arguments: Sequence[str]) -> Iterator[None]:
     """Collect the output of a command line while it runs."""
     _outputs.append(Output(printable(shlex.join(["rsvib", *arguments]))))
     try:
-        yield
+        with options_of_the_program():
+            yield
     finally:
         _outputs.pop()
 
@@ -96,8 +97,7 @@ def show_answer(command: str, answer: Answer) -> None:
         return
     notes = {"Notes": output.notes} if output.notes else {}
     for title, lines in {**answer.results, **notes}.items():
-        text = on_command_line("\n".join(lines))
-        print_line("\n".join([printable(title), *(f"  {line}" for line in text.splitlines())]) + "\n")
+        print_line("\n".join([printable(title), *(f"  {line}" for text in lines for line in text.splitlines())]) + "\n")
     if answer.files:
         print_line(f"Files (open {printable(answer.files[0].name)} first)" if len(answer.files) > 1 else "File")
         for folder in dict.fromkeys(path.parent for path in answer.files):
@@ -105,8 +105,7 @@ def show_answer(command: str, answer: Answer) -> None:
             text = str(folder / names[0]) if len(names) == 1 else f"{folder}: {', '.join(names)}"
             print_line(textwrap.indent(wrapped(printable(text)), "  "))
     if answer.next_steps:
-        steps = [textwrap.indent(on_command_line(step), "  ") for step in answer.next_steps]
-        print_line("\n".join(["", "Next", *steps]))
+        print_line("\n".join(["", "Next", *(textwrap.indent(step, "  ") for step in answer.next_steps)]))
 
 
 def note(message: str) -> None:
@@ -121,7 +120,7 @@ def error_line(message: str, kind: str = "error") -> None:
     Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
     end of a terminal, the command continues.
     """
-    message = on_command_line(shortened(message))
+    message = shortened(message)
     if kind == "warning":
         _outputs[-1].warnings.append(message)
     console = Console(stderr=True, highlight=False)

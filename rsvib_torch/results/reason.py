@@ -6,7 +6,8 @@ is written from the table.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from string import Formatter
@@ -74,7 +75,10 @@ class Reason:
             names = {name for _, name, _, _ in Formatter().parse(match[1]) if name}
             return match[1] if names <= values.keys() else ""
 
-        return re.sub(r"\[([^]]*)\]", part, template).format_map(values)
+        text = re.sub(r"\[([^]]*)\]", part, template).format_map(values)
+        for name, option in _OPTIONS.items() if _of_program else ():
+            text = text.replace(name, option)
+        return text
 
     @property
     def with_axis(self) -> str:
@@ -101,6 +105,33 @@ class Reason:
 
 
 _COMPARED = ("value", "limit")
+# What texts of Python name, and the same for users of the program
+_OPTIONS = {
+    "follow=True": "--follow",
+    "model='free'": "rsvib motion",
+    "check frame_rows, row_time": "check --frame-rate, --row-time",
+    "check exposure_rows": "check --exposure",
+    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
+    "check row_time": "check --row-time",
+    "increase search": "increase search in [detection]",
+    "pass row_time=(low, high)": "give --row-time twice",
+    "scan_axis=": "--scan-axis ",
+    "readout_direction=": "--readout-direction ",
+    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
+}
+_of_program: list[bool] = []  # not empty while a command runs
+
+
+@contextmanager
+def options_of_the_program() -> Iterator[None]:
+    """Texts of reasons name the options of the program instead of those of Python."""
+    _of_program.append(True)
+    try:
+        yield
+    finally:
+        _of_program.pop()
+
+
 _AT_RADIUS = "[ (px: at {radius:.0f} px from the centre)]"  # for components of roll and zoom
 
 
@@ -463,24 +494,3 @@ GROUPS = {
     "Files of later versions": {"unspecified": ReasonKind("{text}")},
 }
 REASONS = {code: kind for kinds in GROUPS.values() for code, kind in kinds.items()}
-
-# How the command line calls what texts name as in Python.
-_NAMES = {
-    "follow=True": "--follow",
-    "model='free'": "rsvib motion",
-    "check frame_rows, row_time": "check --frame-rate, --row-time",
-    "check exposure_rows": "check --exposure",
-    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
-    "check row_time": "check --row-time",
-    "increase search": "increase search in [detection]",
-    "pass row_time=(low, high)": "give --row-time twice",
-    "scan_axis=": "--scan-axis ",
-    "readout_direction=": "--readout-direction ",
-    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
-}
-_NAME = re.compile("|".join(re.escape(name).replace(r"\ ", r"\s+") for name in _NAMES))
-
-
-def on_command_line(text: str) -> str:
-    """A text with the options of the command line instead of those of Python."""
-    return _NAME.sub(lambda match: _NAMES[" ".join(match[0].split())], text)

@@ -28,7 +28,7 @@ from rsvib_torch.report.html.template import (
 )
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
-from rsvib_torch.results.reason import Reason, on_command_line
+from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
 
@@ -262,8 +262,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         verdict = report.verdict
         sentences = [words.FOLLOWED, *([] if verdict is None else sentences[-1:])]
         mark = "good" if verdict is not None and verdict.overall == "helps" else "doubt"
-    if report.command is not None:
-        sentences = list(map(on_command_line, sentences))
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
     windows = None
     if report.windows is not None:
