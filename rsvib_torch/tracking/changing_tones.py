@@ -10,14 +10,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
+from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 from rsvib_torch.detection.verdict import scene_reasons
 from rsvib_torch.frames.grey import GreyFrames
+from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.tables import Array, table
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 
@@ -59,7 +62,7 @@ def changing_tones(stack: GreyFrames, bands: RegistrationOptions) -> tuple[Chang
         ValueError: If the frames cannot be registered.
     """
     # 1. Offsets of the row bands, and the middles of their exposures.
-    rows, curve, (start, end) = start_curve(stack, stack.timing, bands)
+    rows, curve, _ = start_curve(stack, stack.timing, bands)
     against = scene_reasons(curve, stack.images.shape[-1])[0]
     if against:
         raise ValueError(str(against[0]))
@@ -67,24 +70,58 @@ def changing_tones(stack: GreyFrames, bands: RegistrationOptions) -> tuple[Chang
     offsets = np.diff(banded.displacements[0], axis=1)[:, 0]  # (N, 2)
     times = banded.exposure_starts[0] + 0.5 * banded.exposure_time  # (N, 2)
     times[:, 1] -= offsets[:, 1] * rows.row_time
-    # 2. What is tried. A band averages over its rows as well as over the exposure.
-    number = stack.images.shape[1]
-    knots = np.linspace(start, end, 2 + round(number / _KNOT_FRAMES))
-    intervals = np.diff(table(rows.frame_starts(number)))
-    averaged = (rows.exposure_time, bands.band_rows * rows.row_time)
-    tried = np.arange(0.0, 0.5 / averaged[1], 1 / (_STEPS * (knots[1] - knots[0])))[1:]
-
-    def search(axis: int, times: Array) -> tuple[ChangingTones, Array]:
-        weights = banded.weights[0, :, axis] * banded.independent
-        return _AxisOffsets(times, offsets[:, axis], weights, knots, intervals, tried).tones(averaged)
-
-    # 3. Rows of content that moves along the scan are exposed later. By how much is taken from the tones along the
+    # 2. Rows of content that moves along the scan are exposed later. By how much is taken from the tones along the
     # scan: with the measured offsets, a tone that frames do not show would explain these offsets by themselves.
-    moved = np.zeros(len(times))
+    record = _Record.of(table(rows.frame_starts(stack.images.shape[1])), rows, bands.band_rows)
+    weights, moved = banded.weights[0] * banded.independent, np.zeros(len(times))
     for _ in range(2):
         shifted = times + np.stack([np.zeros_like(moved), moved * rows.row_time], 1)
-        along_scan, moved = search(1, shifted)
-    return search(0, shifted)[0], along_scan
+        along_scan, moved = _AxisOffsets(shifted, offsets[:, 1], weights[:, 1], record).tones()
+    return _AxisOffsets(shifted, offsets[:, 0], weights[:, 0], record).tones()[0], along_scan
+
+
+def missing_tones(
+    tones: Sequence[ChangingTones],
+    measured: Sequence[tuple[float, Measurements]],
+    starts: Array,
+    rows: RowTiming,
+    band_rows: int,
+) -> list[float | None]:
+    """For each axis, the frequency of a tone that the measured rows of a record show, and that is none of its tones.
+
+    Rows are measured ten times as accurately as bands, around the tones that a tracker follows. ``measured`` has the
+    start of frames and the displacements of their rows and of those of the frame before; ``starts`` of all frames.
+    """
+    times = np.concatenate([start + one.exposure_starts[0] + 0.5 * one.exposure_time for start, one in measured])
+    offsets = np.concatenate([np.diff(one.displacements[0], axis=1)[:, 0] for _, one in measured])
+    used = [one.weights[0] * one.independent * (one.num_differences[0] > 0)[:, None] for _, one in measured]
+    record, weights = _Record.of(starts, rows, band_rows), np.concatenate(used)
+    missing: list[float | None] = []
+    for axis, known in enumerate(tones):
+        found, _ = _AxisOffsets(times, offsets[:, axis], weights[:, axis], record).found()
+        step = 2 * record.tried[0]
+        others = [one for one in found if not (np.abs(known.frequencies - one) < step).any()]
+        missing.append(others[0] if others else None)
+    return missing
+
+
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """What the offsets of all axes of a record have in common."""
+
+    knots: Array  # (J,) s
+    intervals: Array  # s, between the frames
+    tried: Array  # (F,) Hz
+    averaged: tuple[float, float]  # s, over which exposure and band average
+
+    @classmethod
+    def of(cls, starts: Array, rows: RowTiming, band_rows: int) -> Self:
+        """The record of frames that start at times in s."""
+        end = starts[-1] + float(np.median(np.diff(starts)))
+        knots = np.linspace(starts[0], end, 2 + round(len(starts) / _KNOT_FRAMES))
+        averaged = (rows.exposure_time, band_rows * rows.row_time)
+        tried = np.arange(0.0, 0.5 / averaged[1], 1 / (_STEPS * (knots[1] - knots[0])))[1:]
+        return cls(knots, np.diff(starts), tried, averaged)
 
 
 def _hats(times: Array, knots: Array) -> Array:
@@ -100,9 +137,7 @@ class _AxisOffsets:
     times: Array  # (N, 2) s
     offsets: Array  # (N,) px
     weights: Array  # (N,)
-    knots: Array  # (J,) s
-    intervals: Array  # s, between the frames
-    tried: Array  # (F,) Hz
+    record: _Record
 
     @cached_property
     def data(self) -> Array:
@@ -112,12 +147,12 @@ class _AxisOffsets:
     @cached_property
     def drift(self) -> Array:
         """(N, J) weighted offsets by a velocity of 1 at each knot."""
-        moved = _hats(self.times.mean(1), self.knots) * np.diff(self.times)
+        moved = _hats(self.times.mean(1), self.record.knots) * np.diff(self.times)
         return np.sqrt(self.weights)[:, None] * moved
 
     def columns(self, frequencies: Sequence[float] | Array) -> Array:
         """(N, J + 2 J K) weighted offsets by the drift and by tones of amplitude 1 at each knot."""
-        parts, hats = [self.drift], _hats(self.times, self.knots)
+        parts, hats = [self.drift], _hats(self.times, self.record.knots)
         for frequency in frequencies:
             turned = hats * np.exp(2j * math.pi * frequency * self.times)[..., None]
             change = np.sqrt(self.weights)[:, None] * (turned[:, 1] - turned[:, 0])
@@ -126,14 +161,14 @@ class _AxisOffsets:
 
     def is_blind(self, frequencies: Array) -> Array:
         """Whether all frames are displaced alike by a tone."""
-        gain = np.abs(2 * np.sin(math.pi * np.multiply.outer(self.intervals, frequencies)))
+        gain = np.abs(2 * np.sin(math.pi * np.multiply.outer(self.record.intervals, frequencies)))
         return np.asarray(gain.max(0) < MIN_GAIN)
 
     def found(self) -> tuple[list[float], float | None]:
         """Frequencies of the tones, strongest first, and that of another tone that explains as much as one of them."""
         found: list[float] = []
-        other, step, count = None, self.tried[0], (self.weights > 0).sum()
-        left = self.tried[~self.is_blind(self.tried)]
+        other, step, count = None, self.record.tried[0], (self.weights > 0).sum()
+        left = self.record.tried[~self.is_blind(self.record.tried)]
         while len(found) < MAX_TONES and len(left):
             # 1. The tone that explains most beside those before, with its frequency to a tenth of a step.
             basis = np.linalg.qr(self.columns(found))[0]
@@ -143,7 +178,7 @@ class _AxisOffsets:
             powers = self._explained(near, basis, data)
             frequency, most = float(near[powers.argmax()]), float(powers.max())
             # 2. Is it significant, and large enough?
-            size = 2 * len(self.knots)
+            size = 2 * len(self.record.knots)
             noise = max((float(data @ data) - most) / max(count - size * (len(found) + 1.5), 1), 1e-300)
             is_large = math.sqrt(most / max(self.weights.sum(), 1e-300)) > _MIN_SIZE
             if not (is_large and most > _MIN_EXPLAINED * size * noise):
@@ -157,7 +192,7 @@ class _AxisOffsets:
                 other = float(left[apart][power[apart].argmax()])
             found.append(frequency)
             # 4. What is left out of a tone looks like tones that are a multiple of the frame rate apart from it.
-            interval = float(np.median(self.intervals))
+            interval = float(np.median(self.record.intervals))
             for sign in (-1, 1):
                 turns = (left - sign * frequency) * interval
                 left = left[np.abs(turns - turns.round()) > 2 * step * interval]
@@ -167,15 +202,15 @@ class _AxisOffsets:
         """(F,) decrease of the squares of data by a tone beside the columns of a basis."""
         powers = []
         for frequency in frequencies:
-            added = self.columns([frequency])[:, len(self.knots) :]
+            added = self.columns([frequency])[:, len(self.record.knots) :]
             added = np.linalg.qr(added - basis @ (basis.T @ added))[0]
             powers.append(np.square(added.T @ data).sum())
         return np.array(powers)
 
-    def tones(self, averaged: Sequence[float]) -> tuple[ChangingTones, Array]:
-        """The tones, whose offsets are averaged over some times in s, and the offsets (N,) that they explain."""
+    def tones(self) -> tuple[ChangingTones, Array]:
+        """The tones, and the offsets (N,) that they explain."""
         found, other = self.found()
-        frequencies, count = np.array(found), len(self.knots)
+        frequencies, count = np.array(found), len(self.record.knots)
         for last in (False, False, True):
             columns = self.columns(frequencies)
             solved = np.linalg.lstsq(columns, self.data, rcond=None)[0]
@@ -183,9 +218,9 @@ class _AxisOffsets:
             coefficients = parts[:, 0] + 1j * parts[:, 1]
             if not last:  # what turns the phase from knot to knot belongs to the frequency
                 turn = np.angle((coefficients[:, 1:] * coefficients[:, :-1].conj()).sum(1))
-                frequencies = frequencies + turn / (2 * math.pi * (self.knots[1] - self.knots[0]))
-        kept = np.prod([np.sinc(frequencies * seconds) for seconds in averaged], 0)
+                frequencies = frequencies + turn / (2 * math.pi * (self.record.knots[1] - self.record.knots[0]))
+        kept = np.prod([np.sinc(frequencies * seconds) for seconds in self.record.averaged], 0)
         coefficients = coefficients / np.maximum(kept, 0.1)[:, None]
         explained = columns @ solved / np.sqrt(np.maximum(self.weights, 1e-300))
-        tones = ChangingTones(self.knots, frequencies, coefficients, solved[:count], other)
+        tones = ChangingTones(self.record.knots, frequencies, coefficients, solved[:count], other)
         return tones, np.where(self.weights > 0, explained, 0.0)

@@ -29,7 +29,7 @@ from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FollowOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones
+from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, missing_tones
 from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
@@ -109,16 +109,19 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
     step = steps(2 * number, "frames")
     forwards = _tracked(images, starts, rows, tones, options.columns, step)
     backwards = _tracked(images.flip(0, 1), -ends[::-1], rows, _reversed(tones), options.columns, step)[::-1]
-    # 2. What they agree on, at each frame and axis.
+    # 2. Tones that the measured rows show, and that are not followed.
+    measured = [(one.time, one.measurements) for one in forwards if one is not None]
+    others = [one.other for one in tones]
+    if measured:
+        missing = missing_tones(tones, measured, starts, rows, _BANDS.band_rows)
+        others = [other or another for other, another in zip(others, missing, strict=True)]
+    # 3. What they agree on, at each frame and axis.
     known = [
         (_at_frame(first, start, start, rows, height, 1), _at_frame(second, start, end, rows, height, -1))
         for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
     ]
     judged = [
-        [
-            _judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], tones[axis].other)
-            for axis in range(2)
-        ]
+        [_judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], others[axis]) for axis in range(2)]
         for both in known
     ]
     findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
