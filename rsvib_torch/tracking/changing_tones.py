@@ -8,13 +8,14 @@ few frames of a tone that decays do not.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN
@@ -27,7 +28,9 @@ from rsvib_torch.options import MAX_TONES, RegistrationOptions
 _KNOT_FRAMES = 8  # frame periods between knots: a tone that decays to a third within them is straight to 5 % of it
 _STEPS = 3.0  # frequencies that are tried for each inverse distance of the knots
 _MIN_EXPLAINED = 14.0  # decrease of chi-square for each parameter of a tone: that of noise stays below
-_MIN_SIZE = 0.02  # px, rms of the offsets by a tone: smaller ones may be errors of the registration
+# px, rms of the offsets by a tone: smaller ones may be errors of the registration, and of rows that are measured around
+# a motion that is known less well
+_MIN_SIZE, _MIN_SIZE_OF_ROWS = 0.02, 0.05
 _MIN_BETTER = 25.0  # decrease of chi-square by which a tone must be better than one at another frequency
 
 
@@ -48,6 +51,21 @@ class ChangingTones:
     coefficients: Array
     velocity: Array
     other: float | None
+
+    def missing(self, found: "ChangingTones", slowest: float) -> float | None:
+        """Hz, the frequency of a tone of ``found`` above ``slowest`` that is none of these; None if there is none.
+
+        Tones that are much larger than these are drifts, and much smaller ones errors of the measurement.
+        """
+        step = 2 / (_STEPS * (self.knots[1] - self.knots[0]))
+        largest = np.abs(self.coefficients).mean(1).max(initial=0.0)
+        for frequency, size in zip(
+            found.frequencies.tolist(), np.abs(found.coefficients).mean(1).tolist(), strict=True
+        ):
+            is_known = bool((np.abs(self.frequencies - frequency) < step).any())
+            if not is_known and max(0.05 * largest, 0.03) < size < 3.0 * largest:
+                return float(frequency)
+        return None
 
     def at(self, time: float) -> tuple[Array, float]:
         """``C_k exp(2 pi i f_k t)`` in px and the velocity in px/s at a time in s."""
@@ -80,29 +98,21 @@ def changing_tones(stack: GreyFrames, bands: RegistrationOptions) -> tuple[Chang
     return _AxisOffsets(shifted, offsets[:, 0], weights[:, 0], record).tones()[0], along_scan
 
 
-def missing_tones(
-    tones: Sequence[ChangingTones],
-    measured: Sequence[tuple[float, Measurements]],
-    starts: Array,
-    rows: RowTiming,
-    band_rows: int,
-) -> list[float | None]:
-    """For each axis, the frequency of a tone that the measured rows of a record show, and that is none of its tones.
+def tones_of_rows(
+    measured: Sequence[tuple[float, Measurements]], starts: Array, rows: RowTiming, band_rows: int
+) -> list[ChangingTones]:
+    """The tones of both axes from measured rows, which are ten times as accurate as bands.
 
-    Rows are measured ten times as accurately as bands, around the tones that a tracker follows. ``measured`` has the
-    start of frames and the displacements of their rows and of those of the frame before; ``starts`` of all frames.
+    ``measured`` has the start of frames and the displacements of their rows and of those of the frame before;
+    ``starts`` those of all frames.
     """
     times = np.concatenate([start + one.exposure_starts[0] + 0.5 * one.exposure_time for start, one in measured])
     offsets = np.concatenate([np.diff(one.displacements[0], axis=1)[:, 0] for _, one in measured])
     used = [one.weights[0] * one.independent * (one.num_differences[0] > 0)[:, None] for _, one in measured]
     record, weights = _Record.of(starts, rows, band_rows), np.concatenate(used)
-    missing: list[float | None] = []
-    for axis, known in enumerate(tones):
-        found, _ = _AxisOffsets(times, offsets[:, axis], weights[:, axis], record).found()
-        step = 2 * record.tried[0]
-        others = [one for one in found if not (np.abs(known.frequencies - one) < step).any()]
-        missing.append(others[0] if others else None)
-    return missing
+    averaged = (rows.exposure_time, BLOCK_ROWS * rows.row_time)
+    record = replace(record, averaged=averaged, smallest=_MIN_SIZE_OF_ROWS)
+    return [_AxisOffsets(times, offsets[:, axis], weights[:, axis], record).tones()[0] for axis in range(2)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +123,7 @@ class _Record:
     intervals: Array  # s, between the frames
     tried: Array  # (F,) Hz
     averaged: tuple[float, float]  # s, over which exposure and band average
+    smallest: float = _MIN_SIZE  # px
 
     @classmethod
     def of(cls, starts: Array, rows: RowTiming, band_rows: int) -> Self:
@@ -120,7 +131,10 @@ class _Record:
         end = starts[-1] + float(np.median(np.diff(starts)))
         knots = np.linspace(starts[0], end, 2 + round(len(starts) / _KNOT_FRAMES))
         averaged = (rows.exposure_time, band_rows * rows.row_time)
-        tried = np.arange(0.0, 0.5 / averaged[1], 1 / (_STEPS * (knots[1] - knots[0])))[1:]
+        # below two periods between knots, a tone is not distinguished from a drift
+        tried = np.arange(2 * _STEPS, 0.5 * _STEPS * (knots[1] - knots[0]) / averaged[1]) / (
+            _STEPS * (knots[1] - knots[0])
+        )
         return cls(knots, np.diff(starts), tried, averaged)
 
 
@@ -167,7 +181,8 @@ class _AxisOffsets:
     def found(self) -> tuple[list[float], float | None]:
         """Frequencies of the tones, strongest first, and that of another tone that explains as much as one of them."""
         found: list[float] = []
-        other, step, count = None, self.record.tried[0], (self.weights > 0).sum()
+        other, count = None, (self.weights > 0).sum()
+        step = 1 / (_STEPS * (self.record.knots[1] - self.record.knots[0]))
         left = self.record.tried[~self.is_blind(self.record.tried)]
         while len(found) < MAX_TONES and len(left):
             # 1. The tone that explains most beside those before, with its frequency to a tenth of a step.
@@ -180,7 +195,7 @@ class _AxisOffsets:
             # 2. Is it significant, and large enough?
             size = 2 * len(self.record.knots)
             noise = max((float(data @ data) - most) / max(count - size * (len(found) + 1.5), 1), 1e-300)
-            is_large = math.sqrt(most / max(self.weights.sum(), 1e-300)) > _MIN_SIZE
+            is_large = math.sqrt(most / max(self.weights.sum(), 1e-300)) > self.record.smallest
             if not (is_large and most > _MIN_EXPLAINED * size * noise):
                 break
             apart = np.abs(left - frequency) > 3 * step
@@ -191,6 +206,7 @@ class _AxisOffsets:
             if apart.any() and most - power[apart].max() < _MIN_BETTER * noise:
                 other = float(left[apart][power[apart].argmax()])
             found.append(frequency)
+            left = left[np.abs(left - frequency) > 4 * step]
             # 4. What is left out of a tone looks like tones that are a multiple of the frame rate apart from it.
             interval = float(np.median(self.record.intervals))
             for sign in (-1, 1):

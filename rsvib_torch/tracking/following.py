@@ -29,11 +29,13 @@ from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FollowOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, missing_tones
+from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, tones_of_rows
 from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
 _BANDS = RegistrationOptions()
+_SLOWEST = 1.25  # frame rates; slower tones are not distinguished from a drift that changes, which trackers follow
+_BEGIN = 3  # frames at the start of a tracker, whose rows are measured around a less accurate motion
 _TONE = ("amplitude", "frequency", "phase")
 _DRIFT = ("image_motion", "image_acceleration")
 _ACROSS = (1.0, -1.0)  # sign of displacements along and across the rows if rows are read backwards
@@ -87,6 +89,9 @@ class _AxisAtFrame:
         return float(self.std["displacement"])
 
 
+_Judged = tuple[_AxisAtFrame | None, tuple[Reason, ...]]
+
+
 def follow_vibration(frames: FramesOrFiles, timing: SensorTiming, options: FollowOptions) -> FollowedVibration:
     """Follow the vibration through B stacks: ``detect_vibration(follow=True)``."""
     stacks = grey_frames(frames, timing, options)
@@ -102,30 +107,46 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
     number, height = stack.images.shape[1:3]
     starts = table(stack.timing.in_row_order().frame_starts(number))
     rows = replace(stack.timing.in_row_order(), frame_start_times=None)
-    # 1. Both trackers. Backwards, a frame begins with the end of its last row.
-    tones = changing_tones(stack, _BANDS)
     images = stack.images[0] if stack.valid is None else stack.images[0].masked_fill(~stack.valid[0], math.nan)
     ends = starts + (height - 1) * rows.row_time + rows.exposure_time
-    step = steps(2 * number, "frames")
-    forwards = _tracked(images, starts, rows, tones, options.columns, step)
-    backwards = _tracked(images.flip(0, 1), -ends[::-1], rows, _reversed(tones), options.columns, step)[::-1]
-    # 2. Tones that the measured rows show, and that are not followed.
-    measured = [(one.time, one.measurements) for one in forwards if one is not None]
-    others = [one.other for one in tones]
-    if measured:
-        missing = missing_tones(tones, measured, starts, rows, _BANDS.band_rows)
-        others = [other or another for other, another in zip(others, missing, strict=True)]
-    # 3. What they agree on, at each frame and axis.
-    known = [
-        (_at_frame(first, start, start, rows, height, 1), _at_frame(second, start, end, rows, height, -1))
-        for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
-    ]
-    judged = [
-        [_judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], others[axis]) for axis in range(2)]
-        for both in known
-    ]
-    findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
-    return _assembled([[best for best, _ in of_frame] for of_frame in judged], findings, starts, stack)
+    tones: Sequence[ChangingTones] = changing_tones(stack, _BANDS)
+    best: tuple[int, list[list[_Judged]], list[list[tuple[Reason, ...]]]] = (-1, [], [])
+    for last in (False, True):
+        # 1. Both trackers. Backwards, a frame begins with the end of its last row.
+        step = steps(2 * number, "frames")
+        forwards = _tracked(images, starts, rows, tones, options.columns, step)
+        backwards = _tracked(images.flip(0, 1), -ends[::-1], rows, _reversed(tones), options.columns, step)[::-1]
+        # 2. The measured rows may show tones that bands do not, and decide between tones.
+        measured = [(one.time, one.measurements) for one in forwards if one is not None][_BEGIN:]
+        found = tones_of_rows(measured, starts, rows, _BANDS.band_rows) if measured else tones
+        slowest = _SLOWEST * rows.frame_rate
+        missing = [known.missing(one, slowest) for known, one in zip(tones, found, strict=True)]
+        others = [
+            frequency or (known.other and one.other)
+            for known, one, frequency in zip(tones, found, missing, strict=True)
+        ]
+        # 3. What both trackers agree on, at each frame and axis.
+        known = [
+            (_at_frame(first, start, start, rows, height, 1), _at_frame(second, start, end, rows, height, -1))
+            for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
+        ]
+        judged = [
+            [
+                _judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], others[axis])
+                for axis in range(2)
+            ]
+            for both in known
+        ]
+        findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
+        reliable = sum(not of_axis for of_frame in findings for of_axis in of_frame)
+        if reliable > best[0]:
+            best = (reliable, judged, findings)
+        # 4. Once more, with the tones that are missing.
+        if last or missing == [None, None]:
+            break
+        tones = [known if one is None else other for known, other, one in zip(tones, found, missing, strict=True)]
+    _, judged, findings = best
+    return _assembled([[one for one, _ in of_frame] for of_frame in judged], findings, starts, stack)
 
 
 def _reversed(tones: Sequence[ChangingTones]) -> list[ChangingTones]:
