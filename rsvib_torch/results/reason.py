@@ -318,7 +318,7 @@ _FOLLOWED = {
         "in {value:.0%} of the frames the rows contradict the tones, {limit:.0%} are allowed: tones are missing",
         "use more frames, or frames at shorter intervals",
         "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ or "
-        "not_followed, above 5 %",
+        "not_followed, above 7 %",
     ),
     "other_tone": ReasonKind(
         "a tone of {frequency:.4g} Hz explains the frames as well",

@@ -30,7 +30,7 @@ _STEPS = 3.0  # frequencies that are tried for each inverse distance of the knot
 _MIN_EXPLAINED = 14.0  # decrease of chi-square for each parameter of a tone: that of noise stays below
 # px, rms of the offsets by a tone: smaller ones may be errors of the registration, and of rows that are measured around
 # a motion that is known less well
-_MIN_SIZE, _MIN_SIZE_OF_ROWS = 0.02, 0.05
+_MIN_SIZE, _MIN_SIZE_OF_ROWS = 0.02, 0.1
 _MIN_BETTER = 25.0  # decrease of chi-square by which a tone must be better than one at another frequency
 
 

@@ -45,7 +45,7 @@ _SIZE_STD, _FREQUENCY_STD = 0.2, 0.2  # of the amplitude, and Hz, of the tones o
 _MAX_APART = (0.01, 0.03, 4.0)
 # Part of the frames whose rows contradict the tones of an axis: with more, tones are missing or wrong in all frames. Of
 # 16 axes with two tones that decay, 4 had wrong displacements in frames whose rows do not contradict them.
-_MAX_CONTRADICTED = 0.05
+_MAX_CONTRADICTED = 0.07
 _CONTRADICTED = {"rows_unexplained", "neighbours_unexplained", "halves_apart", "directions_differ", "not_followed"}
 
 
