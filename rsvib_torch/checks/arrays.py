@@ -12,8 +12,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import check_tensor
 from rsvib_torch.checks.values import check_choice
 
-Array = NDArray[Any]
-ArrayLike = Tensor | Array
+ArrayLike = Tensor | NDArray[Any]
 FramesLike = ArrayLike | Sequence[ArrayLike]
 Channels = Literal["first", "last"] | None
 

@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, PPoly
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
@@ -14,9 +16,6 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import MAX_SAMPLES
 from rsvib_torch.results.presentation import Result
 from rsvib_torch.text import text_table
-
-if TYPE_CHECKING:
-    from scipy.interpolate import PPoly
 
 Array = NDArray[np.float64]
 
@@ -94,10 +93,8 @@ class AngularRates(
         return "\n".join([head, table, *([self.source] if self.source else [])])
 
     @cached_property
-    def _integrals(self) -> tuple["PPoly", "PPoly"]:
+    def _integrals(self) -> tuple[PPoly, PPoly]:
         """Integrals of the rates, and of (integral x rates), as splines of the time."""
-        from scipy.interpolate import CubicSpline  # noqa: PLC0415
-
         times, rates = self.times.cpu().numpy(), self.rates.cpu().numpy()
         angle = CubicSpline(times, rates).antiderivative()
         return angle, CubicSpline(times, np.cross(angle(times), rates)).antiderivative()
@@ -122,8 +119,6 @@ class AngularRates(
 
         Rotations from sample to sample are composed without approximation.
         """
-        from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
         reference = check_number("reference", reference)
         steps = Rotation.from_rotvec(self.rotation(self.times[:-1], self.times[1:]).cpu().numpy())
         turned = _running_product(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], steps.as_quat()]))
@@ -137,8 +132,6 @@ class AngularRates(
 
 def _running_product(quaternions: Array) -> Array:
     """Products (N, 4) of the first 1 ... N rotations (scalar last), in log2 N steps of a parallel prefix scan."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
     reach = 1
     while reach < len(quaternions):
         later = Rotation.from_quat(quaternions[:-reach]) * Rotation.from_quat(quaternions[reach:])

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
+from rsvib_torch.numerics.tables import Array
 
 Read = Callable[[int, int], Array]
 

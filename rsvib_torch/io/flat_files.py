@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from rsvib_torch.checks.arrays import Array, channels_appear_last
+from rsvib_torch.checks.arrays import channels_appear_last
 from rsvib_torch.checks.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
+from rsvib_torch.numerics.tables import Array
 
 
 def open_npy(path: Path) -> BlockReader:

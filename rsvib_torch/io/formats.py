@@ -10,9 +10,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.files.reading import Table, check_regular
 from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, StackInfo
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import quoted
 
 Frame = Array

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.checks.values import check_number
+from rsvib_torch.numerics.tables import Array
 
 
 def check_dtype(dtype: np.dtype) -> None:

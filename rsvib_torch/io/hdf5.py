@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
@@ -18,6 +17,7 @@ from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
+from rsvib_torch.numerics.tables import Array
 
 _DATASET = "frames"  # name of the dataset that is written
 _MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms

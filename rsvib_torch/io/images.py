@@ -19,13 +19,13 @@ from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile, putchunk
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag, readable_stack
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
 from rsvib_torch.io.time_metadata import exif_fields, merged_times
+from rsvib_torch.numerics.tables import Array
 
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
 _LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032

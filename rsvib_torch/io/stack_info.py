@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from rsvib_torch.checks.arguments import check_fields, checked_methods
-from rsvib_torch.checks.arrays import Array
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.text import one_line
 

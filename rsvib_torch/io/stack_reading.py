@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Array, FramesLike
+from rsvib_torch.checks.arrays import FramesLike
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.blocks import part_reader
 from rsvib_torch.io.formats import find_format
 from rsvib_torch.io.full_scale import counts_to_frames, full_scale_of_counts
 from rsvib_torch.io.stack_info import FrameReader, StackInfo, split_range
+from rsvib_torch.numerics.tables import Array
 
 PathLike = str | os.PathLike[str]
 FramesOrFiles = FramesLike | PathLike | Sequence[PathLike]

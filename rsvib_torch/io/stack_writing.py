@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.checks.arrays import Array, Channels, FramesLike, as_tensor, channel_axis
+from rsvib_torch.checks.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_target, check_tree, check_writable, whole
@@ -17,6 +17,7 @@ from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike
+from rsvib_torch.numerics.tables import Array
 
 
 def stack_files(path: PathLike) -> list[Path]:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import tifffile
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.array_attributes import attributes_of
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
@@ -18,6 +17,7 @@ from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.io.time_metadata import orientation_of, tiff_times
+from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
 _LOSSLESS = {1, 5, 8, 32946, 32773, 34925, 50000}  # none, LZW, Deflate (two codes), PackBits, LZMA, Zstandard

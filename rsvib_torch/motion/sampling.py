@@ -8,11 +8,11 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
 
 # Columns at which displacements that differ along a row are computed; a polynomial interpolates them. Without a camera,
 # the displacement is linear along a row, up to the motion between its rows. With one, for 2048 columns, 60 degrees and

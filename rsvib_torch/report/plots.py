@@ -19,7 +19,6 @@ from torch.nn import functional
 
 from rsvib_torch import detection, gyroscope
 from rsvib_torch.checks.arguments import check_shapes, checks_arguments
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.checks.validation import Count
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.detection import DetectionResult
@@ -33,6 +32,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration, blind_frequencies
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 from rsvib_torch.results.figures import FIGURES

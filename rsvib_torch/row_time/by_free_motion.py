@@ -16,7 +16,7 @@ from scipy import linalg
 from rsvib_torch.detection.shapes.free import normal_bands
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.splines import spline_taps
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.row_time.joint_fit import FramePlaces
 from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
 
@@ -109,28 +109,26 @@ class _Problem:
         """Splines of both axes at a row time, with knots about ``spacing`` apart."""
         # 1. The coefficients that each row depends on.
         record = self.records[0]
-        rows, seen = table(record.rows), table(record.visible)
-        times = table(record.frames) * self.period + rows * row_time
+        times = record.frames * self.period + record.rows * row_time
         first, last = float(times.min()), float(times.max())
         cells = max(1, math.ceil((last - first) / spacing))
         grid = first, (last - first) / cells, cells + DEGREE
         index, basis = spline_taps(times, *grid, degree=DEGREE)
         _, slope = spline_taps(times, *grid, degree=DEGREE, derivative=1)
-        weights = np.stack([table(one.weights) for one in self.records])
-        bands = normal_bands(index, basis, seen, weights, cells + DEGREE)
+        weights = np.stack([one.weights for one in self.records])
+        bands = normal_bands(index, basis, record.visible, weights, cells + DEGREE)
         cost, step, information = 0.0, 0.0, 0.0
         for one, weight, band in zip(self.records, weights[..., None], bands, strict=True):
             # 2. The spline.
             band[0] += 1e-10 * band[0].mean() + 1e-300
             factor = linalg.cholesky_banded(band, lower=True, check_finite=False)
-            solution, residual = _fitted(table(one.values), one, index, basis, factor)
+            solution, residual = _fitted(one.values, one, index, basis, factor)
             # 3. The change of the displacements by the row time that no change of the coefficients cancels.
-            by_row_time = table(one.relative(tensor((slope * solution[index]).sum(-1) * rows)))
+            by_row_time = one.relative((slope * solution[index]).sum(-1) * record.rows)
             _, unexplained = _fitted(by_row_time, one, index, basis, factor)
-            independent = float(one.independent)
-            cost += float((weight * np.square(residual)).sum()) * independent
-            step += float((weight * unexplained * residual).sum()) * independent
-            information += float((weight * np.square(unexplained)).sum()) * independent
+            cost += float((weight * np.square(residual)).sum()) * one.independent
+            step += float((weight * unexplained * residual).sum()) * one.independent
+            information += float((weight * np.square(unexplained)).sum()) * one.independent
         information = max(information, 1e-300)
         return _Evaluation(cost, 2 * (cells + DEGREE), step / information, information)
 
@@ -153,7 +151,7 @@ def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor
     Displacements depend on coefficients ``index`` (N, G, M) by the factors ``basis``; ``factor`` is the banded Cholesky
     factor of the normal matrix.
     """
-    weighted = table(record.weights)[:, None, None] * values[..., None]
+    weighted = record.weights[:, None, None] * values[..., None]
     right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
     solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)
-    return solution, values - table(record.relative(tensor((basis * solution[index]).sum(-1))))
+    return solution, values - record.relative((basis * solution[index]).sum(-1))

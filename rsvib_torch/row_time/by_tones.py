@@ -19,7 +19,7 @@ from rsvib_torch.detection.tones.selection import robust_fit
 from rsvib_torch.detection.verdict import residual_reasons, with_remedy
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.numerics.tables import Array, table
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
@@ -131,7 +131,9 @@ def row_time_of_tones(
 
 def _possible(tones: list[RowTones], clock: CameraClock, direction: float = 1.0) -> list[Candidate]:
     """Row times that agree with the tones of frames whose rows are in an assumed readout order, the best first."""
-    frequencies, covariances = (torch.cat(values) for values in zip(*(one.frequencies() for one in tones), strict=True))
+    frequencies, covariances = (
+        np.concatenate(values) for values in zip(*(one.frequencies() for one in tones), strict=True)
+    )
     found = candidates(frequencies, covariances, clock.period, clock.low, clock.high)
     found = [replace(one, row_time=direction * one.row_time) for one in found]
     return [one for one in found if clock.allows(one.row_time)]
@@ -147,7 +149,7 @@ def _tones_at(tones: list[RowTones], row_time: float, period: float) -> tuple[Ar
     frequencies = np.zeros((1, 2, count))
     active = np.zeros_like(frequencies, dtype=bool)
     for axis, one in enumerate(tones):
-        nu, phi = table(one.tones[:, 2:]).T
+        nu, phi = one.tones[:, 2:].T
         frequencies[0, axis, : len(nu)] = np.abs(phi + (nu * period / row_time - phi).round()) / period
         active[0, axis, : len(nu)] = True
     return frequencies, active
@@ -222,12 +224,12 @@ def _row_tones(places: FramePlaces, fit: ToneFit, axis: int, row_time: float, cl
     coefficients, frequencies = fit.coefficients[0, axis][active], fit.frequencies[0, axis][active]
     # the record of ``fit`` has another middle than that of the rows
     record = places.of_axis(axis, clock.num_rows, row_time)
-    middle = places.frames[0] * clock.period + places.rows[0] * row_time - table(record.frames) * clock.period
-    middle = (middle - table(record.rows) * row_time).mean() + 0.5 * places.measurements.exposure_time
+    middle = places.frames[0] * clock.period + places.rows[0] * row_time - record.frames * clock.period
+    middle = (middle - record.rows * row_time).mean() + 0.5 * places.measurements.exposure_time
     turned = coefficients * np.exp(2j * math.pi * frequencies * (middle - fit.centre))
     turned = turned * np.sinc(frequencies * places.measurements.exposure_time)
     tones = np.stack([turned.real, turned.imag, frequencies * row_time, frequencies * clock.period], -1)
-    return fit_row_tones(record, tensor(np.concatenate([tones.ravel(), fit.drift[0, axis, :1] * clock.period])))
+    return fit_row_tones(record, np.concatenate([tones.ravel(), fit.drift[0, axis, :1] * clock.period]))
 
 
 def _exposure(other: OtherMotion, timing: RowTiming) -> tuple[float, float] | None:

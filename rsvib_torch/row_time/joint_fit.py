@@ -42,11 +42,11 @@ class FramePlaces:
         measured = self.measurements
         frames = self.frames[0] - 0.5 * (self.frames.min() + self.frames.max())
         return RowRecord(
-            tensor(self.rows[0] - 0.5 * (num_rows - 1)),
-            tensor(frames),
-            tensor(measured.displacements[0, ..., axis]),
-            tensor(measured.visible[0]),
-            tensor(measured.inverse_variances[0, :, axis]),
+            self.rows[0] - 0.5 * (num_rows - 1),
+            frames,
+            measured.displacements[0, ..., axis],
+            measured.visible[0],
+            measured.inverse_variances[0, :, axis],
             float(np.squeeze(measured.independent)),
             row_time / self.period,
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq, least_squares
 
-from rsvib_torch.checks.arrays import Array
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.row_time.flicker import deviations, unexplained
 
 _MAX_MISFIT = 0.3  # largest root mean square of the residuals over the brightness

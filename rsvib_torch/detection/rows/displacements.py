@@ -16,16 +16,14 @@ from typing import Literal
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
+from rsvib_torch.detection.rows.warping import Positions, differently_blurred, second_moments, warp_to_scene
 from rsvib_torch.execution.chunking import chunks, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count, rows_showing, shown_by_tones
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.numerics.fourier import extend_rows, fast_length
 from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.registration.gradients import (
@@ -35,7 +33,7 @@ from rsvib_torch.registration.gradients import (
     row_equations,
     row_gradients,
 )
-from rsvib_torch.registration.row_spectra import EVERY, MARGIN, RowSpectra, column_pattern, overlapping
+from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, overlapping
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
 _MIN_OVERLAP = 0.5  # part of a frame that all frames of a group contain
@@ -77,49 +75,6 @@ class FrameGroups:
         return replace(self, spectra=self.spectra.stacks(index), starts=self.starts[index])
 
 
-@dataclass(frozen=True, eq=False)
-class _Positions:
-    """Where the frames of a group contain scene rows."""
-
-    scene_rows: Tensor  # (B, 1, S) scene rows s
-    columns: Tensor  # (B, 1, 1) px, displacement along the rows that is common to the group and is not taken out
-    rows: Tensor  # (B, G, S) frame rows that contain the scene rows
-    shift: Tensor  # (B, G, S) px, displacement along the rows to be taken out
-    exposure_starts: Tensor  # (B, G, S) s, exposure starts of the frame rows
-
-    @classmethod
-    def of(cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1) -> "_Positions":
-        """Positions of every ``step``-th row of the scene that the middle of a group contains.
-
-        ``starts`` (B, G) are the exposure starts in s of the first rows of the frames, ``motion`` is that of each
-        group.
-        """
-        rows = torch.arange(0, height, step, dtype=torch.float64, device=starts.device)
-        # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
-        middle = starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
-        travelled = motion.drift(middle).round()[:, :, None]  # (B, 1, 1, 2)
-        return cls.of_rows(rows - travelled[..., 1], travelled[..., 0], starts[..., None], timing, motion)
-
-    @classmethod
-    def of_rows(
-        cls, scene_rows: Tensor, columns: Tensor, starts: Tensor, timing: RowTiming, motion: Motion
-    ) -> "_Positions":
-        """Positions of given scene rows in frames that start at ``starts`` (B, G, 1)."""
-        if isinstance(motion, Vibration):
-            rows, along = shown_by_tones(scene_rows, starts, timing, motion)
-        else:
-            rows = rows_showing(scene_rows, starts, timing, motion)
-            along = motion.mean_displacement(starts + rows * timing.row_time, timing.exposure_time)[..., 0]
-        return cls(scene_rows, columns, rows, along - columns, starts + rows * timing.row_time)
-
-    def visible(self, height: int, block: int) -> Tensor:
-        """(B, G, S) float64, 1 for blocks of scene rows that lie inside a frame of ``height`` rows, else 0."""
-        blocks = self.rows.shape[-1] // block
-        inside = ((self.rows >= MARGIN) & (self.rows <= height - 1 - MARGIN)).double()
-        whole = inside[..., : blocks * block].unflatten(-1, (blocks, block)).amin(-1)
-        return functional.pad(whole.repeat_interleave(block, dim=-1), (0, self.rows.shape[-1] - blocks * block))
-
-
 # Groups of frames
 
 
@@ -156,23 +111,23 @@ def frame_groups(
     timing: RowTiming,
     motion: Motion,
     *,
-    pairs_if_blurred_differently: bool = False,
+    pairs: bool = False,
     one_at_a_time: bool = False,
 ) -> list[FrameGroups]:
     """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
 
-    An image motion limits how many frames contain the same part of the scene. ``pairs_if_blurred_differently``: form
-    pairs if exposures blur the frames differently, because only the blur of two frames can be equalised. Pairs are
-    enough for a tone; a free motion needs all frames that contain a row. As many groups as fit in the cache are
-    measured together, unless ``one_at_a_time``.
+    An image motion limits how many frames contain the same part of the scene. ``pairs``: form pairs if exposures blur
+    the frames very differently, because only the blur of two frames can then be equalised. Pairs are enough for a tone;
+    a free motion needs all frames that contain a row. As many groups as fit in the cache are measured together, unless
+    ``one_at_a_time``.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
     travelled = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     fraction = float((travelled / travelled.new_tensor([spectra.width, spectra.height])).amax())
     most = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - _MIN_OVERLAP) // max(fraction, 1e-9))))
-    if pairs_if_blurred_differently:
-        most = 2 if bool(differently_blurred(starts, spectra.height, timing, motion).any()) else most
+    if pairs and bool(differently_blurred(starts, spectra.height, timing, motion)[1].any()):
+        most = 2
     number = max(1, math.ceil((count - 1) / (most - 1)))
     # Groups of equal size follow each other, so that they are measured together.
     steps_of_group, longer = divmod(count - 1, number)
@@ -202,9 +157,9 @@ def measure_group(
     differs by much less than a pixel are given; they are returned with the measurements, for the next call.
     """
     spectra, motion = group.spectra_of_groups, group.motion_of_groups(motion)
-    positions = _Positions.of(group.starts_of_groups, spectra.height, timing, motion)
+    positions = Positions.of(group.starts_of_groups, spectra.height, timing, motion)
     visible = positions.visible(spectra.height, BLOCK_ROWS)
-    warp = _warp_to_scene(spectra, positions, timing, motion)
+    warp = warp_to_scene(spectra, positions, timing, motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     if gradients is None:
         gradients = row_gradients(spectra, warp, runs_of_rows, positions.rows, positions.shift, visible)
@@ -254,14 +209,14 @@ def measure_strips(
         gradients: As in ``measure_group``.
     """
     spectra, count = group.spectra, len(strips.firsts)
-    positions = _Positions.of(group.starts, spectra.height, timing, of_strips)
+    positions = Positions.of(group.starts, spectra.height, timing, of_strips)
 
     def over_strips(values: Tensor) -> Tensor:
         split: Tensor = values.unflatten(0, (-1, count))
         return split
 
     visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
-    warp = _warp_to_scene(spectra, positions, timing, of_strips)
+    warp = warp_to_scene(spectra, positions, timing, of_strips)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     length = fast_length(strips.frame_width + 64)
 
@@ -426,7 +381,7 @@ def column_pattern_of(
     parts = []
     for group, of_group in zip(groups, gradients, strict=True):
         starts, of_groups = group.starts_of_groups, group.motion_of_groups(motion)
-        positions = _Positions.of(starts, group.spectra.height, timing, of_groups, EVERY)
+        positions = Positions.of(starts, group.spectra.height, timing, of_groups, EVERY)
         visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
         variance = of_group.variance[:, ::EVERY]
         parts.append((group.spectra_of_groups, positions.rows, positions.shift, visible, variance))
@@ -486,32 +441,7 @@ def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -
     return residual, noise, regular.all(-1)
 
 
-# Frames that are blurred differently
-
-
-def _paths(exposure_starts: Tensor, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
-    """Paths (B, G, S, N, 2) in px about their means during exposures from ``exposure_starts``, and weights (N,)."""
-    # two thirds of the nodes of the restoration: an accuracy of 1e-3 is enough for images that are blurred twice
-    count = math.ceil(2 / 3 * gauss_node_count(motion, timing.exposure_time))
-    path, weights = exposure_trajectory(motion, exposure_starts, timing, "gauss", count)
-    weights = weights.to(path)
-    return path - (path * weights[:, None]).sum(-2, keepdim=True), weights
-
-
-def _second_moments(paths: Tensor, weights: Tensor) -> Tensor:
-    """Second moments (B, G, S, 2, 2) in px^2 of paths from ``_paths``."""
-    return torch.einsum("bgsni,bgsnj,n->bgsij", paths, paths, weights)
-
-
-def _different(paths: Tensor, weights: Tensor) -> Tensor:
-    """(B,) bool, whether exposures with paths from ``_paths`` blur the same scene row differently."""
-    paths = paths[:, :, ::8]
-    third = torch.einsum("bgsn,bgsni->bgsi", paths.square().sum(-1) * weights, paths)
-    moments = torch.cat([paths.flatten(-2), _second_moments(paths, weights).flatten(-2), third], -1)
-    # px, px^2 and px^3; third moments of this size displace fine detail by 0.001 px
-    limits = moments.new_tensor([0.5] * 2 * len(weights) + [0.03] * 4 + [0.0024] * 2)
-    return ((moments.amax(1) - moments.amin(1)) > limits).flatten(1).any(1)
-
+# Contradictions of the exposure time
 
 _SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
 
@@ -536,7 +466,7 @@ def blur_ratio(
     for group in groups:
         # 1. Coarse detail of the warped frames, and the second moments of the paths.
         of_groups = group.motion_of_groups(motion)
-        positions = _Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
+        positions = Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
         u = group.spectra.frequencies
         low = slice(int((u <= 1 / 64).sum()), int((u < highest).sum()))  # shading affects frequencies below 1/64
         low_spectra = group.spectra.band(low).in_groups(group.count)
@@ -547,7 +477,7 @@ def blur_ratio(
             return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
 
         spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
-        moments = averaged(_second_moments(*_paths(positions.exposure_starts, timing, of_groups)))
+        moments = averaged(second_moments(positions.exposure_starts, timing, of_groups))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
         mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
@@ -589,91 +519,3 @@ def blur_ratio(
     scores = products[:, :, :2, 2] - (products[:, :, :2, :2] @ solution[:, None, :, None])[..., 0]
     scatter = (scores @ inverse[:, 0, :, None]).square().sum((1, 2))
     return solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]
-
-
-def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> Tensor:
-    """(B,) bool, whether frames of ``height`` rows that start at ``starts`` (B, G) in s are blurred differently."""
-    rows = torch.arange(0, height, 8, dtype=torch.float64, device=starts.device)
-    return _different(*_paths(starts[..., None] + rows * timing.row_time, timing, motion))
-
-
-def _between_rows(positions: _Positions, timing: RowTiming, motion: Motion, away: Tensor) -> tuple[Tensor, Tensor]:
-    """Frame rows and shifts (B, G, S, N) of scene rows that are ``away`` (B, G, S, N) px from every scene row.
-
-    They are interpolated between whole scene rows by cubic polynomials, with an error of 1e-5 px for 3 px and periods
-    of 60 rows. To solve for them takes a tenth to a third of the time of a detection behind long exposures.
-    """
-    height = positions.scene_rows.shape[-1]
-    away = away.clamp(-height, height)  # the path of a fit that diverges may have any length
-    margin = math.ceil(float(away.abs().amax())) + 2
-    steps_of_rows = torch.arange(height + 2 * margin, dtype=away.dtype, device=away.device)
-    first = positions.scene_rows[..., :1] - margin
-    starts = (positions.exposure_starts - positions.rows * timing.row_time)[..., :1]
-    positions_of_rows = _Positions.of_rows(first + steps_of_rows, positions.columns, starts, timing, motion)
-    place = away + (positions.scene_rows - first)[..., None]
-    cell = place.floor()
-    # the cubic polynomials (columns) by powers (rows) that are 1 at one of the places -1, 0, 1, 2 and 0 at the others
-    cubic = place.new_tensor([[0, 6, 0, 0], [-2, -3, 6, -1], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
-    powers = torch.arange(4, device=away.device)
-    weights = (place - cell)[..., None] ** powers @ cubic  # (B, G, S, N, 4)
-    index = (cell.long()[..., None] + (powers - 1)).flatten(2)
-    values = torch.stack([positions_of_rows.rows, positions_of_rows.shift])  # (2, B, G, R)
-    near = values.gather(3, index.expand(2, -1, -1, -1)).view(2, *weights.shape)
-    rows, shift = (near * weights).sum(-1).unbind(0)
-    return rows, shift
-
-
-def _warp_to_scene(
-    spectra: RowSpectra, positions: _Positions, timing: RowTiming, motion: Motion
-) -> Callable[[slice], Tensor]:
-    """Function from a slice of the scene rows to spectra (B, G, s, U) of the frames warped to them, with equal blur.
-
-    A long exposure displaces fine detail by more or less than the mean displacement of the row, differently in each
-    frame. Each frame of a pair is therefore blurred once more, by the kernel of the other frame, so that both equal
-    ``K_1 K_2 f`` of the scene f. This is the mean of copies of the frame that are warped along the path of the other.
-
-    Kernels change from row to row, and such operators do not commute: a copy from a distance y was blurred by second
-    moments M of the path that differ by ``y dM/ds`` to first order, which displaces detail by 0.01 px. Each node of the
-    path is therefore corrected by ``y / 2 dM/ds`` times second derivatives of the image.
-    """
-    with_equal_blur = False
-    if positions.rows.shape[1] == 2:
-        paths, weights = _paths(positions.exposure_starts, timing, motion)
-        different = _different(paths, weights)
-        with_equal_blur = bool(different.any())
-    if not with_equal_blur:
-        return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
-    paths = paths * different[:, None, None, None, None]
-    real = spectra.values.real.dtype
-    moment_slope = 0.5 * torch.gradient(_second_moments(paths, weights), dim=2)[0].to(real)[..., None]
-    x, y = paths.flip(1).unbind(-1)  # of the other frame
-    node_rows, node_shift = _between_rows(positions, timing, motion, -y)
-    node_rows, node_shift = node_rows.movedim(-1, 0), (node_shift - x).movedim(-1, 0)  # (N, B, G, S)
-    factors = torch.stack([weights.expand_as(y), weights * y]).to(real).movedim(-1, 0)[..., None, None]
-    by_x = (2j * math.pi * spectra.frequencies).to(spectra.values.dtype)  # derivative along the rows
-    count = positions.rows.shape[-1]
-
-    def warped(part: slice) -> Tensor:
-        first, last, _ = part.indices(count)
-        index = torch.arange(first - 2, last + 2, device=y.device).clamp_(0, count - 1)  # two neighbours, see below
-        shape = (*y.shape[:2], len(index), len(by_x))
-        totals = spectra.values.new_zeros(2, *shape)
-        mean, moment = totals  # of the copies, and of y times them
-        of_numbers = torch.view_as_real(totals)
-        copies = spectra.warped_copies(node_rows[..., index], node_shift[..., index])
-        for copy, of_node in zip(copies, factors[..., index, :, :], strict=True):
-            of_numbers.addcmul_(torch.view_as_real(copy), of_node)
-
-        def neighbour(step: int) -> Tensor:
-            return moment[:, :, 2 + step : len(index) - 2 + step]
-
-        # derivatives across rows, of fourth order, in place: the rows stay in the cache
-        by_y = (neighbour(1) - neighbour(-1)).mul_(8 / 12).sub_(neighbour(2) - neighbour(-2), alpha=1 / 12)
-        by_yy = (neighbour(1) + neighbour(-1)).mul_(16 / 12).sub_(neighbour(2) + neighbour(-2), alpha=1 / 12)
-        by_yy.sub_(neighbour(0), alpha=30 / 12)
-        xx, xy, yy = (moment_slope[:, :, part, i, j].to(by_x.dtype) for i, j in ((0, 0), (0, 1), (1, 1)))
-        result: Tensor = (neighbour(0) * by_x).mul_(xx).addcmul_(by_y, xy, value=2).mul_(by_x)
-        result.add_(mean[:, :, 2:-2]).addcmul_(by_yy, yy)
-        return result
-
-    return warped

@@ -17,7 +17,6 @@ from rsvib_torch.detection.rows.displacements import (
     blur_ratio,
     column_pattern_of,
     differential_motion,
-    differently_blurred,
     displacements_of_parts,
     frame_groups,
     joined_groups,
@@ -26,6 +25,7 @@ from rsvib_torch.detection.rows.displacements import (
     stack_spectra,
     uneven_motion,
 )
+from rsvib_torch.detection.rows.warping import differently_blurred
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
@@ -130,20 +130,25 @@ class GroupedFrames:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
         return torch.stack(blur_ratio(self.groups, self.timing, self.view(motion)), -1)
 
-    def differently_blurred(self, motion: Vibration) -> Array:
-        """(B,) bool, stacks in which the frames of a group are blurred differently."""
+    def differently_blurred(self, motion: Vibration) -> tuple[Array, Array]:
+        """``warping.differently_blurred`` of the frames of any group of each stack, two bool (B,)."""
         view, height = self.view(motion), self.groups[0].spectra.height
-        rows = [
+        of_groups = [
             differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))
             for group in self.groups
         ]
-        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in rows], 1).any(1))
+        stacks = len(motion.amplitude)
+        different, very_different = (
+            table(torch.cat([part.unflatten(0, (stacks, -1)) for part in parts], 1).any(1))
+            for parts in zip(*of_groups, strict=True)
+        )
+        return different, very_different
 
 
 def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
     """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given."""
     spectra = stack_spectra(frames, valid)
-    return GroupedFrames(frame_groups(spectra, timing, motion, pairs_if_blurred_differently=True), timing)
+    return GroupedFrames(frame_groups(spectra, timing, motion, pairs=True), timing)
 
 
 # Strips
@@ -236,13 +241,13 @@ def grouped_strips(
     motion: Vibration | FreeMotion,
     scale: FieldScale,
     *,
-    pairs_if_blurred_differently: bool = True,
+    pairs: bool = True,
     max_slide: float = 0.1,
     min_pitch: int = 48,
 ) -> GroupedStrips:
     """Frames (B, T, H, W) in strips of columns, for a motion of which all components are in px.
 
-    ``pairs_if_blurred_differently`` as in ``frame_groups``. ``max_slide`` is the difference in px of the displacements
+    ``pairs`` as in ``frame_groups``. ``max_slide`` is the difference in px of the displacements
     by roll and zoom of two neighbouring strips; the second order of their interpolation blurs as an exposure with a
     path of this length. ``min_pitch`` are the columns from the middle of a strip to that of the next; narrower strips
     consist of margins mostly.
@@ -260,7 +265,6 @@ def grouped_strips(
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
-    pairs = pairs_if_blurred_differently
-    groups = frame_groups(spectra, timing, view, pairs_if_blurred_differently=pairs, one_at_a_time=True)
+    groups = frame_groups(spectra, timing, view, pairs=pairs, one_at_a_time=True)
     slide = slope * float(columns[1] - columns[0])
     return GroupedStrips(groups, timing, scale, strips, columns, count, slide)

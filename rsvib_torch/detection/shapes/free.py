@@ -229,7 +229,7 @@ def _measure_field(
 
     def strips_for(motion: FreeMotion) -> GroupedStrips:
         motion = motion.to(stack.images.device)
-        return grouped_strips(stack.images, stack.valid, timing, motion, scale, pairs_if_blurred_differently=False)
+        return grouped_strips(stack.images, stack.valid, timing, motion, scale, pairs=False)
 
     # strips follow the size of roll and zoom, which are unknown in the first round
     rows, motion = _rounds(strips_for(motion), motion, spacing, record, 1)

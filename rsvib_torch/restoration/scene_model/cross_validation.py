@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from rsvib_torch.checks.arrays import Array
 from rsvib_torch.execution.chunking import runs
 from rsvib_torch.execution.parallel import allowed_threads, in_parallel
 from rsvib_torch.numerics.fourier import waves
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 
