@@ -44,6 +44,7 @@ from .imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_fram
 from .io import StackInfo, TimingWarning, open_stack, read_stack, read_stack_info, timing_from_first_frame, write_stack
 from .motion.camera import Camera
 from .motion.cameras import CameraMode, camera_mode, find_cameras
+from .motion.detected_vibration import FollowedVibration
 from .motion.recorded import read_motion
 from .motion.spline import FreeMotion
 from .motion.timing import SensorTiming
@@ -96,6 +97,7 @@ __all__ = [
     "DetectionResult",
     "DisplacementSpectrum",
     "FixedDewarp",
+    "FollowedVibration",
     "FreeMotion",
     "Margins",
     "MotionCheck",

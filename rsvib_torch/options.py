@@ -148,11 +148,24 @@ class VibrationOptions(ToneOptions, MaskedInputOptions):
     """``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape, with the options of
     ``detect_motion``; ``"swept"``: one tone per axis whose amplitude decays or grows and whose frequency sweeps, with
     the options of ``detect_swept_tone``."""
+    follow: Literal[False] = False
+    """True: follow a vibration that changes, e.g. decays, from frame to frame. The result is a batch with one entry per
+    frame; the only other options are ``columns``, ``full_scale``, ``channels`` and ``ignore``."""
     window: int | None = None
-    """Number of frames of one result: the vibration is followed through the stack, and the result is a batch with one
-    entry per window (a leading dimension behind B). None for one result from all frames."""
+    """Number of frames of one result, in which the vibration is steady: the result is a batch with one entry per window
+    (a leading dimension behind B). None for one result from all frames."""
     window_step: int | None = None
     """Frames from one window to the next; half a window by default."""
+
+
+@options
+class FollowOptions(MaskedInputOptions):
+    """Options of ``detect_vibration(follow=True)``."""
+
+    follow: Literal[True]
+    """Follow the vibration from frame to frame."""
+    columns: Columns | None = 384
+    """Columns that are measured, those with the most detail; None for all."""
 
 
 @options
@@ -377,9 +390,10 @@ class WindowSize:
 
     window: Frames = Field(default=8, json_schema_extra=COMMAND_LINE)
     """Largest number of frames in which one vibration is detected."""
-    follow: bool = Field(default=False, json_schema_extra=COMMAND_LINE)
-    """Follow a vibration that changes, e.g. decays, from frame to frame, instead of detecting a steady one in each
-    window. The result of a window is the vibration at its middle frame."""
+    follow: bool | Literal["auto"] = Field(default="auto", json_schema_extra=COMMAND_LINE)
+    """Follow the vibration from frame to frame in all windows (true) or none (false); by default where it changes, e.g.
+    decays (``"auto"``). These are windows in which no steady vibration explains the frames, if more axes are reliable
+    then; none with options of detection, ``joint``, ``scale``, ``mosaic`` or ``optics``."""
 
 
 @options

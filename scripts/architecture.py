@@ -13,7 +13,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, its journal, resume"},
     {
         "evaluation": "image quality, slanted edge (mtf/), Cramér–Rao bound",
-        "tracking": "tracker.py: vibration frame by frame",
+        "tracking": "tracker.py: vibration frame by frame; following.py: through a stack, forwards and backwards",
         "row_time": "row time of a camera from flickering light or motion",
         "augmentation": "training data for Kornia pipelines",
         "datasets": "drawn scenes and example frames",

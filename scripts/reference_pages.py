@@ -128,7 +128,7 @@ def parameter_row(parameter: inspect.Parameter) -> list[str]:
     if isinstance(info, typer.models.ArgumentInfo):
         text = parameter.name.upper()
     else:
-        text = option if kind is bool else f"{option} {value}"
+        text = option if types == [bool] else f"{option} {value}"
     required = parameter.default is inspect.Parameter.empty
     stated = "" if parameter.default in (None, False) else f"`{parameter.default}`"
     default = info.show_default if isinstance(info.show_default, str) else stated

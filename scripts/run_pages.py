@@ -22,6 +22,7 @@ from typing import Any
 import nbclient
 import nbformat
 
+from rsvib_torch.commands import terminal
 from rsvib_torch.commands.main import run_command
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -51,6 +52,7 @@ def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     parts, end, output = [], 0, None
     columns = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "100"
+    terminal.LOG_AFTER = 3600.0  # s; pages show no progress
     try:
         for block in BLOCK.finditer(text):
             between, (language, code) = text[end : block.start()], block.groups()

@@ -8,6 +8,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from rsvib_torch import SensorTiming
+from rsvib_torch.commands import terminal
 
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
@@ -66,6 +67,12 @@ def figures_are_not_arranged(request, monkeypatch):
 
     if not ARRANGED & set(request.path.parts):
         monkeypatch.setattr(FigureCanvasAgg, "print_figure", print_figure)
+
+
+@pytest.fixture(autouse=True)
+def write_no_progress(monkeypatch):
+    """Commands in the process of the tests write no lines of progress, however slow the machine is."""
+    monkeypatch.setattr(terminal, "LOG_AFTER", 3600.0)
 
 
 @pytest.fixture(name="set_free")

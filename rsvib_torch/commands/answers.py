@@ -121,7 +121,7 @@ def steps_after_detection(
     reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):
         motion = ("motion", frames, *settings.arguments, "--out", "motion.csv")
-        steps.append(next_step("detect a motion that is not a steady vibration (model='free')", *motion))
+        steps.append(next_step("detect a motion that is not a steady vibration", *motion))
     if reasons:
         steps.append("follow the remedies that the reasons above name")
     return steps

@@ -73,10 +73,13 @@ def _parameter(name: str, annotation: Any, default: Any, form: Mapping[str, Any]
     plain = [member for member in members if get_origin(member) is not Literal]
     kind: Any = str if str in plain else plain[0] if plain else type(choices[0])
     kind = Literal[choices] if not plain and kind is str else kind
-    names = form.pop("names", ()) or ([f"--{name.replace('_', '-')}"] if kind is bool else [])
+    automatic = kind is bool and choices == ("auto",)  # neither --name nor --no-name
+    option_name = f"--{name.replace('_', '-')}"
+    switch = [f"{option_name}/--no-{option_name[2:]}" if automatic else option_name]
+    names = form.pop("names", ()) or (switch if kind is bool else [])
     make: Any = typer.Argument if form.pop("positional", False) else typer.Option
     info = make(*names, help=form.pop("text"), **{"show_default": True} | form)
-    default = False if default is None and kind is bool else default
+    default = False if default is None and kind is bool and not automatic else default
     stated: Any = Annotated[kind | None if default is None else kind, info]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=stated)
 
@@ -124,7 +127,7 @@ def flat_command(name: str, command: Callable[[Any], Answer]) -> Callable[..., N
             if place == parameter.name:
                 values[place] = value
             else:
-                is_given = value is not None and value is not False
+                is_given = value is not None and (value is not False or parameter.default is None)
                 values.setdefault(place, {}).update({parameter.name: value} if is_given else {})
         output = current_output()
         output.as_json, output.quiet = given["as_json"], given["quiet"]

@@ -83,6 +83,10 @@ def run(given: RunOptions) -> Answer:
     settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
+    if given.require_reliable and "gyroscope" in given.moved:
+        raise ValueError(
+            "--require-reliable does not go with --gyroscope, which searches for no tones; leave one of them out"
+        )
     is_video = False
     if given.video:
         from rsvib_torch.io.stack_info import H264, VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
@@ -114,7 +118,7 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
     """Process a stack in windows."""
     settings, frames, out = given.settings, given.stack, given.out
     common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
-    common["detection"] = None if chosen.follow else settings.detection  # a tracker has none
+    common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
     counts = info.shape[0] > chosen.window
     with working(f"restoring {frames.name}", counts=counts) as progress:
@@ -137,8 +141,7 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
             with working("drawing the frames"):
                 names += written.draw_safely(folder / "before_after.png", lambda: _comparison(given, common, first))
         names += [restored.name, "manifest.json"]
-        if result.windows == 1 and not chosen.follow:
-            assert isinstance(first.detection, detection.DetectionResult)
+        if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
             assert first.restoration is not None
             restoration = common["restoration"]
             reports.write_restoration(folder / "restoration.json", first.restoration, restoration, result.not_kept)

@@ -177,7 +177,8 @@ class DetectOptions(shared.StackCommand, shared.PixelSizeOptions, shared.Verdict
                 "window": {
                     "text": "Detect separately in windows of at most this number of frames; writes manifest.json and "
                     "tones.csv.",
-                    "show_default": "from the configuration, or all frames together",
+                    "show_default": "from the configuration, or all frames together if there are at most 256 and "
+                    "their vibration is steady, else 8",
                 }
             },
         ),
@@ -187,48 +188,74 @@ class DetectOptions(shared.StackCommand, shared.PixelSizeOptions, shared.Verdict
 def detect(given: DetectOptions) -> Answer:
     """Detect the vibration in a stack of frames.
 
-    The vibration is modelled as sinusoids of constant amplitude and frequency. For other motion see rsvib motion.
+    The vibration is modelled as sinusoids of constant amplitude and frequency; if they change within the frames, they
+    are followed from frame to frame. For other motion see rsvib motion.
     """
     settings, frames, out = given.settings, given.stack, given.out
     written.check_folder(out, (*written.OF_DETECTION, *written.OF_WINDOWS), given.overwrite, given.inputs)
-    windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")}
-    windows |= given.windows
-    if "window" not in windows and not windows.get("follow"):
-        stack = load(given)
-        result = _detect(stack, settings)
-        with whole_folder(out) as folder:
+    windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")} | given.windows
+    count = io.read_stack_info(frames).shape[0]
+    result, many = None, "window" in windows or windows.get("follow") is True or count > _LONG
+    with whole_folder(out) as folder:
+        if not many:
+            stack = load(given)
+            result = _detect(stack, settings)
+            may_change = windows.get("follow") is not False and stacks.may_change(result, count)
+        if many or may_change:
+            manifest = _detect_windows(given, folder, windows)
+            found = stacks.read_manifest(manifest).detections()
+            reliable = sum(0.0 if one is None else float(one.reliable.sum()) for one in found) / len(found)
+            if result is not None and not reliable > float(result.reliable.sum()):
+                manifest.unlink()  # a steady vibration of all frames is known as well
+            else:
+                result = None
+        if result is not None:
             names = written.write_detection(folder, result, stack.timing, given.pixel_size)
-        written.remove_old(out, (*written.OF_DETECTION, *written.OF_WINDOWS), names)
+        else:
+            names = [*written.write_windows(folder, manifest, given.pixel_size), "manifest.json"]
+    written.remove_old(out, (*written.OF_DETECTION, *written.OF_WINDOWS), names)
+    if result is not None:
         answer = answers.stack_answer(frames, result, given.pixel_size)
         answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
     else:
-        info = io.read_stack_info(frames)
-        print_notes(info, settings)
-        with whole_folder(out) as folder:
-            with working(f"detecting in {frames.name}", counts=True) as progress:
-                stacks.detect_stack(
-                    frames,
-                    folder / "manifest.json",
-                    settings.timing,
-                    **windows,
-                    detection=None if windows.get("follow") else settings.detection,
-                    full_scale=shared.full_scale_of(frames, info, settings, given.full_scale),
-                    device=str(given.torch_device),
-                    progress=progress,
-                )
-            names = [*written.write_windows(folder, folder / "manifest.json", given.pixel_size), "manifest.json"]
-        written.remove_old(out, written.OF_DETECTION, names)
-        manifest = stacks.read_manifest(out / "manifest.json")
-        written.warn_of_failures(manifest)
-        title = f"Vibration in {len(manifest.windows)} windows of {frames.name}"
-        answer = answers.windows_answer(title, manifest, pixel_size=given.pixel_size)
-        if windows.get("follow"):
-            run = ("run", frames, out / "restored", *settings.arguments, "--follow")
+        stored = stacks.read_manifest(out / "manifest.json")
+        written.warn_of_failures(stored)
+        title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
+        answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
+        if any(record.followed is not None for record in stored.windows):
+            run = (
+                "run",
+                frames,
+                out / "restored",
+                *settings.arguments,
+                *["--follow"] * (windows.get("follow") is True),
+            )
             answer.next_steps.append(answers.next_step("restore the frames", *run))
         else:
             answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     answer.files += [out / name for name in names]
     return answer
+
+
+_LONG = 256  # frames; longer stacks are detected in windows, and shorter ones as a whole
+
+
+def _detect_windows(given: DetectOptions, folder: Path, windows: Table) -> Path:
+    """Detect the vibration in the windows of a stack; the ``manifest.json`` in a folder."""
+    settings, frames, manifest = given.settings, given.stack, folder / "manifest.json"
+    info = io.read_stack_info(frames)
+    with working(f"detecting in {frames.name}", counts=True) as progress:
+        stacks.detect_stack(
+            frames,
+            manifest,
+            settings.timing,
+            **windows,
+            detection=None if windows.get("follow") is True else settings.detection,
+            full_scale=shared.full_scale_of(frames, info, settings, given.full_scale),
+            device=str(given.torch_device),
+            progress=progress,
+        )
+    return manifest
 
 
 @options
@@ -290,10 +317,9 @@ def _restore_windows(given: RestoreOptions) -> Answer:
             f"{vibration}: it describes a video that was followed frame by frame, and its parts are not windows; "
             "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
         )
-    if manifest.settings.get("follow"):
+    if any(record.followed is not None for record in manifest.windows):
         raise ValueError(
-            f"{vibration}: its vibration was followed from frame to frame, and each window states that of one frame; "
-            "repeat rsvib run --follow"
+            f"{vibration}: its vibration was followed from frame to frame, and is not that of windows; repeat rsvib run"
         )
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
@@ -346,7 +372,12 @@ def report(given: ReportOptions) -> Answer:
     _, _, options = given.planned_restoration(given.restoration)
     stack = load(given, options)
     detection = _detect(stack, settings)
-    result = _restore(stack, detection, options, given.force, "page")
+    followed = None if windows is None else windows.followed()
+    if followed is not None and len(followed.times) == len(stack.frames):
+        with working("restoring and judging"):
+            result = stacks.restore_followed(stack.frames, stack.timing, followed, options, force=given.force)[0]
+    else:
+        result = _restore(stack, detection, options, given.force, "page")
     pattern = options.get("mosaic")
     steps = []
     if result.restored:
@@ -354,7 +385,7 @@ def report(given: ReportOptions) -> Answer:
     elif result.moves:
         forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
         steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
-    steps += answers.steps_after_detection(detection, frames, settings)
+    steps += [] if followed is not None else answers.steps_after_detection(detection, frames, settings)
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
 
     content = reports.Report(
@@ -376,9 +407,16 @@ def report(given: ReportOptions) -> Answer:
     with whole_folder(out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
         shared.check_new([out / name for name in files], overwrite=True, inputs=inputs)
-    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and followed is not None:
+        answer = answers.windows_answer(f"Vibration in {frames.name}", windows)
+        answer.results["Restoration of the page"] = answers.restoration_lines(result, len(stack.frames))
+        answer.data["restoration"] = reports.restoration_data(result)
+    else:
+        answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
     if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
-        answer.results["Restoration of the page, of one vibration in all frames"] = answer.results.pop("Restoration")
+        if followed is None:
+            title = "Restoration of the page, of one vibration in all frames"
+            answer.results[title] = answer.results.pop("Restoration")
         answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
     answer.files += [out / name for name in files]
     answer.next_steps += steps

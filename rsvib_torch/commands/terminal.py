@@ -20,6 +20,7 @@ from rich.text import Text
 
 from rsvib_torch.execution.progress import listening
 from rsvib_torch.files.reading import Table
+from rsvib_torch.results.reason import options_of_the_program
 from rsvib_torch.text import json_text, printable, shortened, wrapped
 
 
@@ -45,7 +46,7 @@ class Output:
     warnings: list[str] = field(default_factory=list)
 
 
-LOG_AFTER = 20.0  # s; commands that take less write no progress to files
+LOG_AFTER = 2.0  # s; commands that take less write no progress to files
 _SHOWN_AFTER = 2.0  # s, from which the elapsed time is shown beside that of a loop, which may be one of several
 
 _outputs: list[Output] = [Output()]  # that of the running command is the last
@@ -56,7 +57,8 @@ def running(arguments: Sequence[str]) -> Iterator[None]:
     """Collect the output of a command line while it runs."""
     _outputs.append(Output(printable(shlex.join(["rsvib", *arguments]))))
     try:
-        yield
+        with options_of_the_program():
+            yield
     finally:
         _outputs.pop()
 

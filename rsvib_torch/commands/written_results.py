@@ -69,9 +69,11 @@ def write_windows(folder: Path, path: Path, pixel_size: float | None = None) -> 
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
-        starts, drawn = [record.start_time for record in manifest.windows], []
+        drawn = []
         if manifest.gyroscope is None:  # no tones are searched for otherwise
-            drawn = draw_safely(folder / "windows.png", lambda: reports.windows_figure(starts, manifest.detections()))
+            drawn = draw_safely(
+                folder / "windows.png", lambda: reports.windows_figure(manifest.times(), manifest.detections())
+            )
     return [*drawn, "windows.json", "tones.csv"]
 
 

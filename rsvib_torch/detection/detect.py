@@ -23,11 +23,14 @@ from rsvib_torch.frames.entry_points import TimedModule, entry_point, module_opt
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
+from rsvib_torch.motion.detected_vibration import FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import FreeMotionOptions, SweptToneOptions, VibrationOptions
+from rsvib_torch.options import FollowOptions, FreeMotionOptions, SweptToneOptions, VibrationOptions
+from rsvib_torch.results.higher_packages import imported
 
 VibrationModel = Literal["tones", "free", "swept"]
 T = ParamSpec("T")
+W = ParamSpec("W")
 F = ParamSpec("F")
 S = ParamSpec("S")
 
@@ -51,13 +54,17 @@ _OTHER_MODELS: dict[str, tuple[type, Callable[..., MotionDetection | SweptTone]]
 }
 
 
-class _DetectsVibration(Protocol[T, F, S]):
+class _DetectsVibration(Protocol[T, W, F, S]):
     """Type of ``detect_vibration``: the model determines the options and the result."""
 
     @overload
     def __call__(
         self, frames: FramesOrFiles, timing: SensorTiming, *args: T.args, **kwargs: T.kwargs
     ) -> DetectionResult: ...
+    @overload
+    def __call__(
+        self, frames: FramesOrFiles, timing: SensorTiming, *args: W.args, **kwargs: W.kwargs
+    ) -> FollowedVibration: ...
     @overload
     def __call__(
         self, frames: FramesOrFiles, timing: SensorTiming, *args: F.args, **kwargs: F.kwargs
@@ -67,26 +74,35 @@ class _DetectsVibration(Protocol[T, F, S]):
 
 
 def _options_of_models(
-    tones: Callable[T, VibrationOptions], free: Callable[F, _FreeModel], swept: Callable[S, _SweptModel]
-) -> Callable[[Callable[..., Any]], _DetectsVibration[T, F, S]]:
-    def of_model(model: object = "tones", **given: Any) -> Any:
+    tones: Callable[T, VibrationOptions],
+    followed: Callable[W, FollowOptions],
+    free: Callable[F, _FreeModel],
+    swept: Callable[S, _SweptModel],
+) -> Callable[[Callable[..., Any]], _DetectsVibration[T, W, F, S]]:
+    def of_model(model: object = "tones", follow: object = False, **given: Any) -> Any:
         check_choice("model", model, ("tones", *_OTHER_MODELS))
-        group: Any = tones if model == "tones" else _OTHER_MODELS[str(model)][0]
+        check_choice("follow", follow, (False, True))
+        chosen = {"follow": True} if follow and model == "tones" else {"model": model}
+        group: Any = (
+            FollowOptions if "follow" in chosen else tones if model == "tones" else _OTHER_MODELS[str(model)][0]
+        )
+        given |= {"follow": True} if follow and model != "tones" else {}
         for name in given:
             if name not in fields_of(group):
+                ((stated, value),) = chosen.items()
                 names = ", ".join(fields_of(group))
-                raise TypeError(f"model={model!r} has no option {name!r}; its options are {names}")
-        return group(model=model, **given)
+                raise TypeError(f"{stated}={value!r} has no option {name!r}; its options are {names}")
+        return group(**chosen, **given)
 
     return lambda function: entry_point(tones, function, of_model)
 
 
-@_options_of_models(VibrationOptions, _FreeModel, _SweptModel)
+@_options_of_models(VibrationOptions, FollowOptions, _FreeModel, _SweptModel)
 @full_precision
 @without_gradients
 def detect_vibration(
-    frames: FramesOrFiles, timing: SensorTiming, options: VibrationOptions | _FreeModel | _SweptModel
-) -> DetectionResult | MotionDetection | SweptTone:
+    frames: FramesOrFiles, timing: SensorTiming, options: VibrationOptions | FollowOptions | _FreeModel | _SweptModel
+) -> DetectionResult | FollowedVibration | MotionDetection | SweptTone:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
     Row bands are registered between frames, and sinusoids and a uniform motion (Eq. 5) are fitted to the offset curve.
@@ -104,7 +120,8 @@ def detect_vibration(
 
     Returns:
         The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
-        ``DetectionResult``, or the ``MotionDetection`` of the free and the ``SweptTone`` of the swept model.
+        ``DetectionResult``. With ``follow=True``, a ``FollowedVibration`` with one entry per frame, which ``restore``
+        accepts as well. Of the free model a ``MotionDetection``, of the swept one a ``SweptTone``.
 
     Warns:
         TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
@@ -114,6 +131,7 @@ def detect_vibration(
             is out of range.
 
     Example:
+        >>> import torch
         >>> import rsvib_torch as rsv
         >>> from rsvib_torch.datasets import city_and_fields
         >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
@@ -134,7 +152,20 @@ def detect_vibration(
         >>> detection = rsv.detect_vibration(frames, timing)
         >>> detection.reliable.tolist()
         [True, False]
+
+        A vibration that decays with 0.3 s is followed from frame to frame:
+
+        >>> times = torch.arange(-0.01, 0.3, 2e-4, dtype=torch.float64)
+        >>> tone = 3.0 * torch.exp(-times / 0.3) * torch.sin(2 * torch.pi * 110 * times)  # px
+        >>> decaying = rsv.FreeMotion.through(times, torch.stack([tone, 0.5 * tone], -1))
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, decaying, num_frames=20)
+        >>> followed = rsv.detect_vibration(frames, timing, follow=True)
+        >>> followed.vibration.amplitude[::10, 0, 0].round(decimals=1).tolist()  # px along x, of frames 0 and 10
+        [2.9, 2.0]
     """
+    if isinstance(options, FollowOptions):
+        followed: FollowedVibration = imported("follow")(frames, timing, options)
+        return followed
     if not isinstance(options, VibrationOptions):
         given = {name: value for name, value in vars(options).items() if name != "model"}
         return _OTHER_MODELS[options.model][1](frames, timing, **given)

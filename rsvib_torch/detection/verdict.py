@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -243,6 +243,14 @@ def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
     if numbers["correlated"] > allowed:
         return [Reason("neighbours_unexplained", axis, numbers["correlated"], allowed)]
     return []
+
+
+def with_remedy(reasons: Iterable[Reason], remedy: str) -> tuple[Reason, ...]:
+    """Reasons with another remedy where theirs is to follow a vibration that changes, or to try other tones."""
+    codes = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
+    return tuple(
+        replace(one, details={**one.details, "instead": remedy}) if one.code in codes else one for one in reasons
+    )
 
 
 def contradicted_axes(findings: Findings) -> tuple[bool, bool]:

@@ -35,14 +35,22 @@ def steps(total: int, unit: str) -> Callable[..., None]:
         1 of 3 frames
         3 of 3 frames
     """
-    done = 0
+    done, listeners = 0, _listeners[-1:]
 
     def advance(count: int = 1) -> None:
         nonlocal done
         with _lock:
             done += count
-            for listener in _listeners[-1:]:
+            for listener in listeners:
                 listener(done, total, unit)
 
     advance(0)
     return advance
+
+
+@contextmanager
+def whole_steps(total: int, unit: str) -> Iterator[Callable[..., None]]:
+    """``steps`` of a loop whose steps take about the same time; loops within them report nothing."""
+    advance = steps(total, unit)
+    with listening(lambda *_: None):
+        yield advance

@@ -1,9 +1,12 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
-from dataclasses import dataclass, field, fields
+import math
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.checks.values import described
 from rsvib_torch.files.reading import Table
@@ -142,3 +145,38 @@ class DetectedVibration(
     def _middle_time(self, batch: tuple[int, ...]) -> float | None:
         """Middle of the frames of a result in s; None without an offset curve."""
         return None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "times": "..."}):
+    """The vibration at each frame of a stack, from ``detect_vibration(follow=True)``: a batch with one entry per frame.
+
+    Amplitude and frequency may change from frame to frame. A frame whose vibration is not known has amplitude 0, and is
+    not reliable. Phases and the image motion refer to the time origin of the stack, as those of all detections; their
+    values hold around the frame. ``restore`` restores each frame with its own entry.
+
+    Attributes:
+        times: (...) s, middle of the exposures of each frame.
+    """
+
+    times: Tensor = field(kw_only=True)
+
+    def with_tones(self, count: int) -> "FollowedVibration":
+        """The same with ``count`` tones on each axis; those that it does not have are 0."""
+        missing = count - self.gain.shape[-1]
+
+        def padded(values: Tensor) -> Tensor:
+            return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values
+
+        vibration, std = self.vibration.mapped(padded), self.std.mapped(padded)
+        return replace(self, vibration=vibration, std=std, gain=padded(self.gain))
+
+    def timed_from(self, origin: float) -> "FollowedVibration":
+        """The same with another time origin, in s from the present one; times count from it as well."""
+        found, turn = self.vibration, 2 * math.pi * origin
+        phase = torch.remainder(found.phase + turn * found.frequency + math.pi, 2 * math.pi) - math.pi
+        moved = found.image_motion + origin * found.image_acceleration
+        return replace(self, vibration=replace(found, phase=phase, image_motion=moved), times=self.times - origin)
+
+    def _middle_time(self, batch: tuple[int, ...]) -> float | None:
+        return float(self.times[batch])

@@ -27,7 +27,7 @@ from rsvib_torch.evaluation import MtfCurve
 from rsvib_torch.files.reading import Table
 from rsvib_torch.imaging import row_psf
 from rsvib_torch.imaging.trajectory import exposure_nodes
-from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
@@ -246,7 +246,7 @@ def windows_figure(
     times: Sequence[float],
     detections: Sequence[DetectedVibration | None],
     *,
-    time_label: str = "start of the window (s)",
+    time_label: str = "time (s)",
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 
@@ -751,6 +751,9 @@ FIGURES.update(
     {
         (DetectionResult, 0): offset_figure,
         (DetectionResult, 1): _batch_figure,
+        (FollowedVibration, 1): lambda followed: windows_figure(
+            followed.times.tolist(), [followed[index] for index in range(len(followed.times))]
+        ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
         (detection.MotionDetection, 0): free_motion_figure,
         (detection.SweptTone, 0): _swept_figure,

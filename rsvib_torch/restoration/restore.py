@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -18,9 +18,10 @@ from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.imaging.sensor_model import Optics, sharpened
 from rsvib_torch.io.stack_reading import FramesOrFiles
-from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import OpticsOptions, RestorationOptions, RestoreOptions, RestorerOptions
 from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
@@ -30,7 +31,9 @@ from rsvib_torch.restoration.frame_motion import motion_in_row_order, restore_in
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
-from rsvib_torch.restoration.verdict.trust import vibration_to_undo
+from rsvib_torch.restoration.verdict.trust import trusted_vibration, vibration_to_undo
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,11 @@ def restore(
         saturation=options.saturation,
         mosaic=options.mosaic,
     )
+    if isinstance(vibration, FollowedVibration):
+        result, _, left_alone = restore_each(prepared, vibration, options)
+        for reason in left_alone:
+            warn_of_restoration(str(reason))
+        return prepared.from_row_order(result)
     timing = prepared.image_timing
     _, count, _, height, _ = prepared.images.shape
     vibration, left_alone = vibration_to_undo(vibration, timing, count, height)
@@ -198,16 +206,79 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
         return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, {"options": options, **more})
 
 
+def restore_each(
+    frames: PreparedFrames, followed: FollowedVibration, options: RestorationOptions
+) -> tuple[Tensor, Vibration, tuple[Reason, ...]]:
+    """Restore each frame with its own vibration.
+
+    Returns:
+        Frames (B, T, C, H, W) in row order, as taken where no motion is known; the B T vibrations that were undone,
+        each with the time origin in the middle of its frame; a reason for each axis that was restored in no frame.
+    """
+    (stacks, count), height = frames.images.shape[:2], frames.images.shape[-2]
+    if tuple(followed.batch_shape) != ((stacks, count) if frames.batched else (count,)):
+        raise ValueError(
+            f"vibration was followed through {tuple(followed.batch_shape)} frames, but frames are {stacks} x {count}; "
+            "pass the frames that it was detected in"
+        )
+    if options.joint:
+        raise ValueError(f"joint={options.joint}: frames of a vibration that changes are restored one by one")
+    # 1. Each frame is a stack of one, with the time origin in its middle.
+    if frames.batched:
+        followed = followed.mapped(lambda values: values.flatten(0, 1))
+        object.__setattr__(followed, "findings", tuple(one for stack in followed.findings for one in stack))
+    moved = replace(
+        followed.vibration,
+        phase=followed.vibration.phase + 2 * math.pi * followed.vibration.frequency * followed.times[:, None, None],
+        image_motion=followed.vibration.image_motion + followed.vibration.image_acceleration * followed.times[:, None],
+    )
+    start = -0.5 * ((height - 1) * frames.timing.row_time + frames.timing.exposure_time)
+    timing = replace(frames.image_timing, frame_start_times=(start,))
+    trusted, left_alone = trusted_vibration(replace(followed, vibration=moved), timing, 1, height)
+    axes = trusted.moving_axes()
+    # 2. Only frames that move are restored.
+    result = _as_taken(frames, False, options.scale)
+    moving = axes.any(-1)
+    if bool(moving.any()):
+
+        def moved_frames(values: Tensor) -> Tensor:
+            return values.flatten(0, 1)[moving][:, None]
+
+        apart = replace(
+            frames,
+            images=moved_frames(frames.images),
+            missing=None if frames.missing is None else moved_frames(frames.missing),
+            saturated=None if frames.saturated is None else moved_frames(frames.saturated),
+            colours=None if frames.colours is None else moved_frames(frames.colours),
+            timing=timing.in_row_order(),
+            image_timing=timing,
+            shape=(int(moving.sum()), 1, *frames.shape[-3:]),
+        )
+        restored = restore_prepared(apart, trusted.mapped(lambda values: values[moving]), options)[:, 0]
+        camera = check_optics(options.optics)
+        flat = result.flatten(0, 1)
+        flat[moving] = restored if camera is None else sharpened(restored, camera, options.scale)
+        result = flat.unflatten(0, (stacks, count))
+    nowhere = [name for name, moves in zip(AXIS_NAMES, axes.any(0).tolist(), strict=False) if not moves]
+    first = {reason.axis: reason for reason in reversed(left_alone)}
+    return result, trusted, tuple(first[name] for name in nowhere if name in first)
+
+
 def unchanged_frames(frames: PreparedFrames, joint: bool | int, scale: int = 1) -> Tensor:
     """The frames as taken in place of restored ones: NaN at missing pixels; with ``joint=True`` the middle one.
 
     On a finer grid, values between the pixels are interpolated.
     """
+    return frames.from_row_order(_as_taken(frames, joint, scale))
+
+
+def _as_taken(frames: PreparedFrames, joint: bool | int, scale: int) -> Tensor:
+    """``unchanged_frames`` in row order."""
     images = frames.images.clone() if frames.colours is None else interpolated_colours(frames.filled, frames.colours)
     if frames.missing is not None:
         images = images.masked_fill(frames.missing, math.nan)
     middle = images.shape[1] // 2
-    return frames.from_row_order(enlarged(images[:, middle : middle + 1] if joint is True else images, scale))
+    return enlarged(images[:, middle : middle + 1] if joint is True else images, scale)
 
 
 def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: Motion, joint: bool | int) -> None:

@@ -6,7 +6,8 @@ is written from the table.
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from string import Formatter
@@ -67,13 +68,17 @@ class Reason:
         values = {"axis": self.axis, "other": {"x": "y", "y": "x"}.get(self.axis or ""), **self.details}
         # JSON has no infinity: a number that is missing in a file was infinite
         values |= {name: getattr(self, name) if getattr(self, name) is not None else math.inf for name in _COMPARED}
-        template = "; ".join(filter(None, (self.kind.sentence, self.kind.remedy))) + _AT_RADIUS
+        remedy = str(self.details.get("instead", self.kind.remedy))  # another remedy than that of the table
+        template = "; ".join(filter(None, (self.kind.sentence, remedy))) + _AT_RADIUS
 
         def part(match: re.Match[str]) -> str:
             names = {name for _, name, _, _ in Formatter().parse(match[1]) if name}
             return match[1] if names <= values.keys() else ""
 
-        return re.sub(r"\[([^]]*)\]", part, template).format_map(values)
+        text = re.sub(r"\[([^]]*)\]", part, template).format_map(values)
+        for name, option in _OPTIONS.items() if _of_program else ():
+            text = text.replace(name, option)
+        return text
 
     @property
     def with_axis(self) -> str:
@@ -100,6 +105,33 @@ class Reason:
 
 
 _COMPARED = ("value", "limit")
+# What texts of Python name, and the same for users of the program
+_OPTIONS = {
+    "follow=True": "--follow",
+    "model='free'": "rsvib motion",
+    "check frame_rows, row_time": "check --frame-rate, --row-time",
+    "check exposure_rows": "check --exposure",
+    "frame_rows and row_time, which": "--frame-rate and --row-time, which",
+    "check row_time": "check --row-time",
+    "increase search": "increase search in [detection]",
+    "pass row_time=(low, high)": "give --row-time twice",
+    "scan_axis=": "--scan-axis ",
+    "readout_direction=": "--readout-direction ",
+    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
+}
+_of_program: list[bool] = []  # not empty while a command runs
+
+
+@contextmanager
+def options_of_the_program() -> Iterator[None]:
+    """Texts of reasons name the options of the program instead of those of Python."""
+    _of_program.append(True)
+    try:
+        yield
+    finally:
+        _of_program.pop()
+
+
 _AT_RADIUS = "[ (px: at {radius:.0f} px from the centre)]"  # for components of roll and zoom
 
 
@@ -122,7 +154,7 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
-_FOLLOW = "use follow=True (--follow) if the vibration changes"
+_FOLLOW = "use follow=True if the vibration changes"
 _TONES_OR_FREE = f"{_FOLLOW}, try more tones or model='free'"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
@@ -271,6 +303,26 @@ _TONES = {
     ),
     "other_scan_axis": ReasonKind(
         "the frames agree with scan_axis='{agreeing}', not with '{stated}'", refuses="all axes"
+    ),
+}
+_FOLLOWED = {
+    "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),
+    "directions_differ": ReasonKind(
+        "forwards and backwards in time, the displacement of the rows differs by {value:.2g} px, {limit:.2g} px are "
+        "allowed",
+        "use more frames, or frames at shorter intervals",
+        "rms difference of the displacements that both trackers find, above 0.01 px, 3 % and 4 standard deviations",
+        "px",
+    ),
+    "tones_contradicted": ReasonKind(
+        "in {value:.0%} of the frames the rows contradict the tones, {limit:.0%} are allowed: tones are missing",
+        "use more frames, or frames at shorter intervals",
+        "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ or "
+        "not_followed, above 7 %",
+    ),
+    "other_tone": ReasonKind(
+        "a tone of {frequency:.4g} Hz explains the frames as well",
+        "use more frames, or frames at other intervals",
     ),
 }
 _SHAPES = {
@@ -434,6 +486,7 @@ _RESTORATION = {
 # The codes by what they refuse; a code belongs to one group.
 GROUPS = {
     "Tones (`detect_vibration`)": _TONES,
+    "A vibration that is followed (`follow=True`)": _FOLLOWED,
     "Other motions (`detect_motion`, `detect_swept_tone`)": _SHAPES,
     "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,

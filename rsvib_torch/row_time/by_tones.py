@@ -16,7 +16,7 @@ from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, motion_of_fit, residual_of, shrunk
 from rsvib_torch.detection.tones.selection import robust_fit
-from rsvib_torch.detection.verdict import residual_reasons
+from rsvib_torch.detection.verdict import residual_reasons, with_remedy
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.tables import Array, table
@@ -175,7 +175,8 @@ class _Direct:
         other |= {"size": self.other_motion.size[0], "permitted": self.other_motion.permitted[0]}
         reasons: list[Reason] = []
         for axis, name in enumerate(AXIS_NAMES[:2]):
-            reasons += residual_reasons(name, {quantity: float(values[axis]) for quantity, values in other.items()})
+            numbers = {quantity: float(values[axis]) for quantity, values in other.items()}
+            reasons += with_remedy(residual_reasons(name, numbers), "use frames in which the vibration is steady")
             count = int(self.fit.active[0, axis].sum())
             if count >= MAX_TONES:
                 reasons.append(Reason("too_many_tones", name, count, MAX_TONES))

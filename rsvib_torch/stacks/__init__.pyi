@@ -4,7 +4,7 @@ from .manifest import StackManifest, read_manifest
 from .process import detect_stack, iterate_stack, process_stack
 from .recorded_motion import align_stack, check_stack_motion
 from .run_folder import StackReport
-from .window_restoration import RestoredFrames, restore_trusted, without_data
+from .window_restoration import RestoredFrames, may_change, restore_followed, restore_trusted, without_data
 from .windows import Window, cut_windows
 
 __all__ = [
@@ -20,9 +20,11 @@ __all__ = [
     "cut_windows",
     "detect_stack",
     "iterate_stack",
+    "may_change",
     "process_stack",
     "read_manifest",
     "restore_block",
+    "restore_followed",
     "restore_trusted",
     "without_data",
 ]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from rsvib_torch.io.full_scale import (
 )
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
-from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import (
@@ -43,10 +43,11 @@ from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.stacks.memory import windows_at_once
 from rsvib_torch.stacks.window_restoration import (
-    WARM_UP,
+    MARGIN,
     RestoredFrames,
-    follow_window,
     frame_fault,
+    may_change,
+    restore_followed,
     restore_trusted,
     without_data,
 )
@@ -64,12 +65,12 @@ class WindowResult(Summarised):
         indices: Indices of ``frames`` in the stack; empty if all frames were restored jointly as one image.
         frames: Frames whose full scale is 1, (T, H, W) or (T, C, H, W): restored, or as taken.
         restored: Whether they are restored.
-        detection: The detection, with the time origin at the window's first frame; None if it failed.
+        detection: The detection, with the time origin at the window's first frame; a ``FollowedVibration`` of the
+            frames ``indices`` if it was followed from frame to frame; None if it failed.
         restoration: Details of the restoration; None without a detection.
         error: Why detection or restoration failed.
-        unchanged: Indices of ``frames`` that are as taken, in a window that is restored: with ``follow=True``, those
-            whose motion is not known.
-        middle: With ``follow=True``, the frame whose vibration ``detection`` states.
+        unchanged: Indices of ``frames`` that are as taken, in a window that is restored: those of a vibration that was
+            followed, whose motion is not known.
         bad_frames: Frames of ``window.written`` that could not be used, with the reason; they are not in ``frames``.
     """
 
@@ -82,7 +83,6 @@ class WindowResult(Summarised):
     error: str | None
     bad_frames: Mapping[int, str]
     unchanged: tuple[int, ...] = ()
-    middle: int | None = None
 
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
@@ -123,7 +123,7 @@ class StackJob:
     force: bool = False  # whether to write restored frames even if they are judged worse than the raw ones
     device: str = "cpu"  # device for the computation
     window: int = StackOptions.window  # maximum number of frames of a window
-    follow: bool = False  # whether the vibration is followed from frame to frame
+    follow: bool | Literal["auto"] = False  # whether the vibration is followed from frame to frame
 
     def open(self) -> FrameReader:
         """Open the stack, which must not have changed."""
@@ -164,40 +164,33 @@ class StackJob:
 
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
-        faults: dict[int, str] = {}
-        nodata = self.info.nodata
-        usable: dict[int, NDArray[Any]] = {}
-        for index, frame in zip(window.frames, pixels, strict=True):
-            fault = frame if isinstance(frame, str) else frame_fault(frame, index, self.full_scale, nodata=nodata)
-            if fault is not None:
-                faults[index] = fault
-            elif not isinstance(frame, str):
-                usable[index] = frame
-        frames = torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
-        if usable:
-            stored = np.stack(list(usable.values()))
-            frames = counts_to_frames(stored, self.full_scale, str(self.source), nodata).to(self.device)
+        usable, faults = self._usable(window, pixels)
+        inside = {index: frame for index, frame in usable.items() if window.first <= index <= window.last}
+        frames = self._images(inside)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        skipped = sum(index < window.first for index in usable)  # frames before the window
-        taken = self._unchanged(frames[skipped : skipped + len(kept)])
+        taken = self._unchanged(frames[: len(kept)])
         as_taken = WindowResult(window, kept, taken, False, None, None, None, bad)
-        if faults and len(usable) < 2:
+        if faults and len(inside) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
-        if self.follow:
-            return self._followed(as_taken, list(usable), frames)
-        timing = window_timing(self.timing, window, list(usable))
+        if self.follow is True:
+            return self._followed(as_taken, usable)
+        timing = window_timing(self.timing, window, list(inside))
         detection: DetectionResult | DetectedVibration | None = None
         try:
-            motion = self.motion and self._motion_of(window)
-            if motion is None:
-                known = None if self.given is None else self.given[window.index]
-                detection = detect_vibration(frames, timing, **self.detection) if self.given is None else known
-                if detection is None:
-                    return replace(as_taken, error="no detection was given for this window")
-            found = detection if motion is None else motion
-            if self.restoration is None or found is None:
-                return replace(as_taken, detection=detection)
+            found: DetectionResult | DetectedVibration | FreeMotion | None
+            if self.motion is not None:
+                found = self._motion_of(window)
+            elif self.given is not None:
+                found = detection = self.given[window.index]
+            else:
+                found = detection = detect_vibration(frames, timing, **self.detection)
+                followed = self._followed_instead(as_taken, usable, detection)
+                if followed is not None:
+                    return followed
+            if found is None or self.restoration is None:
+                missing = "no detection was given for this window" if found is None else None
+                return replace(as_taken, detection=detection, error=missing)
             joint = bool(self.restoration.get("joint", False))
             restoration = restore_trusted(
                 frames,
@@ -212,7 +205,7 @@ class StackJob:
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
         one_image = self.joined and restoration.restored
         restored = restoration.frames if one_image else restoration.frames[: len(kept)]
-        if nodata is not None:
+        if self.info.nodata is not None:
             restored = without_data(restored, frames if one_image else frames[: len(kept)])
         return replace(
             as_taken,
@@ -231,24 +224,63 @@ class StackJob:
         readout = self.info.shape[int(self.timing.scan_axis)] * self.timing.row_time + self.timing.exposure_time
         return self.motion.within(first - readout, last + 2 * readout).retimed(first).to(self.device)
 
-    def _followed(self, as_taken: WindowResult, indices: list[int], frames: Tensor) -> WindowResult:
-        """The result of a window by a tracker, from its usable frames and those before it."""
-        window = as_taken.window
-        starts = self.timing.frame_starts(window.last + 1).tolist()
-        times = [starts[index] - starts[window.first] for index in indices]
+    def _usable(self, window: Window, pixels: WindowFrames) -> tuple[dict[int, NDArray[Any]], dict[int, str]]:
+        """The frames of a window that can be used, and why others cannot."""
+        usable: dict[int, NDArray[Any]] = {}
+        faults: dict[int, str] = {}
+        for index, frame in zip(window.frames, pixels, strict=True):
+            if isinstance(frame, str):
+                faults[index] = frame
+            elif (fault := frame_fault(frame, index, self.full_scale, nodata=self.info.nodata)) is not None:
+                faults[index] = fault
+            else:
+                usable[index] = frame
+        return usable, faults
+
+    def _images(self, frames: Mapping[int, NDArray[Any]]) -> Tensor:
+        """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
+        if not frames:
+            return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
+        stored = np.stack(list(frames.values()))
+        return counts_to_frames(stored, self.full_scale, str(self.source), self.info.nodata).to(self.device)
+
+    def _followed_instead(
+        self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]], steady: DetectedVibration
+    ) -> WindowResult | None:
+        """The result of a window whose tones may change, if more of its axes are reliable than of a steady one."""
+        if self.follow != "auto" or not may_change(steady, len(usable)):
+            return None
+        followed = self._followed(as_taken, usable)
+        better = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
+        return followed if better > steady.reliable.sum() else None
+
+    def _followed(self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]]) -> WindowResult:
+        """The result of a window whose vibration is followed, from its usable frames and those around it."""
+        window, kept = as_taken.window, list(as_taken.indices)
+        if not kept:
+            return as_taken
         try:
-            found = follow_window(frames, indices, times, window, self.timing, self.restoration, force=self.force)
+            timing = window_timing(self.timing, window, list(usable))
+            found = detect_vibration(self._images(usable), timing, follow=True, channels="first")
+            followed = FollowedVibration.stacked([found[number] for number, i in enumerate(usable) if i in kept])
+            if self.restoration is None:
+                return replace(as_taken, detection=followed)
+            frames = as_taken.frames
+            timing = window_timing(self.timing, window, kept)
+            restoration, left = restore_followed(frames, timing, followed, self.restoration, force=self.force)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, error=" ".join(str(error).split()))
-        if found is None:
-            return replace(as_taken, error="the vibration could not be followed: its motion is not known in any frame")
-        detection, middle, restoration, unchanged = found
-        result = replace(as_taken, detection=detection, middle=middle, restoration=restoration)
-        if restoration is None or not restoration.restored:
-            return result
-        has_gaps = self.info.nodata is not None
-        restored = without_data(restoration.frames, as_taken.frames) if has_gaps else restoration.frames
-        return replace(result, frames=restored, restored=True, unchanged=unchanged)
+        restored = restoration.frames
+        if self.info.nodata is not None:
+            restored = without_data(restored, frames)
+        return replace(
+            as_taken,
+            frames=restored,
+            restored=restoration.restored,
+            detection=followed,
+            restoration=restoration,
+            unchanged=tuple(kept[number] for number in left),
+        )
 
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
@@ -282,7 +314,8 @@ class StackJob:
     def record(self, result: WindowResult, written: int) -> dict[str, Any]:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
-        restored_frames = result.restored * len(set(result.indices) - {*result.unchanged}) if self.follow else None
+        followed = result.indices if isinstance(result.detection, FollowedVibration) else None
+        restored_frames = None if followed is None else result.restored * len({*followed} - {*result.unchanged})
         return window_record(
             None if restoration is None else restoration.verdict,
             result.bad_frames,
@@ -295,7 +328,7 @@ class StackJob:
             detection=result.detection and DetectedVibration.of(result.detection),
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
-            middle=result.middle,
+            followed=followed,
             restored_frames=restored_frames,
         )
 
@@ -315,20 +348,41 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
     """
     with closing(job.open()) as reader:
         last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
-        shared = 1 + (WARM_UP if job.follow else 0)
+        shared = 1 + (2 * MARGIN if job.follow else 0)
         for window in windows:
             frames = [last[index] if index in last else stored_frame(reader.frame, index) for index in window.frames]
             last = dict(zip(window.frames[-shared:], frames[-shared:], strict=True))
             yield window, frames
 
 
+_TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
+
+
 def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
     """Options of ``restore`` without those that frames which are restored one by one do not have."""
     given = dict(restoration or {})
-    for name in ("joint", "scale", "mosaic", "optics"):
+    for name in _TOGETHER:
         if given.pop(name, None) not in (None, False, 1):
             raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
     return given
+
+
+def _follows(
+    options: StackDetectionOptions, restoration: OptionTable, detection: OptionTable, given: object
+) -> bool | Literal["auto"]:
+    """Whether the vibration is followed; ``"auto"`` is not where options are given that frames one by one do not have.
+
+    Raises:
+        ValueError: If it is requested with such an option.
+    """
+    if options.follow is True:
+        if detection or given is not None:
+            raise ValueError("follow=True has no options of detection, and no given detections")
+        single_frame_options(restoration)
+    elif options.follow == "auto":
+        together = any((restoration or {}).get(name) not in (None, False, 1) for name in _TOGETHER)
+        return False if detection or given is not None or together else "auto"
+    return options.follow
 
 
 def plan_job(
@@ -358,11 +412,8 @@ def plan_job(
     device = default if options.device == "auto" else options.device
     restored = options if isinstance(options, StackOptions) else None
     run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
-    if options.follow and (detection or run.given is not None):
-        raise ValueError("follow=True has no options of detection, and no given detections")
-    restoration = None
-    if restored is not None:
-        restoration = single_frame_options(restored.restoration) if options.follow else dict(restored.restoration or {})
+    restoration = None if restored is None else dict(restored.restoration or {})
+    follow = _follows(options, restoration, detection, run.given if run.motion is None else run.motion)
     job = StackJob(
         Path(source),
         info,
@@ -376,14 +427,14 @@ def plan_job(
         restored is not None and restored.force,
         device,
         options.window,
-        options.follow,
+        follow,
     )
     if job.mosaic is not None:
         check_mosaic(job.mosaic, info.shape, str(source))
     if job.restoration is not None:
         check_optics(RestorationOptions(**job.restoration).optics)
-    before = WARM_UP if job.follow else 0
-    windows = cut_windows(info.shape[0], job.window, before)
+    margin = MARGIN if job.follow else 0
+    windows = cut_windows(info.shape[0], job.window, margin)
     if options.workers is not None:
         most = options.workers
     elif device != "cpu":
@@ -399,7 +450,7 @@ def plan_job(
         most=most,
         restoration=job.restoration,
         on_gpu=device != "cpu",
-        before=before,
+        margin=margin,
     )
     return job, windows, at_once
 

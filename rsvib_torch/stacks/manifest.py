@@ -4,18 +4,19 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
 from typing import Any
 
 import numpy as np
+import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import split_range
-from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.results.presentation import (
     AXIS_NAMES,
@@ -82,8 +83,9 @@ class StackManifest(Result, file_format="rsvib stack"):
         Phases refer to ``start_s``, the exposure start of the first row of the window.
         """
         lines = []
-        for record, middle in zip(self.windows, self._middle_times(), strict=True):
-            first: dict[str, Any] = {"window": record.window, "first_frame": record.first, "last_frame": record.last}
+        for record, frame, found, middle in self._results():
+            ends = (record.first, record.last) if frame is None else (frame, frame)
+            first: dict[str, Any] = {"window": record.window, "first_frame": ends[0], "last_frame": ends[1]}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
             note = record.error or "; ".join(map(str, record.left_alone))
             last = {
@@ -93,22 +95,46 @@ class StackManifest(Result, file_format="rsvib stack"):
                 "note": note,
             }
             last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
-            tones = [{}] if record.detection is None else record.detection.tone_lines(pixel_size)
+            tones = [{}] if found is None else found.tone_lines(pixel_size)
             lines += [{**first, **tone, **last} for tone in tones]
         return joined_columns(lines)
 
-    def _middle_times(self) -> list[float | None]:
-        """Middle of the frames of each window in s; of windows that were followed, the middle of their middle frame."""
-        if self.settings.get("sensor") is None:
-            return [None] * len(self.windows)
-        timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
-        rows = self.input["shape"][timing.scan_axis]
-        half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
-        starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
-        ends = [
-            (record.first, record.last) if record.middle is None else 2 * (record.middle,) for record in self.windows
+    def _results(self) -> Iterator[tuple[WindowRecord, int | None, DetectedVibration | None, float | None]]:
+        """Each detection with its window, its frame if it is that of a frame, and the middle of its frames in s."""
+        starts, half_frame = None, 0.0
+        if self.settings.get("sensor") is not None:
+            timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
+            rows = self.input["shape"][timing.scan_axis]
+            half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+            starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
+        for record in self.windows:
+            found: list[tuple[int | None, DetectedVibration | None]] = [(None, record.detection)]
+            if record.followed is not None and record.detection is not None:
+                found = [(frame, record.detection[number]) for number, frame in enumerate(record.followed)]
+            for frame, detection in found:
+                ends = (record.first, record.last) if record.middle is None else (record.middle, record.middle)
+                ends = ends if frame is None else (frame, frame)
+                middle = None if starts is None else 0.5 * (starts[ends[0]] + starts[ends[1]]) + half_frame
+                yield record, frame, detection, middle
+
+    def followed(self) -> FollowedVibration | None:
+        """The vibration at every frame, with the time origin of the stack; None unless all windows were followed."""
+        parts = []
+        for record, frame, found, middle in self._results():
+            if frame is None or found is None or middle is None:
+                return None
+            time = torch.tensor(middle - record.start_time, dtype=torch.float64)
+            one = FollowedVibration(**{part.name: getattr(found, part.name) for part in fields(found)}, times=time)
+            parts.append(one.timed_from(-record.start_time))
+        count = max(one.gain.shape[-1] for one in parts)
+        return FollowedVibration.stacked([one.with_tones(count) for one in parts])
+
+    def times(self) -> list[float]:
+        """Time of each of the ``detections`` in s: start of the window, or middle of the frame."""
+        return [
+            record.start_time if frame is None or middle is None else middle
+            for record, frame, _, middle in self._results()
         ]
-        return [0.5 * (starts[first] + starts[last]) + half_frame for first, last in ends]
 
     @property
     def shaking(self) -> dict[str, tuple[float, ...]] | None:
@@ -142,30 +168,45 @@ class StackManifest(Result, file_format="rsvib stack"):
     def tone_table(self, pixel_size: float | None = None) -> tuple[list[str], list[list[str]]]:
         """Head and rows of a table of the tones of each axis: median ± standard deviation over the windows.
 
-        With the size of a pixel in m, there are columns in units of length for x and y.
+        Of a vibration that was followed, the amplitudes in the first and in the last frame. With the size of a pixel in
+        m, there are columns in units of length for x and y.
         """
-        rows = []
+        rows, count, unit = [], len(self.detections()), self._unit
         for name, of_axis in self.totals()["tones"].items():
             for tone in of_axis["tones"] or [{"windows": 0}]:
                 texts = [
                     measured_text(tone[quantity], tone[f"{quantity}_spread"]) if tone["windows"] else ""
                     for quantity in ("amplitude", "frequency")
                 ]
+                if unit != "windows" and tone["windows"]:
+                    texts[0] = f"{tone['first']:.4g} … {tone['last']:.4g}"
                 if pixel_size is not None:
                     known = tone["windows"] and name in ("x", "y")
                     physical = physical_tone(tone["amplitude"], tone["frequency"], pixel_size).values() if known else ()
                     texts += [measured_text(value) for value in physical] or [""] * len(PHYSICAL_HEAD)
-                rows.append([name, f"{tone['windows']} of {len(self.windows)}", *texts])
-        head = ["axis", "reliable windows", "amplitude (px)", "frequency (Hz)"]
+                rows.append([name, f"{tone['windows']} of {count}", *texts])
+        head = ["axis", f"reliable {unit}", "amplitude (px)", "frequency (Hz)"]
         return [*head, *(PHYSICAL_HEAD if pixel_size is not None else ())], rows
 
     def lines(self, pixel_size: float | None = None) -> tuple[list[str], list[str]]:
         """The totals as lines of text: about the vibration, and about the restoration."""
         data = self.totals()
-        vibration = [
-            text_table(*self.tone_table(pixel_size)),
-            "median ± standard deviation over the windows",
-        ]
+        spread = f"median ± standard deviation over the {self._unit}"
+        if self._unit != "windows":
+            spread = f"amplitude: in the first and the last frame; frequency: {spread}"
+        vibration = [text_table(*self.tone_table(pixel_size)), spread]
+        followed = [record for record in self.windows if record.followed is not None]
+        if followed and self.settings.get("follow") == "auto":
+            which = (
+                "all windows"
+                if len(followed) == len(self.windows)
+                else f"{len(followed)} of {len(self.windows)} windows"
+            )
+            vibration.append(
+                wrapped(
+                    f"the tones change within {which}, which were therefore followed from frame to frame (--follow)"
+                )
+            )
         if self.gyroscope is not None:
             found = self.gyroscope
             axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
@@ -175,10 +216,10 @@ class StackManifest(Result, file_format="rsvib stack"):
                 f"focal length {measured_text(found['focal_length'], found['focal_length_std'])} px",
             ]
         restoration = [f"{data['restored']} of {number_of(data['windows'], 'window')} restored"]
-        followed = [record for record in self.windows if record.restored_frames is not None]
-        if followed:
+        if any(record.written for record in followed):
             count = sum(record.restored_frames or 0 for record in followed)
-            restoration.append(f"{count} of {sum(record.written for record in followed)} frames restored")
+            which = "" if len(followed) == len(self.windows) else " of the windows that were followed"
+            restoration.append(f"{count} of {sum(record.written for record in followed)} frames{which} restored")
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
             restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
@@ -200,6 +241,12 @@ class StackManifest(Result, file_format="rsvib stack"):
             vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
 
+    @property
+    def _unit(self) -> str:
+        """What has a detection."""
+        followed = [record.followed is not None for record in self.windows]
+        return "frames" if all(followed) else "windows or frames" if any(followed) else "windows"
+
     def _has_no_tone(self) -> bool:
         """Whether all windows were measured, and nothing else than missing tones is stated against any axis."""
         codes = [
@@ -210,8 +257,8 @@ class StackManifest(Result, file_format="rsvib stack"):
         return bool(codes) and set(codes) == {"no_tone"}
 
     def detections(self) -> list[DetectedVibration | None]:
-        """The detection of every window; None where it failed."""
-        return [record.detection for record in self.windows]
+        """The detection of every window, or of every frame of a window that was followed; None where it failed."""
+        return [found for _, _, found, _ in self._results()]
 
 
 _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window closer than this is the same one
@@ -243,6 +290,7 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
         entry: dict[str, Any] = {"windows": len(tone)}
         for name, values in zip(("amplitude", "frequency"), zip(*tone, strict=True), strict=True):
             entry |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
+        entry |= {"first": tone[0][0], "last": tone[-1][0]}
         described.append(entry)
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 

@@ -74,18 +74,23 @@ def windows_at_once(
     most: int,
     restoration: Mapping[str, Any] | None,
     on_gpu: bool = False,
-    before: int = 0,
+    margin: int = 0,
 ) -> int:
     """Number of windows that can be processed at once, at most ``most``, within the memory of the machine.
 
-    As many frames ``before`` each window are read as well.
+    As many frames as ``margin`` before and after each window are read as well; their motion is measured one by one.
 
     The error about too little memory states the required size and the largest window that fits.
     """
     limit = memory_limit(memory)
 
+    pixels = 2 * min(margin, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
+    around = pixels * (
+        np.dtype(info.dtype).itemsize + 4
+    )  # as stored and as float32; less than a window takes otherwise
+
     def needed(frames: int, count: int = 1) -> int:
-        return memory_needed(info, frames + before, restoration, count, on_gpu=on_gpu)
+        return memory_needed(info, frames, restoration, count, on_gpu=on_gpu) + count * around
 
     process, one = needed(window, 0), needed(window)
     count = (limit - process) // (one - process)

@@ -129,7 +129,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     """
     sink = Path(sink)
     scheduler, compression, given = options.scheduler, options.compression, options.given
-    other = options.follow or options.detection or given is not None
+    other = options.follow is True or options.detection or given is not None
     if options.motion is not None and (other or not isinstance(options.motion, FreeMotion)):
         raise ValueError("motion must be a FreeMotion; it has no detection, given detections or follow beside it")
     job, windows, at_once = plan_job(source, timing, options, here=scheduler in (None, "local"))

@@ -1,10 +1,8 @@
 """Restoration of the frames of one window, with a check of each frame and a verdict; also frame by frame (follow)."""
 
-import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,19 +16,17 @@ from rsvib_torch.frames.pixels import detailed_columns
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.io.full_scale import beyond_full_scale
-from rsvib_torch.motion.detected_vibration import DetectedVibration
+from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
-from rsvib_torch.restoration.restore import check_optics, restore_prepared, unchanged_frames
+from rsvib_torch.restoration.restore import check_optics, restore_each, restore_prepared, unchanged_frames
 from rsvib_torch.restoration.verdict.judge import judge_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.stacks.windows import Window
-from rsvib_torch.tracking import TrackedFrame, VibrationTracker
 
 _JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of them
 
@@ -159,85 +155,46 @@ def frame_fault(
     return constant_frame(index) if high - low <= rounding * largest else None
 
 
-# Frames before a window. Of a tone that decays with 1.2 s at 10 frames per second, read in 13 % of the frame period, 8
-# frames left 6 of 128 reliable axes with a wrong tone, 12 and 16 frames none.
-WARM_UP = 12
-# Frames of a detection. A tone that decays is detected with smaller errors in fewer frames: with 8 instead of 4, 5 of
-# 112 axes were wrong and 19 not known (12 frames before the window).
-_START = 4
+# Frames before and after a window. Frequencies that differ by a multiple of the frame rate are distinguished by the
+# whole record: of tones that decay with 1.2 s at 10 to 22 frames per second, 32 frames left no wrong one.
+MARGIN = 12
+_LEAST_FRAMES = 4  # that two trackers run through
+# Reasons against an axis whose tones may change within the record
+_CHANGES = {"displacement_ambiguous", "rows_unexplained", "neighbours_unexplained"}
 
 
-def follow_window(
+def may_change(detection: DetectedVibration, num_frames: int) -> bool:
+    """Whether tones that change within the frames may be why an axis of a steady vibration is not reliable."""
+    return num_frames >= _LEAST_FRAMES and any(
+        not _CHANGES.isdisjoint(one.code for one in of_axis) for of_axis in detection.findings
+    )
+
+
+def restore_followed(
     frames: Tensor,
-    indices: list[int],
-    times: list[float],
-    window: Window,
     timing: SensorTiming,
-    restoration: Mapping[str, Any] | None,
+    followed: FollowedVibration,
+    options: Mapping[str, Any],
     *,
     force: bool = False,
-) -> tuple[DetectedVibration, int, RestoredFrames | None, tuple[int, ...]] | None:
-    """Follow the vibration through a window and the frames before it, and restore the frames of the window.
-
-    ``frames`` are the usable ones, (T, H, W) or (T, C, H, W), full scale 1, ``indices`` theirs in the stack, and
-    ``times`` their exposure starts in s from the start of the window. Without options of ``restoration``, nothing is
-    restored.
+) -> tuple[RestoredFrames, tuple[int, ...]]:
+    """Restore the frames of a window, each with its own vibration, and judge whether that helps.
 
     Returns:
-        Vibration of the frame nearest to the middle of the window of those whose motion is known, with the time origin
-        at the start of the window; index of that frame; restored frames of the window; indices of those that are as
-        taken. None if the motion is not known in any frame of the window.
+        The frames, and the numbers of those that are as taken.
     """
-    options = RestorationOptions(**(restoration or {"method": "dewarp"}))
-    given = {"method": options.method, **(restoration or {})}
-    tracker = VibrationTracker(replace(timing, frame_start_times=None), window=_START, channels="first", **given)
-    # 1. Follow. Only frames of the window are kept.
-    tracked: dict[int, TrackedFrame] = {}
-    for index, time, frame in zip(indices, times, frames, strict=True):
-        one = tracker.update(frame, time)
-        if index >= window.first:
-            tracked[index] = one
-    known = [index for index, one in tracked.items() if one.tones is not None]
-    if not known:
-        return None
-    # 2. The vibration in the middle.
-    middle = min(known, key=lambda index: abs(2 * index - window.first - window.last))
-    detection = _timed_from_window(tracked[middle])
-    if restoration is None:
-        return detection, middle, None, ()
-    # 3. Judge two neighbouring frames near the middle, and restore all.
-    moving = [index for index in known if bool(tracked[index].motion.moving_axes().any())]
-    left = tuple(
-        Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(detection.reasons[axis])})
-        for axis, name in enumerate(AXIS_NAMES[:2])
-        if not any(bool(tracked[index].motion.moving_axes()[axis]) for index in moving)
-    )
-    verdict = None
-    pairs = [(index, later) for index, later in pairwise(tracked) if index in moving]
+    chosen = RestorationOptions(**options)
+    prepared = prepare_frames(frames, timing, saturation=chosen.saturation)
+    restored, undone, left_alone = restore_each(prepared, followed, chosen)
+    moving = undone.moving_axes().any(-1).tolist()
+    # Two neighbouring frames near the middle are judged.
+    verdict, starts = None, timing.frame_starts(len(moving)).tolist()
+    pairs = [index for index in range(len(moving) - 1) if moving[index] and moving[index + 1]]
     if pairs:
-        first, later = min(pairs, key=lambda pair: abs(pair[0] - middle))
-        both, interval = [indices.index(index) for index in (first, later)], tracked[later].time - tracked[first].time
-        verdict = pair_verdict(frames[both], timing, tracked[first].motion, interval, options)
-    written = [index for index in tracked if index in window.written]
-    unchanged = tuple(index for index in written if index not in moving)
-    keep = len(unchanged) < len(written) and (verdict is None or verdict.overall != "worse" or force)
-    results = [
-        tracked[index].restored if keep and index in moving else frames[indices.index(index)] for index in written
-    ]
-    stacked = torch.stack(results) if results else frames[:0]
-    return detection, middle, RestoredFrames(stacked, keep, left, verdict, bool(moving)), unchanged
-
-
-def _timed_from_window(tracked: TrackedFrame) -> DetectedVibration:
-    """The vibration at a frame, whose time is that from the start of its window, with the time origin there."""
-    found = tracked.detection
-    assert found is not None
-    vibration, std, elapsed = found.vibration, found.std, tracked.time
-    turn = 2 * math.pi * elapsed
-    moved = replace(
-        vibration,
-        phase=torch.remainder(vibration.phase - turn * vibration.frequency + math.pi, 2 * math.pi) - math.pi,
-        image_motion=vibration.image_motion - elapsed * vibration.image_acceleration,
-    )
-    phase_std = torch.hypot(std.phase, turn * std.frequency)
-    return replace(DetectedVibration.of(found), vibration=moved, std=replace(std, phase=phase_std))
+        first = min(pairs, key=lambda index: abs(2 * index + 2 - len(moving)))
+        interval = starts[first + 1] - starts[first]
+        verdict = pair_verdict(frames[first : first + 2], timing, undone[first], interval, chosen)
+    keep = any(moving) and (verdict is None or verdict.overall != "worse" or force)
+    result = prepared.from_row_order(restored) if keep else frames
+    unchanged = tuple(index for index, moves in enumerate(moving) if not (moves and keep))
+    return RestoredFrames(result, keep, left_alone, verdict, any(moving)), unchanged

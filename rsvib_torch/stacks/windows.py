@@ -27,12 +27,13 @@ class Window:
     first: int
     last: int  # inclusive
     kept: int  # number of frames that it writes
-    before: int = 0  # frames before the first that are read as well, to begin to follow the vibration
+    before: int = 0  # frames before the first that are read as well, to follow the vibration
+    after: int = 0  # the same after the last
 
     @property
     def frames(self) -> range:
         """Indices of the frames that are read."""
-        return range(self.first - self.before, self.last + 1)
+        return range(self.first - self.before, self.last + self.after + 1)
 
     @property
     def written(self) -> range:
@@ -42,10 +43,10 @@ class Window:
     @property
     def alone(self) -> bool:
         """Whether it is the whole stack."""
-        return self.index == 0 and self.kept == len(self.frames)
+        return self.index == 0 and self.kept == self.last + 1 - self.first
 
 
-def cut_windows(num_frames: int, window: int, before: int = 0) -> list[Window]:
+def cut_windows(num_frames: int, window: int, margin: int = 0) -> list[Window]:
     """Cut a stack into windows of at most ``window`` frames, of equal length to within one frame.
 
     They depend only on the arguments.
@@ -53,7 +54,7 @@ def cut_windows(num_frames: int, window: int, before: int = 0) -> list[Window]:
     Args:
         num_frames: Number of frames of the stack.
         window: Maximum number of frames of a window, at least 2.
-        before: Number of frames before each window that are read as well, if there are so many.
+        margin: Number of frames before and after each window that are read as well, if there are so many.
 
     Returns:
         Windows in order; a stack of up to ``window`` frames is one window.
@@ -68,16 +69,23 @@ def cut_windows(num_frames: int, window: int, before: int = 0) -> list[Window]:
     borders = [index * pairs // count for index in range(count + 1)]
     borders[-1] = num_frames - 1
     return [
-        Window(index, first, last, last - first + (index == count - 1), min(before, first))
+        Window(
+            index,
+            first,
+            last,
+            last - first + (index == count - 1),
+            min(margin, first),
+            min(margin, num_frames - 1 - last),
+        )
         for index, (first, last) in enumerate(itertools.pairwise(borders))
     ]
 
 
 def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> SensorTiming:
     """Timing of the usable ``frames`` of a window as a stack, with the time origin at the first frame of the window."""
-    if timing.frame_start_times is None and frames == list(window.frames):
+    if timing.frame_start_times is None and frames == list(range(window.first, window.last + 1)):
         return timing
-    starts = timing.frame_starts(window.last + 1)
+    starts = timing.frame_starts(window.frames[-1] + 1)
     return replace(timing, frame_start_times=starts[torch.tensor(frames, device="cpu")] - starts[window.first])
 
 
@@ -91,7 +99,7 @@ class WindowRecord:
     start_time: float  # s, exposure start of its first row, the time origin of its detection
     written: int  # number of frames written
     frames: Literal["restored", "as taken"]  # those that are written
-    detection: DetectedVibration | None  # None if it failed
+    detection: DetectedVibration | None  # None if it failed; of a window that was followed, a batch of its frames
     left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
     outcome: str | None  # ``RestorationVerdict.overall``; None if the frames could not be compared
     summary: str | None  # ``RestorationVerdict.sentence``
@@ -101,8 +109,10 @@ class WindowRecord:
     # Of a part of a video, rms motion in px before and after, in its first frames: ``frame_to_frame``, changes of the
     # motion of the frame, and ``rows``, of twelfths of the rows beside it. None: not measured.
     shaking: dict[str, tuple[float, ...]] | None = None
-    middle: int | None = None  # with ``follow=True``, the frame whose vibration is stated; None if it is not known
-    restored_frames: int | None = None  # with ``follow=True``, number of frames written that are restored
+    # of a window that was followed: the frames of its detection, and those that are restored
+    followed: tuple[int, ...] | None = None
+    restored_frames: int | None = None
+    middle: int | None = None  # of a part of a video, the frame whose vibration is stated
 
 
 def window_record(

@@ -5,9 +5,9 @@ are measured as in ``detect_vibration`` (``detection.rows``). They correct the p
 gradients of the scene are kept while the scene stays within a few pixels. Detection from several frames
 (``detection.pipeline``) is only needed to begin, and again if the rows contradict the prediction.
 
-All that the tracker knows is one immutable ``_State``. A frame takes it through these steps, each of which returns
-another state: ``_measured`` or, for a late frame, ``_predicted``; then, if the motion is not known or contradicted,
-``_detected``. The result for the user (``tracked_frame``) is made from the last state.
+All that the tracker knows is one immutable ``TrackerState``. A frame takes it through these steps, each of which
+returns another state: ``_measured`` or, for a late frame, ``_predicted``; then, if the motion is not known or
+contradicted, ``_detected``. The result for the user (``tracked_frame``) is made from the last state.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -44,7 +44,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.detection.tones.selection import MIN_SIGNIFICANCE
 from rsvib_torch.detection.tones.uncertainty import with_unknown_amplitudes
-from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons
+from rsvib_torch.detection.verdict import contradicted_axes, judged, scene_reasons, with_remedy
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, outside_graphs, without_gradients
 from rsvib_torch.frames.entry_points import module_options
@@ -80,7 +80,7 @@ _DIRECT_ATTEMPTS = 2  # consecutive attempts; after them only bands are tried
 _FEW_ROWS = 256  # rows of a frame; smaller frames have few bands, and every attempt uses the direct method as well
 _MIN_VALID = 0.1  # of the pixels of each frame, to detect the vibration; as in detect_vibration
 _MAX_DOUBLED = 4  # times that the number of frames between two attempts to detect the vibration is doubled
-_PATIENCE = 3  # consecutive frames that contradict the tones, before the state is "searching"
+PATIENCE = 3  # consecutive frames that contradict the tones, before the state is "searching"
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class _Track:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class TrackerState:
     """All that the tracker knows after a frame. It is never changed: a step returns another one."""
 
     time: float = -math.inf  # s, exposure start of the last frame
@@ -149,7 +149,7 @@ class _State:
     contradictions: int = 0  # consecutive frames, and starts of the filter, whose rows contradict the tones
     lost: str = ""  # why the motion that was followed until the last frame is not known any more
 
-    def without_track(self, reason: str) -> "_State":
+    def without_track(self, reason: str) -> "TrackerState":
         """The state without the motion that was followed, if there was one."""
         return replace(self, track=None, lost="" if self.track is None else reason)
 
@@ -196,7 +196,7 @@ class VibrationTracker:
 
     def reset(self) -> None:
         """Forget all frames, e.g. after a change of the camera's settings."""
-        self._state = _State()
+        self._state = TrackerState()
 
     @outside_graphs
     @full_precision
@@ -271,7 +271,7 @@ class VibrationTracker:
 
     # Tracking
 
-    def _measured(self, state: _State) -> _State:
+    def _measured(self, state: TrackerState) -> TrackerState:
         """Compare the last frame with the one before, and correct the motion that is followed."""
         track = state.track
         if track is None:
@@ -354,9 +354,11 @@ class VibrationTracker:
             timing=self._rows,
             max_tones=MAX_TONES,
         )
+        # the tones are followed already
+        findings = tuple(with_remedy(of_axis, "use frames at shorter intervals") for of_axis in findings)
         return TrackedTones(frame.time, fit, measurements, findings)
 
-    def _predicted(self, state: _State) -> _State | None:
+    def _predicted(self, state: TrackerState) -> TrackerState | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
 
         The filter stays where it is: the next frame that is measured is compared with the last one that was.
@@ -376,7 +378,7 @@ class VibrationTracker:
 
     # Detection
 
-    def _frames_to_detect(self, state: _State) -> int:
+    def _frames_to_detect(self, state: TrackerState) -> int:
         """Number of last frames to detect the vibration from; 0 if it is known, or if it is too early to try again.
 
         After a change of the vibration, only frames behind the change are used: half a window first, then whole windows
@@ -390,7 +392,7 @@ class VibrationTracker:
             return 0
         return min(new, len(state.frames))
 
-    def _detected(self, state: _State) -> _State:
+    def _detected(self, state: TrackerState) -> TrackerState:
         """Detect the vibration in the last frames if that is due, and follow its tones from the last frame."""
         count = self._frames_to_detect(state)
         if count == 0:
@@ -437,7 +439,9 @@ class VibrationTracker:
         stacks = GreyFrames(without_mosaic(images), mask, batched=False, timing=self._rows)
         return stacks if self.options.columns is None else stacks.narrowed(self.options.columns)
 
-    def _started(self, state: _State, found: Attempt, chosen: Tensor, middle: float, record: float) -> _State:
+    def _started(
+        self, state: TrackerState, found: Attempt, chosen: Tensor, middle: float, record: float
+    ) -> TrackerState:
         """Start the filter with the ``chosen`` (2, K) tones of a detection from the last frames; measure the last one.
 
         The ``middle`` of these frames is the time origin of the detection, the ``record`` their duration (s).
@@ -457,16 +461,30 @@ class VibrationTracker:
             return state.without_track("the rows cannot be measured")
         # 2. Tones, with twice the standard deviations, because the last frame is measured again. Those of a record
         # allow for further tones, which the filter does not.
-        tones = tones * ~slow
         size_std = torch.minimum(std.amplitude, 0.05 * vibration.amplitude)
-        growth_std = torch.full_like(size_std, _GROWTH_STD)
-        parts = torch.stack([size_std, size_std, growth_std, 2 * math.pi * std.frequency], -1)
-        tone_std = torch.where((tones.abs() > 0)[..., None], 2.0 * parts, 0.0).flatten(-2)
-        all_std = torch.cat([tone_std, tone_std.new_tensor(_DRIFT_STD).expand(2, -1)], -1)
-        coefficients, frequency, start, start_std = tables(tones, vibration.frequency, drift, all_std)
-        exposure_time = self._rows.exposure_time
-        started = ToneFilter.started(middle, coefficients, frequency, start, start_std, exposure_time)
-        # 3. The last frame is compared with the one before.
+        return self._begun(
+            state, middle, *tables(tones * ~slow, vibration.frequency, drift, 2.0 * size_std, 2.0 * std.frequency)
+        )
+
+    def _begun(
+        self,
+        state: TrackerState,
+        time: float,
+        coefficients: Array,
+        frequency: Array,
+        drift: Array,
+        size_std: Array,
+        frequency_std: Array,
+    ) -> TrackerState:
+        """Start the filter with tones (2, K) at a time, and compare the last frame with the one before.
+
+        Coefficients are those of ``ToneFilter``; standard deviations (2, K) are in px and Hz.
+        """
+        growth_std = np.full_like(size_std, 2.0 * _GROWTH_STD)
+        parts = np.stack([size_std, size_std, growth_std, 2 * math.pi * frequency_std], -1)
+        tone_std = np.where((np.abs(coefficients) > 0)[..., None], parts, 0.0).reshape(2, -1)
+        all_std = np.concatenate([tone_std, np.broadcast_to(_DRIFT_STD, (2, 2))], -1)
+        started = ToneFilter.started(time, coefficients, frequency, drift, all_std, self._rows.exposure_time)
         before, last = state.frames[-2:]
         columns = (
             slice(None) if self.options.columns is None else detailed_columns(last.images[0, 0], self.options.columns)
@@ -476,7 +494,7 @@ class VibrationTracker:
 
     # Results
 
-    def _result(self, prepared: PreparedFrames, state: _State, *, usable: bool = True) -> TrackedFrame:
+    def _result(self, prepared: PreparedFrames, state: TrackerState, *, usable: bool = True) -> TrackedFrame:
         """The result for the last frame."""
         label: TrackingState = "searching" if usable else "unusable"
         device, measurements = prepared.images.device, None
@@ -496,7 +514,7 @@ class VibrationTracker:
             motion = motion.from_row_order(self.timing)
             place = state.path + track.filter.path(state.time + half - track.filter.time)
             path = offsets_from_row_order(tensor(place).to(device), self.timing)
-            label = "searching" if state.contradictions >= _PATIENCE else "tracking"
+            label = "searching" if state.contradictions >= PATIENCE else "tracking"
         return TrackedFrame(
             time=state.time,
             state=label,

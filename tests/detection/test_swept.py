@@ -101,6 +101,23 @@ def test_other_minima_are_left(scene):
     assert (found.std["frequency"] < 1.5).all()
 
 
+@pytest.mark.parametrize(
+    ("rate", "hertz", "codes"), [(10.36, (60.98, 95.35), [(), ()]), (15.2, (70.0, 91.2), [(), ("tone_blind",)])]
+)
+def test_aliases_are_tried_and_blind_tones_refused(rate, hertz, codes):
+    """Without aliases, 95.35 Hz was found as 85.00 ± 0.01 Hz; 91.2 Hz is six times the frame rate."""
+    timing = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1e4 / rate)
+
+    def decaying(times):
+        return np.exp(-times / 1.2)[..., None] * [2.5, 1.36] * np.sin(2 * np.pi * times[..., None] * hertz + 1.0)
+
+    frames = take_frames(draw_scene(208, 208, 1), timing, Curve(decaying), 40, noise=0.003)
+    found = rsv.detect_swept_tone(frames, timing)
+    assert [tuple(reason.code for reason in of_axis) for of_axis in found.findings] == codes
+    for axis in np.flatnonzero(found.reliable.numpy()):
+        assert found.frequency[axis].item() == pytest.approx(hertz[axis], abs=0.01)
+
+
 @pytest.mark.parametrize("contrast", [0.0, 0.02, 0.3])  # of the scene; without the check 4.20 ± 0.08 px for 0.02
 def test_noise_that_hides_the_scene_is_refused(scene, contrast):
     flat = 0.5 + contrast * (torch.from_numpy(take_frames(scene, TIMING, tone(0.5, 60.0), 3, 0.0)) - 0.5)

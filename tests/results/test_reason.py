@@ -6,7 +6,8 @@ from string import Formatter
 
 import pytest
 
-from rsvib_torch.results.reason import GROUPS, REASONS, Reason, read_findings
+from rsvib_torch.detection.verdict import with_remedy
+from rsvib_torch.results.reason import GROUPS, REASONS, Reason, options_of_the_program, read_findings
 
 VALUE, LIMIT = 3.0, 7.0
 
@@ -78,3 +79,14 @@ def test_stored_reasons_have_a_known_code(stored, code):
 def test_wrong_reasons_are_refused(values, message):
     with pytest.raises(ValueError, match=message):
         Reason(**values)
+
+
+def test_the_program_names_its_own_options():
+    reason = Reason("rows_unexplained", "x", 0.2, 0.05)
+    assert "use follow=True if the vibration changes, try more tones or model='free'" in str(reason)
+    with options_of_the_program():
+        assert "use --follow if the vibration changes, try more tones or rsvib motion" in str(reason)
+        assert "check --frame-rate, --row-time" in str(reason)
+        followed = with_remedy([reason], "use frames at shorter intervals")[0]
+        assert str(followed).endswith("0.05 px are allowed; use frames at shorter intervals")
+    assert "follow=True" in str(reason)

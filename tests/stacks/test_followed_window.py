@@ -2,9 +2,11 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from program import refused, rsvib
 from truth import Curve, crop, decibel, draw_scene, take_frames
 
@@ -35,43 +37,95 @@ def make_place(tmp_path_factory):
 
 
 def follow(folder, sink, **options):
+    options = {"restoration": {"method": "dewarp"}} | options
     return rsv.process_stack(folder / "frames.npy", sink, TIMING, follow=True, **options)
 
 
-def test_every_frame_is_restored_whose_motion_is_known(place):
+def test_every_frame_of_a_vibration_that_decays_is_restored(place):
     taken, restored = (np.load(place / name) for name in ("frames.npy", "out.npy"))
     before, after = ([decibel(frame, STILL) for frame in stack] for stack in (taken, restored))
-    assert np.mean(np.subtract(after, before)) > 10
-    assert min(np.subtract(after, before)) >= 0
-    unchanged = [index for index in range(FRAMES) if np.array_equal(taken[index], restored[index])]
-    assert set(unchanged) <= {0, 1}  # the vibration is detected in them
+    assert np.mean(np.subtract(after, before)) > 5
+    assert min(np.subtract(after, before)) > 0
     manifest = read_manifest(place / "out.npy.manifest.json")
-    assert sum(record.restored_frames for record in manifest.windows) == FRAMES - len(unchanged)
+    assert sum(record.restored_frames for record in manifest.windows) == FRAMES
     assert {record.outcome for record in manifest.windows} <= {"helps", "partly"}
-    assert manifest.settings["follow"]
+    assert manifest.settings["follow"] is True
 
 
-def test_each_window_states_the_vibration_at_its_middle_frame(place, tmp_path):
-    detect_stack(place / "frames.npy", tmp_path / "manifest.json", TIMING, follow=True, window=4)
-    manifest = read_manifest(tmp_path / "manifest.json")
+def errors_of(found, start, first=0):
+    """(T, 2) px, rms error of the displacement of the rows of frames from ``first`` on; time origin at ``start``."""
+    rows = np.arange(128) * TIMING.row_time + 0.5 * TIMING.exposure_time
     errors = []
-    for record in manifest.windows:
-        found, std = record.detection.vibration, record.detection.std
-        middle = record.middle * TIMING.frame_period + 0.5 * (127 * TIMING.row_time + TIMING.exposure_time)
-        size = AMPLITUDE * np.exp(-middle / DECAY)
-        for axis in np.flatnonzero(record.detection.reliable.numpy()):
-            amplitude, frequency, phase = (
-                float(values[axis, 0]) for values in (found.amplitude, found.frequency, found.phase)
-            )
-            assert frequency == pytest.approx(FREQUENCY[axis], abs=5 * float(std.frequency[axis, 0]), rel=0.05)
-            assert abs(amplitude - size[axis]) < max(5 * float(std.amplitude[axis, 0]), 0.05 * size[axis])
-            turn = 2 * np.pi * FREQUENCY[axis] * record.start_time + PHASE[axis] - phase
-            assert abs(np.angle(np.exp(1j * turn))) < 5 * float(std.phase[axis, 0])
-            errors.append(abs(amplitude / size[axis] - 1))
-    assert len(errors) > 1.8 * len(manifest.windows)  # of two axes
-    assert np.median(errors) < 0.02
-    times = manifest.table()["middle_time_s"]
-    assert times[-1] == pytest.approx(middle)
+    for number in range(len(found.times)):
+        times = (first + number) * TIMING.frame_period + rows
+        vibration = found.vibration[number]
+        amplitude, frequency, phase = (getattr(vibration, name).numpy() for name in ("amplitude", "frequency", "phase"))
+        turned = 2 * np.pi * frequency * (times - start)[:, None, None] + phase
+        error = (amplitude * np.sin(turned)).sum(-1) - decaying(times)
+        errors.append(np.sqrt(np.square(error - error.mean(0)).mean(0)))
+    return np.array(errors)
+
+
+def test_each_frame_has_the_vibration_at_its_time(place):
+    frames = np.load(place / "frames.npy")
+    found = rsv.detect_vibration(frames, TIMING, follow=True)
+    assert found.vibration.amplitude.shape == (FRAMES, 2, 1)
+    errors, reliable = errors_of(found, 0.0), found.reliable.numpy()
+    assert (reliable & (errors < 0.01)).all(1).sum() >= 36
+    assert not (reliable & (errors > np.maximum(5 * found.std.displacement.numpy(), 0.01))).any()
+    table = found.table()
+    assert len(table["axis"]) == 2 * FRAMES
+    assert table["middle_time_s"][-1] == pytest.approx(39 * TIMING.frame_period + 0.5 * (127e-4 + 1.2e-3))
+    restored = rsv.restore(frames, TIMING, found, method="dewarp").numpy()
+    assert min(decibel(restored[index], STILL) - decibel(frames[index], STILL) for index in range(0, 30, 5)) > 4
+    with pytest.raises(ValueError, match="pass the frames that it was detected in"):
+        rsv.restore(frames[:8], TIMING, found)
+
+
+def test_a_batch_of_stacks_read_from_below_is_followed(place):
+    frames = np.load(place / "frames.npy")[:16]
+    turned = rsv.SensorTiming(
+        row_time=1e-4, exposure_rows=12, frame_rows=500, scan_axis="x", readout_direction="reverse"
+    )
+    batch = np.stack([frames[:, ::-1].transpose(0, 2, 1)[:, None]] * 2)
+    found = rsv.detect_vibration(batch, turned, follow=True)
+    assert tuple(found.reliable.shape) == (2, 16, 2)
+    assert found.reliable.all()
+    amplitude = found.vibration.amplitude[1, 0].numpy().ravel()  # x across the rows
+    np.testing.assert_allclose(amplitude, AMPLITUDE[::-1] * np.exp(-0.007 / DECAY), rtol=0.02)
+    restored = rsv.restore(batch, turned, found, method="dewarp")[1, :, 0].numpy().transpose(0, 2, 1)[:, ::-1]
+    assert min(decibel(image, STILL) for image in restored) > 40
+
+
+def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
+    """Of frames that do not determine two tones of each axis, no frame is wrong."""
+    sizes, hertz = np.array([[0.97, 0.94], [2.11, 0.57]]), np.array([[29.7, 48.4], [80.9, 72.8]])
+
+    def moved(times):
+        return (sizes * np.sin(2 * np.pi * hertz * times[..., None, None])).sum(-1)
+
+    frames = take_frames(SCENE, TIMING, Curve(moved), 24, noise=0.003)
+    found = rsv.detect_vibration(frames, TIMING, follow=True)
+    rows = np.arange(128) * TIMING.row_time + 0.5 * TIMING.exposure_time
+    for number, axis in np.argwhere(found.reliable.numpy()):
+        error = (
+            found.vibration[int(number)]
+            .translation()
+            .displacement(torch.from_numpy(number * TIMING.frame_period + rows))
+        )
+        error = error.numpy()[:, axis] - moved(number * TIMING.frame_period + rows)[:, axis]
+        assert np.std(error) < 0.1
+
+
+def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
+    detect_stack(place / "frames.npy", tmp_path / "manifest.json", TIMING, follow=True, window=14)
+    manifest = read_manifest(tmp_path / "manifest.json")
+    assert len(manifest.detections()) == FRAMES
+    assert [frame for record in manifest.windows for frame in record.followed] == list(range(FRAMES))
+    table = manifest.table()
+    assert (table["first_frame"][-1], table["last_frame"][-1]) == (39, 39)
+    assert table["middle_time_s"][-1] == pytest.approx(manifest.times()[-1])
+    assert np.mean(table["reliable"]) > 0.9
 
 
 def test_result_does_not_depend_on_interruptions_windows_at_once_or_workers(place, tmp_path):
@@ -81,7 +135,7 @@ def test_result_does_not_depend_on_interruptions_windows_at_once_or_workers(plac
 
     with pytest.raises(KeyboardInterrupt):
         follow(place, tmp_path / "out.npy", progress=stop)
-    with pytest.raises(ValueError, match=r"cannot resume: settings\.follow was true, now it is false"):
+    with pytest.raises(ValueError, match=r'cannot resume: settings\.follow was true, now it is "auto"'):
         rsv.process_stack(place / "frames.npy", tmp_path / "out.npy", TIMING, resume=True)
     report = follow(place, tmp_path / "out.npy", resume=True, workers=3)
     assert 0 < report.resumed < report.windows
@@ -98,25 +152,54 @@ def test_bad_frames_are_written_as_taken_and_the_others_followed(place, tmp_path
     assert (report.bad_frames, report.restored) == (1, report.windows)
     restored = np.load(tmp_path / "out.npy")
     np.testing.assert_array_equal(restored[17], frames[17])
-    assert min(decibel(restored[index], STILL) for index in (16, 18, 19)) > 40
+    assert min(decibel(restored[index], STILL) for index in (16, 18, 19)) > 36
 
 
-def test_run_names_follow_where_a_vibration_changes_and_follows_it(place, tmp_path, capsys):
-    assert rsvib("run", place / "frames.npy", tmp_path / "steady", *CAMERA) == 0
+def test_run_and_detect_follow_a_vibration_that_changes_without_an_option(place, tmp_path, capsys):
+    for command, *target in (("run", tmp_path / "run"), ("detect", "--out", tmp_path / "detect")):
+        assert rsvib(command, place / "frames.npy", *target, *CAMERA) == 0
+        shown = " ".join(capsys.readouterr().out.split())
+        assert "the tones change within" in shown
+        assert "followed from frame to frame" in shown
+        manifest = read_manifest(target[-1] / "manifest.json")
+        right, wrong = 0, 0
+        for record in manifest.windows:
+            if record.followed is None:
+                continue
+            parts = [record.detection[number] for number in range(len(record.followed))]
+            found = SimpleNamespace(vibration=[one.vibration for one in parts], times=record.followed)
+            errors = errors_of(found, record.start_time, record.first)
+            reliable = np.array([one.reliable.numpy() for one in parts])
+            right += (reliable & (errors < 0.01)).all(1).sum()
+            stds = np.array([one.std.displacement.numpy() for one in parts])
+            wrong += (reliable & (errors > np.maximum(3 * stds, 0.01))).sum()
+        assert right >= 36
+        assert wrong == 0
+        rows = list(csv.DictReader((target[-1] / "tones.csv").read_text().splitlines()))
+        sizes = [
+            float(row["amplitude_px"]) for row in rows if row["axis"] == "x" and row["first_frame"] == row["last_frame"]
+        ]
+        assert sizes[0] > 4 * sizes[-1]
+    restored = rsv.read_stack(tmp_path / "run" / "restored.tif").numpy()
+    assert sum(decibel(restored[index], STILL) > 40 for index in range(FRAMES)) >= 36
+    shown = ("--manifest", tmp_path / "run" / "manifest.json")
+    assert rsvib("report", place / "frames.npy", tmp_path / "page", *CAMERA, *shown, "--method", "dewarp") == 0
+    answer = " ".join(capsys.readouterr().out.split())
+    assert f"{FRAMES} frames restored" in answer
+    assert "--follow if" not in answer  # the remedy of a steady vibration
+    assert "The vibration changes." in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    manifest = tmp_path / "detect" / "manifest.json"
+    again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
+    assert "repeat rsvib run" in refused(capsys, *again)
+
+
+def test_following_is_refused_where_it_is_switched_off(place, tmp_path, capsys):
+    part = place / "frames.npy"
+    assert rsvib("run", part, tmp_path / "steady", *CAMERA, "--frames", "0:12", "--no-follow") == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "0 restored" in shown
-    assert "use follow=True (--follow) if the vibration changes" in shown
-    assert rsvib("run", place / "frames.npy", tmp_path / "followed", *CAMERA, "--follow", "--window", 4) == 0
-    assert "frames restored" in capsys.readouterr().out
-    rows = list(csv.DictReader((tmp_path / "followed" / "tones.csv").read_text().splitlines()))
-    assert len(rows) == 2 * 13  # axes, windows
-    sizes = [float(row["amplitude_px"]) for row in rows if row["axis"] == "x"]
-    assert sizes[0] > 4 * sizes[-1]
-    assert rsvib("detect", place / "frames.npy", "--out", tmp_path / "detected", *CAMERA, "--follow") == 0
-    assert "--follow" in capsys.readouterr().out  # the next step
-    manifest = tmp_path / "detected" / "manifest.json"
-    again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
-    assert "repeat rsvib run --follow" in refused(capsys, *again)
+    assert "--follow" in shown
+    assert "follow=True" not in shown
 
 
 @pytest.mark.parametrize(

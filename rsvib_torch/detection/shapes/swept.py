@@ -22,10 +22,12 @@ from rsvib_torch.detection.shapes.free import (
     unexplained_reasons,
 )
 from rsvib_torch.detection.start import measurements_of_curve
+from rsvib_torch.detection.tones.fit import MIN_GAIN, offset_gain
 from rsvib_torch.detection.tones.periodogram import explained_power
 from rsvib_torch.detection.verdict import MAX_DISPLACEMENT_STD
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
+from rsvib_torch.execution.progress import whole_steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import (
@@ -171,10 +173,10 @@ def detect_swept_tone(frames: FramesOrFiles, timing: SensorTiming, options: Swep
     """
     stacks = grey_frames(frames, timing, options)
     timing = stacks.timing
-    with threads_for(stacks.images):
-        fitted = [
-            _detect(stacks.one(index), timing, options, options.iterations) for index in range(len(stacks.images))
-        ]
+    number = len(stacks.images)
+    # the start of each axis, and rounds of measuring and fitting
+    with threads_for(stacks.images), whole_steps(number * (3 + options.iterations), "steps") as step_done:
+        fitted = [_detect(stacks.one(index), timing, options, options.iterations, step_done) for index in range(number)]
     step = min(_step(one.fits, one.record, timing) for one in fitted)  # motions of a batch have common knots
     tones = [_report(one, timing, step).to(stacks.images.device) for one in fitted]
     return SweptTone.stacked(tones) if stacks.batched else tones[0]
@@ -195,15 +197,21 @@ class _Fitted:
     against: list[list[Reason]]  # reasons against each axis from the offsets of row bands
     others: list[Tensor | None]  # another fit (6,) of each axis that agrees with the rows as well, if there is one
     frames: int  # number of frames
+    intervals: Array  # s, between them
 
 
-def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int) -> _Fitted:
+def _detect(
+    stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions, iterations: int, step_done: Callable[[], None]
+) -> _Fitted:
     """Fit of one stack: start, then rounds of measuring and fitting."""
     rowwise, curve, record = start_curve(stack, timing, bands)
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
     highest = 0.5 / (bands.band_rows * rowwise.row_time)
     pairs = curve.quality.shape[1]
-    starts = [_start(banded, axis, pairs, record, highest) for axis in range(2)]
+    starts = []
+    for axis in range(2):
+        starts.append(_start(banded, axis, pairs, record, highest))
+        step_done()
     fits = torch.stack([start[0] for start in starts])
 
     def motion_of(values: Tensor) -> FreeMotion:
@@ -216,9 +224,11 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
         motion = motion_of(fits)
         measured, _ = measure_groups(groups, rowwise, motion.expanded(1).to(stack.images.device), keep_images=False)
         weighed = measured.reweighted(residual_of_motion(measured, motion))
+        starts = [_with_aliases(start, (record[1] - record[0]) / len(stack.images[0])) for start in starts]
         solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
         starts = [one[0][:4] for one in solved]
         fits = torch.stack([start[0] for start in starts])
+        step_done()
     solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
     fits, covariances, gains = (torch.stack([one[i][0] for one in solved]) for i in range(3))
     fits = torch.where(gains[:, None] > _F_THRESHOLD, fits, _still(fits))
@@ -236,7 +246,9 @@ def _detect(stack: GreyFrames, timing: SensorTiming, bands: RegistrationOptions,
     for axis, error in enumerate(band_errors(banded, motion)):
         if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
             against[axis].append(Reason("tone_of_chance", AXIS_NAMES[axis], chance[axis], _MAX_CHANCE))
-    return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, frames)
+    step_done()
+    intervals = np.diff(table(rowwise.frame_starts(frames)))
+    return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, frames, intervals)
 
 
 def _chance(banded: Measurements, motion: FreeMotion, pairs: int, candidates: float) -> list[float]:
@@ -480,6 +492,17 @@ def _at_origin(fit: Tensor, middle: float) -> Tensor:
     return torch.stack([amplitude, frequency - chirp * middle, decay, chirp, phase])
 
 
+def _with_aliases(fits: Tensor, period: float) -> Tensor:
+    """Fits, and the first one at the frequencies that differ by up to three times the frame rate.
+
+    Of 16 axes of tones that decay in 40 frames, one was found at such a frequency, and reliable.
+    """
+    steps = torch.tensor([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0], dtype=fits.dtype)
+    others = fits[:1].repeat(len(steps), 1)
+    others[:, 2] += steps / period
+    return torch.cat([fits, others[others[:, 2] > 0]])
+
+
 def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
     """Parameters at the time origin and in image axes, with standard deviations and verdict."""
     middle = 0.5 * (fitted.record[0] + fitted.record[1])
@@ -502,6 +525,9 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         elif present and (other := fitted.others[axis]) is not None:
             details = {"frequency": float(other[2]), "decay": float(other[3])}
             against.append(Reason("other_swept_tone", name, details=details))
+        gain = float(offset_gain(np.abs([float(fit[2])]), fitted.intervals)[0])
+        if present and gain < MIN_GAIN:
+            against.append(Reason("tone_blind", name, gain, MIN_GAIN, {"frequency": float(fit[2])}))
         uncertain, size = float(fitted.uncertain[axis]), float(fitted.moved[axis])
         if present and uncertain > MAX_DISPLACEMENT_STD * size:
             allowed = MAX_DISPLACEMENT_STD * size

@@ -257,6 +257,11 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     )
     if not restored and report.windows is not None and report.windows.totals()["restored"]:
         sentences[0] = words.WINDOWS_RESTORED
+    mark = words.overall_result(result, report.verdict, restored)[0]
+    if restored and report.windows is not None and report.windows.followed() is not None:
+        verdict = report.verdict
+        sentences = [words.FOLLOWED, *([] if verdict is None else sentences[-1:])]
+        mark = "good" if verdict is not None and verdict.overall == "helps" else "doubt"
     tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
     windows = None
     if report.windows is not None:
@@ -264,13 +269,12 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         lines = [*vibration[1:], *(restoration if report.windows.output is not None else [])]
         windows = {"lines": lines, "table": report.windows.tone_table()}
         if report.windows.gyroscope is None:  # no tones are searched for otherwise
-            starts = [record.start_time for record in report.windows.windows]
-            figures["windows"] = drawing(plots.windows_figure(starts, report.windows.detections()))
+            figures["windows"] = drawing(plots.windows_figure(report.windows.times(), report.windows.detections()))
     mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
         "report": report,
         "title": report.title,
-        "mark": words.overall_result(result, report.verdict, restored)[0],
+        "mark": mark,
         "verdict": sentences if restored else sentences[:1],
         "tried": tried,
         "frames_title": "Input and restored frame" if restored else "Input frame",

@@ -55,6 +55,8 @@ WINDOWS_RESTORED = (
     "removed, and are unchanged on this page."
 )
 
+FOLLOWED = "The vibration changes. It was followed from frame to frame before, see below, and is removed here as well."
+
 
 def overall_result(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> tuple[Mark, str]:
     """Overall result, which selects the colour of the verdict, and its sentence."""

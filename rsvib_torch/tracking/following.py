@@ -1,0 +1,283 @@
+"""The vibration at each frame of a stack, by trackers that run through it forwards and backwards.
+
+Both begin with the tones of the whole record (``changing_tones``). What two trackers that share no frame agree on is
+not an error of their start, and each knows the frames in which the other begins. Backwards in time, the last row of the
+last frame is the first that is exposed, and rows move in the opposite direction.
+
+Invariant: the displacement depends on the row only (docs/architecture.md).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from rsvib_torch.detection.tones.fit import displacement_std, residual_of, vibration_of_fit
+from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.progress import steps
+from rsvib_torch.frames.grey import GreyFrames, grey_frames
+from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order
+from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.motion.detected_vibration import FollowedVibration
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
+from rsvib_torch.numerics.tables import Array, table, tensor
+from rsvib_torch.options import FollowOptions, RegistrationOptions
+from rsvib_torch.results.presentation import AXIS_NAMES
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, tones_of_rows
+from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle
+from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
+
+_BANDS = RegistrationOptions()
+_SLOWEST = 1.25  # frame rates; slower tones are not distinguished from a drift that changes, which trackers follow
+_BEGIN = 3  # frames at the start of a tracker, whose rows are measured around a less accurate motion
+_TONE = ("amplitude", "frequency", "phase")
+_DRIFT = ("image_motion", "image_acceleration")
+_ACROSS = (1.0, -1.0)  # sign of displacements along and across the rows if rows are read backwards
+_SIZE_STD, _FREQUENCY_STD = 0.2, 0.2  # of the amplitude, and Hz, of the tones of a record at a frame
+# Largest rms difference of the displacements of the rows by both trackers: px, of the displacement, and standard
+# deviations of the difference.
+_MAX_APART = (0.01, 0.03, 4.0)
+# Part of the frames whose rows contradict the tones of an axis: with more, tones are missing or wrong in all frames. Of
+# 16 axes with two tones that decay, 4 had wrong displacements in frames whose rows do not contradict them.
+_MAX_CONTRADICTED = 0.07
+_CONTRADICTED = {"rows_unexplained", "neighbours_unexplained", "halves_apart", "directions_differ", "not_followed"}
+
+
+class _Follower(VibrationTracker):
+    """A tracker of grey frames in row order that begins, and begins again, with the tones of the record."""
+
+    def __init__(self, timing: RowTiming, tones: Sequence[ChangingTones], columns: int | None) -> None:
+        super().__init__(timing, columns=columns)
+        self._known = tones
+
+    def _detected(self, state: TrackerState) -> TrackerState:
+        if len(state.frames) < 2 or (state.track is not None and state.contradictions < PATIENCE):
+            return state
+        before, last = state.frames[-2:]
+        time = 0.5 * (before.time + last.time) + 0.5 * last.images.shape[-2] * self._rows.row_time
+        parts = [of_axis.at(time) for of_axis in self._known]
+        count = max(1, *(len(size) for size, _ in parts))
+        coefficients = np.array([np.pad(size, (0, count - len(size))) for size, _ in parts])
+        frequencies = np.array([np.pad(one.frequencies, (0, count - len(one.frequencies))) for one in self._known])
+        drift = np.array([[velocity, 0.0] for _, velocity in parts])
+        sizes = np.array([[_SIZE_STD], [_FREQUENCY_STD]])
+        size_std, frequency_std = sizes[0] * np.abs(coefficients), np.full_like(frequencies, sizes[1])
+        return self._begun(
+            replace(state, contradictions=0), time, coefficients, frequencies, drift, size_std, frequency_std
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _AxisAtFrame:
+    """An axis at a frame by one tracker, in row order, with the time origin of the stack."""
+
+    vibration: dict[str, Tensor]  # values of ``Vibration`` (K,) and ()
+    std: dict[str, Tensor]  # values of ``VibrationStd``
+    residual: float  # px
+    against: tuple[Reason, ...]
+    moved: Array  # (N,) px, displacement of rows by the tones, without their mean
+
+    @property
+    def displacement_std(self) -> float:
+        """px, of the displacement of the rows."""
+        return float(self.std["displacement"])
+
+
+_Judged = tuple[_AxisAtFrame | None, tuple[Reason, ...]]
+
+
+def follow_vibration(frames: FramesOrFiles, timing: SensorTiming, options: FollowOptions) -> FollowedVibration:
+    """Follow the vibration through B stacks: ``detect_vibration(follow=True)``."""
+    stacks = grey_frames(frames, timing, options)
+    with threads_for(stacks.images):
+        followed = [_followed(stacks.one(index), options) for index in range(len(stacks.images))]
+    if not stacks.batched:
+        return followed[0]
+    count = max(one.gain.shape[-1] for one in followed)
+    return FollowedVibration.stacked([one.with_tones(count) for one in followed])
+
+
+def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
+    number, height = stack.images.shape[1:3]
+    starts = table(stack.timing.in_row_order().frame_starts(number))
+    rows = replace(stack.timing.in_row_order(), frame_start_times=None)
+    images = stack.images[0] if stack.valid is None else stack.images[0].masked_fill(~stack.valid[0], math.nan)
+    ends = starts + (height - 1) * rows.row_time + rows.exposure_time
+    tones: Sequence[ChangingTones] = changing_tones(stack, _BANDS)
+    best: tuple[int, list[list[_Judged]], list[list[tuple[Reason, ...]]]] = (-1, [], [])
+    for last in (False, True):
+        # 1. Both trackers. Backwards, a frame begins with the end of its last row.
+        step = steps(2 * number, "frames")
+        forwards = _tracked(images, starts, rows, tones, options.columns, step)
+        backwards = _tracked(images.flip(0, 1), -ends[::-1], rows, _reversed(tones), options.columns, step)[::-1]
+        # 2. The measured rows may show tones that bands do not, and decide between tones.
+        measured = [(one.time, one.measurements) for one in forwards if one is not None][_BEGIN:]
+        found = tones_of_rows(measured, starts, rows, _BANDS.band_rows) if measured else tones
+        slowest = _SLOWEST * rows.frame_rate
+        missing = [known.missing(one, slowest) for known, one in zip(tones, found, strict=True)]
+        others = [
+            frequency or (known.other and one.other)
+            for known, one, frequency in zip(tones, found, missing, strict=True)
+        ]
+        # 3. What both trackers agree on, at each frame and axis.
+        known = [
+            (_at_frame(first, start, start, rows, height, 1), _at_frame(second, start, end, rows, height, -1))
+            for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
+        ]
+        judged = [
+            [
+                _judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], others[axis])
+                for axis in range(2)
+            ]
+            for both in known
+        ]
+        findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
+        reliable = sum(not of_axis for of_frame in findings for of_axis in of_frame)
+        if reliable > best[0]:
+            best = (reliable, judged, findings)
+        # 4. Once more, with the tones that are missing.
+        if last or missing == [None, None]:
+            break
+        tones = [known if one is None else other for known, other, one in zip(tones, found, missing, strict=True)]
+    _, judged, findings = best
+    return _assembled([[one for one, _ in of_frame] for of_frame in judged], findings, starts, stack)
+
+
+def _reversed(tones: Sequence[ChangingTones]) -> list[ChangingTones]:
+    """The tones backwards in time; displacements across the rows then have the opposite sign."""
+    return [
+        replace(
+            one,
+            knots=-one.knots[::-1],
+            coefficients=sign * one.coefficients[:, ::-1].conj(),
+            velocity=-sign * one.velocity[::-1],
+        )
+        for one, sign in zip(tones, _ACROSS, strict=True)
+    ]
+
+
+def _tracked(
+    images: Tensor,
+    starts: Array,
+    rows: RowTiming,
+    tones: Sequence[ChangingTones],
+    columns: int | None,
+    step: Callable[[], None],
+) -> list[TrackedTones | None]:
+    """The tones at each of T frames (T, H, W) with their starts in s; None where they are not known."""
+    tracker = _Follower(rows, tones, columns)
+    found = []
+    for image, start in zip(images, starts, strict=True):
+        found.append(tracker.update(image, float(start)).tones)
+        step()
+    return found
+
+
+def _at_frame(
+    tones: TrackedTones | None, start: float, origin: float, rows: RowTiming, height: int, direction: int
+) -> list[_AxisAtFrame] | None:
+    """Both axes at a frame that starts at ``start`` in s, from tones with the time origin ``origin``.
+
+    ``direction`` is -1 for tones backwards in time: sin(-2 pi f t + phi) = sin(2 pi f t + pi - phi).
+    """
+    if tones is None:
+        return None
+    vibration, std = vibration_of_fit(tones.fit)
+    exposures = table(rows.row_starts(1, height)[0, ::8])
+    known = displacement_std(tones.fit, exposures, rows.exposure_time)[0]
+    residual = np.nanmean(np.abs(residual_of(tones.measurements, tones.fit)[0]), (0, 1))
+    middles = start + tensor(exposures) + 0.5 * rows.exposure_time
+    axes = []
+    for axis, sign in enumerate(_ACROSS):
+        one = {name: getattr(vibration, name)[0, axis] for name in (*_TONE, *_DRIFT)}
+        stds = {name: getattr(std, name)[0, axis] for name in (*_TONE, *_DRIFT, "period")}
+        if direction < 0:
+            one["phase"] = math.pi * (1 + (sign < 0)) - one["phase"]
+            one |= {"image_motion": -sign * one["image_motion"], "image_acceleration": sign * one["image_acceleration"]}
+        turn = 2 * math.pi * origin
+        one["phase"] = torch.remainder(one["phase"] - turn * one["frequency"] + math.pi, 2 * math.pi) - math.pi
+        one["image_motion"] = one["image_motion"] - origin * one["image_acceleration"]
+        stds |= {"phase": torch.hypot(stds["phase"], turn * stds["frequency"]), "displacement": tensor(known)[axis]}
+        waves = torch.sin(2 * math.pi * one["frequency"] * middles[:, None] + one["phase"])
+        moved = table((waves * one["amplitude"] * torch.sinc(one["frequency"] * rows.exposure_time)).sum(-1))
+        against = tones.findings[axis]
+        axes.append(_AxisAtFrame(one, stds, float(residual[axis]), against, moved - moved.mean()))
+    return axes
+
+
+def _judged(
+    known: Sequence[_AxisAtFrame], name: str, other: float | None
+) -> tuple[_AxisAtFrame | None, tuple[Reason, ...]]:
+    """An axis at a frame by the tracker that knows its displacement better, and the reasons against it."""
+    if not known:
+        return None, (Reason("not_followed", name),)
+    trusted = [one for one in known if not one.against]
+    best = min(trusted or known, key=lambda one: one.displacement_std)
+    if best.against:
+        return best, best.against
+    if len(known) > 1:
+        first, second = (one.moved for one in known)
+        least, share, deviations = _MAX_APART
+        std = math.hypot(*(one.displacement_std for one in known))
+        allowed = max(least, share * float(np.sqrt(np.square(best.moved).mean())), deviations * std)
+        apart = float(np.sqrt(np.square(second - first).mean()))
+        if not apart < allowed:
+            return best, (Reason("directions_differ", name, apart, allowed),)
+    return best, () if other is None else (Reason("other_tone", name, details={"frequency": other}),)
+
+
+def _with_reasons_of_axes(findings: Sequence[Sequence[tuple[Reason, ...]]]) -> list[list[tuple[Reason, ...]]]:
+    """The reasons at each frame, and those against an axis whose rows contradict the tones in too many frames."""
+    refused: list[tuple[Reason, ...]] = []
+    for axis, name in enumerate(AXIS_NAMES[:2]):
+        share = sum(any(one.code in _CONTRADICTED for one in of_frame[axis]) for of_frame in findings) / len(findings)
+        reason = Reason("tones_contradicted", name, share, _MAX_CONTRADICTED)
+        refused.append((reason,) if share > _MAX_CONTRADICTED else ())
+    return [[of_axis or of_all for of_axis, of_all in zip(of_frame, refused, strict=True)] for of_frame in findings]
+
+
+def _assembled(
+    found: Sequence[Sequence[_AxisAtFrame | None]],
+    findings: Sequence[Sequence[tuple[Reason, ...]]],
+    starts: Array,
+    stack: GreyFrames,
+) -> FollowedVibration:
+    """The result in image axes, from each frame and axis that is known."""
+    timing = stack.timing
+    known = [(index, axis, one) for index, pair in enumerate(found) for axis, one in enumerate(pair) if one is not None]
+    count = max([1, *(len(one.vibration["amplitude"]) for _, _, one in known)])
+
+    def of_axes(part: str, name: str, unknown: float) -> Tensor:
+        """(T, 2, K) values of tones, padded with zeros, or (T, 2) others."""
+        shape = (count,) if name in (*_TONE, "period") else ()
+        values = torch.full((len(found), 2, *shape), unknown, dtype=torch.float64)
+        for index, axis, one in known:
+            given = getattr(one, part)[name]
+            values[index, axis] = functional.pad(given, (0, count - len(given))) if shape else given
+        return values
+
+    amplitude, frequency, phase = (of_axes("vibration", name, 0.0) for name in _TONE)
+    speed, acceleration = (of_axes("vibration", name, 0.0) for name in _DRIFT)
+    vibration = Vibration(amplitude, frequency, phase, speed, acceleration).from_row_order(timing)
+    of_std = ("amplitude", "frequency", "period", "phase", *_DRIFT, "displacement")
+    std = VibrationStd(*(of_axes("std", name, math.inf) for name in of_std))
+    reliable = torch.tensor([[not of_axis for of_axis in of_frame] for of_frame in findings])
+    residual = torch.full((len(found), 2), math.nan, dtype=torch.float64)
+    for index, axis, one in known:
+        residual[index, axis] = one.residual
+    return FollowedVibration(
+        vibration=vibration,
+        std=std.from_row_order(timing),
+        gain=vibration.gain(float(np.diff(starts).min())),
+        residual=magnitudes_from_row_order(residual, timing),
+        reliable=magnitudes_from_row_order(reliable, timing),
+        findings=tuple(findings_from_row_order(of_frame, timing) for of_frame in findings),
+        assumptions=((),) * len(found),
+        times=tensor(starts + time_to_middle(stack.images.shape[-2], timing.in_row_order())),
+    ).to(stack.images.device)
