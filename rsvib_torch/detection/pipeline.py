@@ -252,10 +252,10 @@ def fit_directly(
     else:  # pairs take several times as long, and are not needed to find that there is no roll
         frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs=not doubtful)
     refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
-    # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames very differently.
+    # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames differently.
     if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
         motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
-        if frames.differently_blurred(motion)[1].any():
+        if frames.differently_blurred(motion)[0].any():
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
             again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)

@@ -256,7 +256,7 @@ def _assembled(
     def of_axes(part: str, name: str, unknown: float) -> Tensor:
         """(T, 2, K) values of tones, padded with zeros, or (T, 2) others."""
         shape = (count,) if name in (*_TONE, "period") else ()
-        values = torch.full((len(found), 2, *shape), unknown, dtype=torch.float64)
+        values = torch.full((len(found), 2, *shape), unknown, dtype=torch.float64, device="cpu")
         for index, axis, one in known:
             given = getattr(one, part)[name]
             values[index, axis] = functional.pad(given, (0, count - len(given))) if shape else given
@@ -267,8 +267,8 @@ def _assembled(
     vibration = Vibration(amplitude, frequency, phase, speed, acceleration).from_row_order(timing)
     of_std = ("amplitude", "frequency", "period", "phase", *_DRIFT, "displacement")
     std = VibrationStd(*(of_axes("std", name, math.inf) for name in of_std))
-    reliable = torch.tensor([[not of_axis for of_axis in of_frame] for of_frame in findings])
-    residual = torch.full((len(found), 2), math.nan, dtype=torch.float64)
+    reliable = torch.tensor([[not of_axis for of_axis in of_frame] for of_frame in findings], device="cpu")
+    residual = torch.full((len(found), 2), math.nan, dtype=torch.float64, device="cpu")
     for index, axis, one in known:
         residual[index, axis] = one.residual
     return FollowedVibration(

@@ -497,7 +497,7 @@ def _with_aliases(fits: Tensor, period: float) -> Tensor:
 
     Of 16 axes of tones that decay in 40 frames, one was found at such a frequency, and reliable.
     """
-    steps = torch.tensor([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0], dtype=fits.dtype)
+    steps = fits.new_tensor([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
     others = fits[:1].repeat(len(steps), 1)
     others[:, 2] += steps / period
     return torch.cat([fits, others[others[:, 2] > 0]])
