@@ -159,12 +159,12 @@ class _StateColumn(ProgressColumn):
         elapsed = str(timedelta(seconds=int(passed)))
         if task.total is None:
             return Text(elapsed)
-        state = f"{task.completed:.0f} of {task.total:.0f} {task.fields['unit']}"
+        parts = [f"{task.completed:.0f} of {task.total:.0f} {task.fields['unit']}"]
         done, seconds = task.completed - task.fields["first"], task.elapsed or 0.0
-        if done <= 0 or seconds <= 0:
-            return Text(state)
-        left = timedelta(seconds=round((task.total - task.completed) * seconds / done))
-        return Text(f"{state}  {done / seconds:.3g}/s  {left} left{f'  {elapsed} so far' * (passed >= _SHOWN_AFTER)}")
+        if done > 0 and seconds > 0 and task.completed < task.total:  # not of a loop that is followed by other work
+            left = timedelta(seconds=round((task.total - task.completed) * seconds / done))
+            parts += [f"{done / seconds:.3g}/s", f"{left} left"]
+        return Text("  ".join([*parts, *([f"{elapsed} so far"] if passed >= _SHOWN_AFTER else [])]))
 
 
 def _progress() -> Progress:
