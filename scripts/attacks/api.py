@@ -6,14 +6,13 @@ the argument. A name of ``rsvib_torch.__all__`` without a valid call raises an e
 """
 
 import copy
-import dataclasses
 import inspect
 import math
 import os
 import random
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -44,7 +43,7 @@ class Call:
 
 def _with_fields(value: Any) -> Call:
     """The constructor of a dataclass with the values of an object."""
-    names = [field.name for field in dataclasses.fields(value) if field.init]
+    names = [field.name for field in fields(value) if field.init]
     return Call(type(value), {name: getattr(value, name) for name in names})
 
 
@@ -270,11 +269,15 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described += (accelerometer, tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     described += (rsv.TimingDiagnosis("frame_rows", 104.0, 110.0, timing),)
+    of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
+    described += (rsv.FollowedVibration(**of_frame, times=times[0]),)
     described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
     for value in described:
         result[type(value).__name__] = _with_fields(value)
     for value in (vibration, recorded, timing, *described):
-        result |= _methods(value, **pool | {"path": folder / "out.json", "size": 2, "count": 3, "mosaic": "RGGB"})
+        result |= _methods(
+            value, **pool | {"path": folder / "out.json", "size": 2, "count": 3, "mosaic": "RGGB", "origin": 0.1}
+        )
     for name, given in (("forward", "scene"), ("A", "x"), ("A_adjoint", "y")):
         result[f"RowVaryingBlur.{name}"] = Call(getattr(blur, name), {given: pool[given]})
     result["RowVaryingBlur.adjoint"] = Call(blur.adjoint, {"frames": frames[0], "scene_shape": (160, 128)})
