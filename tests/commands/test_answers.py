@@ -14,6 +14,8 @@ import sys
 import termios
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 import typer
@@ -319,6 +321,17 @@ def test_progress_in_a_log_is_a_line_after_twice_the_time():
     )
     assert 3 <= len(lines) <= 8
     assert "quietly" not in done.stderr
+
+
+@pytest.mark.parametrize("options", [(), ("--window", "3")])
+def test_missing_frames_are_named_with_and_without_windows(place, tmp_path, capsys, options):
+    folder = tmp_path / "numbered"
+    folder.mkdir()
+    for number, frame in enumerate(rsv.read_stack(place / "long.tif").numpy()):
+        if number != 3:
+            cv2.imwrite(str(folder / f"frame_{number}.png"), (255 * frame).round().astype(np.uint8))
+    assert rsvib("detect", folder, "--config", place / "camera.toml", "--out", tmp_path / "o", "--json", *options) == 0
+    assert any("1 frame is missing" in note for note in json.loads(capsys.readouterr().out)["notes"])
 
 
 def test_long_operations_report_their_progress(place, tmp_path):
