@@ -1,10 +1,8 @@
 """A detected vibration with its uncertainty and verdict: what restoration needs of a detection."""
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
-import torch
 from torch import Tensor
 from torch.nn import functional
 
@@ -173,10 +171,7 @@ class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "
 
     def timed_from(self, origin: float) -> "FollowedVibration":
         """The same with another time origin, in s from the present one; times count from it as well."""
-        found, turn = self.vibration, 2 * math.pi * origin
-        phase = torch.remainder(found.phase + turn * found.frequency + math.pi, 2 * math.pi) - math.pi
-        moved = found.image_motion + origin * found.image_acceleration
-        return replace(self, vibration=replace(found, phase=phase, image_motion=moved), times=self.times - origin)
+        return replace(self, vibration=self.vibration.timed_from(origin), times=self.times - origin)
 
     def _middle_time(self, batch: tuple[int, ...]) -> float | None:
         return float(self.times[batch])

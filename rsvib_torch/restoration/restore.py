@@ -225,13 +225,9 @@ def restore_each(
         raise ValueError(f"joint={options.joint}: frames of a vibration that changes are restored one by one")
     # 1. Each frame is a stack of one, with the time origin in its middle.
     if frames.batched:
-        followed = followed.mapped(lambda values: values.flatten(0, 1))
-        object.__setattr__(followed, "findings", tuple(one for stack in followed.findings for one in stack))
-    moved = replace(
-        followed.vibration,
-        phase=followed.vibration.phase + 2 * math.pi * followed.vibration.frequency * followed.times[:, None, None],
-        image_motion=followed.vibration.image_motion + followed.vibration.image_acceleration * followed.times[:, None],
-    )
+        findings = tuple(one for stack in followed.findings for one in stack)
+        followed = replace(followed.mapped(lambda values: values.flatten(0, 1)), findings=findings)
+    moved = followed.vibration.timed_from(followed.times)
     start = -0.5 * ((height - 1) * frames.timing.row_time + frames.timing.exposure_time)
     timing = replace(frames.image_timing, frame_start_times=(start,))
     trusted, left_alone = trusted_vibration(replace(followed, vibration=moved), timing, 1, height)

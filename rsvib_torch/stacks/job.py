@@ -231,10 +231,12 @@ class StackJob:
         for index, frame in zip(window.frames, pixels, strict=True):
             if isinstance(frame, str):
                 faults[index] = frame
-            elif (fault := frame_fault(frame, index, self.full_scale, nodata=self.info.nodata)) is not None:
-                faults[index] = fault
-            else:
+                continue
+            fault = frame_fault(frame, index, self.full_scale, nodata=self.info.nodata)
+            if fault is None:
                 usable[index] = frame
+            else:
+                faults[index] = fault
         return usable, faults
 
     def _images(self, frames: Mapping[int, NDArray[Any]]) -> Tensor:

@@ -84,10 +84,9 @@ def windows_at_once(
     """
     limit = memory_limit(memory)
 
+    # frames around a window, as stored and as float32; less than a window takes otherwise
     pixels = 2 * min(margin, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
-    around = pixels * (
-        np.dtype(info.dtype).itemsize + 4
-    )  # as stored and as float32; less than a window takes otherwise
+    around = pixels * (np.dtype(info.dtype).itemsize + 4)
 
     def needed(frames: int, count: int = 1) -> int:
         return memory_needed(info, frames, restoration, count, on_gpu=on_gpu) + count * around

@@ -66,11 +66,9 @@ class _Follower(VibrationTracker):
         coefficients = np.array([np.pad(size, (0, count - len(size))) for size, _ in parts])
         frequencies = np.array([np.pad(one.frequencies, (0, count - len(one.frequencies))) for one in self._known])
         drift = np.array([[velocity, 0.0] for _, velocity in parts])
-        sizes = np.array([[_SIZE_STD], [_FREQUENCY_STD]])
-        size_std, frequency_std = sizes[0] * np.abs(coefficients), np.full_like(frequencies, sizes[1])
-        return self._begun(
-            replace(state, contradictions=0), time, coefficients, frequencies, drift, size_std, frequency_std
-        )
+        size_std, frequency_std = _SIZE_STD * np.abs(coefficients), np.full_like(frequencies, _FREQUENCY_STD)
+        state = replace(state, contradictions=0)
+        return self._begun(state, time, coefficients, frequencies, drift, size_std, frequency_std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +124,7 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
             for known, one, frequency in zip(tones, found, missing, strict=True)
         ]
         # 3. What both trackers agree on, at each frame and axis.
-        known = [
+        at_frames = [
             (_at_frame(first, start, start, rows, height, 1), _at_frame(second, start, end, rows, height, -1))
             for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
         ]
@@ -135,7 +133,7 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
                 _judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], others[axis])
                 for axis in range(2)
             ]
-            for both in known
+            for both in at_frames
         ]
         findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
         reliable = sum(not of_axis for of_frame in findings for of_axis in of_frame)
@@ -188,22 +186,27 @@ def _at_frame(
     """
     if tones is None:
         return None
-    vibration, std = vibration_of_fit(tones.fit)
+    vibrations, stds_of_fit = vibration_of_fit(tones.fit)
+    vibration, std = vibrations[0], stds_of_fit[0]
+    if direction < 0:
+        signs = vibration.phase.new_tensor(_ACROSS)
+        vibration = replace(
+            vibration,
+            phase=math.pi * (1.5 - 0.5 * signs[:, None]) - vibration.phase,
+            image_motion=-signs * vibration.image_motion,
+            image_acceleration=signs * vibration.image_acceleration,
+        )
+    vibration = vibration.timed_from(-origin)
+    std = replace(std, phase=torch.hypot(std.phase, 2 * math.pi * origin * std.frequency))
     exposures = table(rows.row_starts(1, height)[0, ::8])
     known = displacement_std(tones.fit, exposures, rows.exposure_time)[0]
     residual = np.nanmean(np.abs(residual_of(tones.measurements, tones.fit)[0]), (0, 1))
     middles = start + tensor(exposures) + 0.5 * rows.exposure_time
     axes = []
-    for axis, sign in enumerate(_ACROSS):
-        one = {name: getattr(vibration, name)[0, axis] for name in (*_TONE, *_DRIFT)}
-        stds = {name: getattr(std, name)[0, axis] for name in (*_TONE, *_DRIFT, "period")}
-        if direction < 0:
-            one["phase"] = math.pi * (1 + (sign < 0)) - one["phase"]
-            one |= {"image_motion": -sign * one["image_motion"], "image_acceleration": sign * one["image_acceleration"]}
-        turn = 2 * math.pi * origin
-        one["phase"] = torch.remainder(one["phase"] - turn * one["frequency"] + math.pi, 2 * math.pi) - math.pi
-        one["image_motion"] = one["image_motion"] - origin * one["image_acceleration"]
-        stds |= {"phase": torch.hypot(stds["phase"], turn * stds["frequency"]), "displacement": tensor(known)[axis]}
+    for axis in range(2):
+        one = {name: getattr(vibration, name)[axis] for name in (*_TONE, *_DRIFT)}
+        stds = {name: getattr(std, name)[axis] for name in (*_TONE, *_DRIFT, "period")}
+        stds["displacement"] = tensor(known)[axis]
         waves = torch.sin(2 * math.pi * one["frequency"] * middles[:, None] + one["phase"])
         moved = table((waves * one["amplitude"] * torch.sinc(one["frequency"] * rows.exposure_time)).sum(-1))
         against = tones.findings[axis]
@@ -211,9 +214,7 @@ def _at_frame(
     return axes
 
 
-def _judged(
-    known: Sequence[_AxisAtFrame], name: str, other: float | None
-) -> tuple[_AxisAtFrame | None, tuple[Reason, ...]]:
+def _judged(known: Sequence[_AxisAtFrame], name: str, other: float | None) -> _Judged:
     """An axis at a frame by the tracker that knows its displacement better, and the reasons against it."""
     if not known:
         return None, (Reason("not_followed", name),)

@@ -28,7 +28,7 @@ _MOST_TONES = 3  # of an axis in a window
 _KNOTS = 2  # of the spline per frame; with one, residuals of hand-held clips are 1.7 times as large
 _STIFFNESS = 1e-3  # of the third difference of the spline, in units of the information of a typical knot
 _ENVELOPE = 4  # frames between the knots of a tone; a blow that decays with 0.3 s is followed at 30 frames per second
-_STEADY = 0.1  # of a tone, by which neighbouring knots differ (standard deviation), where corners do not tell
+_STEADY = 0.1  # of a tone, by which neighbouring knots differ (standard deviation), where corners do not determine it
 _CELLS = 24  # of the rows, in which the search for tones takes means; resolves tones of 12 periods per readout
 _MIN_RATIO = 60.0  # of the variance that a tone explains and that of the rest; compression and parallax reach 40
 _MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller ones are not visible in a video
@@ -227,7 +227,7 @@ class _WindowFit:
                 gram[np.ix_(index, index)] += heavy @ both
                 right[index] += heavy @ self.corners.offsets[part].T.ravel()
                 columns.append((part, index, both))
-            # 2. The solution with a stiff path, and tones that are steady where nothing tells.
+            # 2. The solution with a stiff path, and tones that are steady where nothing determines them.
             self._regularise(gram, size)
             for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
                 spread = _STEADY * np.sqrt(np.square(np.abs(tone.knots)).mean())

@@ -300,7 +300,6 @@ def tone_tables(tones: list[Tone], axes: int) -> tuple[Array, Array, Array]:
     for axis, of_axis in enumerate(of_axes):
         for number, tone in enumerate(sorted(of_axis, key=lambda tone: -abs(tone.coefficient))):
             amplitude[axis, number], frequency[axis, number] = abs(tone.coefficient), tone.frequency
-            phase[axis, number] = (
-                np.angle(tone.coefficient) + 0.5 * math.pi
-            )  # Re c exp(i a) = |c| sin(a + arg c + pi/2)
+            # Re c exp(i a) = |c| sin(a + arg c + pi/2)
+            phase[axis, number] = np.angle(tone.coefficient) + 0.5 * math.pi
     return amplitude, frequency, phase

@@ -111,25 +111,24 @@ def frame_groups(
     timing: RowTiming,
     motion: Motion,
     *,
-    pairs: bool = False,
+    pairs: Literal["never", "different", "very different"] = "never",
     one_at_a_time: bool = False,
 ) -> list[FrameGroups]:
     """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
 
     An image motion limits how many frames contain the same part of the scene. ``pairs``: form pairs if exposures blur
-    the frames very differently, because only the blur of two frames can then be equalised. Pairs are enough for a tone;
-    a free motion needs all frames that contain a row. As many groups as fit in the cache are measured together, unless
-    ``one_at_a_time``, as strips are: these form pairs if the frames are blurred differently at all, because in larger
-    groups the standard deviations behind a lens are half as large, with the same errors.
+    the frames differently, or very differently: only the blur of two frames can then be equalised. Pairs are enough for
+    a tone; a free motion needs all frames that contain a row. As many groups as fit in the cache are measured together,
+    unless ``one_at_a_time``.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
     travelled = (motion.drift(starts[:, 1:]) - motion.drift(starts[:, :-1])).abs().amax((0, 1))
     fraction = float((travelled / travelled.new_tensor([spectra.width, spectra.height])).amax())
     most = int(max(2, min(MAX_GROUP_FRAMES, 1 + (1 - _MIN_OVERLAP) // max(fraction, 1e-9))))
-    if pairs:
+    if pairs != "never":
         different, very_different = differently_blurred(starts, spectra.height, timing, motion)
-        most = 2 if bool((different if one_at_a_time else very_different).any()) else most
+        most = 2 if bool((different if pairs == "different" else very_different).any()) else most
     number = max(1, math.ceil((count - 1) / (most - 1)))
     # Groups of equal size follow each other, so that they are measured together.
     steps_of_group, longer = divmod(count - 1, number)

@@ -148,7 +148,7 @@ class GroupedFrames:
 def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
     """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given."""
     spectra = stack_spectra(frames, valid)
-    return GroupedFrames(frame_groups(spectra, timing, motion, pairs=True), timing)
+    return GroupedFrames(frame_groups(spectra, timing, motion, pairs="very different"), timing)
 
 
 # Strips
@@ -247,10 +247,10 @@ def grouped_strips(
 ) -> GroupedStrips:
     """Frames (B, T, H, W) in strips of columns, for a motion of which all components are in px.
 
-    ``pairs`` as in ``frame_groups``. ``max_slide`` is the difference in px of the displacements
-    by roll and zoom of two neighbouring strips; the second order of their interpolation blurs as an exposure with a
-    path of this length. ``min_pitch`` are the columns from the middle of a strip to that of the next; narrower strips
-    consist of margins mostly.
+    ``pairs``: form pairs if the frames are blurred differently. ``max_slide`` is the difference in px of the
+    displacements by roll and zoom of two neighbouring strips; the second order of their interpolation blurs as an
+    exposure with a path of this length. ``min_pitch`` are the columns from the middle of a strip to that of the next;
+    narrower strips consist of margins mostly.
     """
     field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
@@ -265,6 +265,7 @@ def grouped_strips(
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)
-    groups = frame_groups(spectra, timing, view, pairs=pairs, one_at_a_time=True)
+    # in larger groups, the standard deviations behind a lens are half as large, with the same errors
+    groups = frame_groups(spectra, timing, view, pairs="different" if pairs else "never", one_at_a_time=True)
     slide = slope * float(columns[1] - columns[0])
     return GroupedStrips(groups, timing, scale, strips, columns, count, slide)
