@@ -118,7 +118,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     Args:
         path: The TOML file; None if ``sensor`` describes the camera.
         sensor: Keys of ``[sensor]`` that replace those of the file. ``exposure_time`` also replaces ``exposure_rows``,
-            ``frame_rate`` also ``frame_rows``, and vice versa.
+            ``frame_rate`` also ``frame_rows``, ``row_time`` also ``row_time_std``, and vice versa.
 
     Raises:
         ValueError: If it is not TOML, or keys are missing, unknown or have a wrong type or value: one line for each.
@@ -133,7 +133,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     if sensor:
         stated = data.get("sensor", {})
         if isinstance(stated, dict):
-            same = ({"exposure_time", "exposure_rows"}, {"frame_rate", "frame_rows"})
+            same = ({"exposure_time", "exposure_rows"}, {"frame_rate", "frame_rows"}, {"row_time", "row_time_std"})
             replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}

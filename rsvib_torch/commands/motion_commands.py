@@ -173,7 +173,7 @@ def known(given: KnownOptions) -> Answer:
         _refuse(given, found.reasons)
         placed = found.motion
         if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):
-            timing = _with_row_time(timing, found.row_time)
+            timing = _with_row_time(timing, found.row_time, found.row_time_std)
     else:
         placed = recorded.retimed(given.offset)
         _check_covers(given, recorded, placed, io.timing_from_first_frame(timing, info), info.shape)
@@ -235,12 +235,11 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     return rsvib_torch.read_gyroscope(given.motion)
 
 
-def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float) -> rsvib_torch.SensorTiming:
+def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float, std: float) -> rsvib_torch.SensorTiming:
     """The timing with another row time, and the same exposure and frame period in seconds."""
     rows = timing.row_time / row_time
-    return replace(
-        timing, row_time=row_time, exposure_rows=rows * timing.exposure_rows, frame_rows=rows * timing.frame_rows
-    )
+    exposure, period = rows * timing.exposure_rows, rows * timing.frame_rows
+    return replace(timing, row_time=row_time, exposure_rows=exposure, frame_rows=period, row_time_std=std)
 
 
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
@@ -497,6 +496,7 @@ def _calibrated_toml(result: row_time.RowTimeCalibration, scan_axis: str) -> str
     period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
     values = {
         "row_time": result.row_time,
+        "row_time_std": result.row_time_std,
         "exposure_time": result.exposure_time,
         **period,
         "scan_axis": scan_axis,

@@ -55,6 +55,8 @@ class SensorTiming:
             last one is.
         frame_start_times: Exposure start of the first row of each frame in seconds, for frames that are not evenly
             spaced (dropped frames, irregular clocks); strictly increasing.
+        row_time_std: Standard deviation of ``row_time`` in s, with the same exposure and frame period in s. That of
+            tones contains its effect.
 
     Raises:
         ValueError: If a value is out of range, or indicates another unit (a row time over 10 ms, a frame period
@@ -76,6 +78,7 @@ class SensorTiming:
     scan_axis: Literal[-2, -1, "y", "x"] = -2
     readout_direction: Literal["forward", "reverse"] = "forward"
     frame_start_times: Sequence[float] | Tensor | None = None
+    row_time_std: float = 0.0
 
     def __post_init__(self) -> None:
         row_time = check_number("row_time", self.row_time, above=0.0)
@@ -109,6 +112,7 @@ class SensorTiming:
         if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
         check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
+        check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
         object.__setattr__(self, "row_time", row_time)
         object.__setattr__(self, "exposure_rows", exposure_rows)
         object.__setattr__(self, "frame_rows", frame_rows)
@@ -136,6 +140,7 @@ class SensorTiming:
         scan_axis: Literal[-2, -1, "y", "x"] = -2,
         readout_direction: Literal["forward", "reverse"] = "forward",
         frame_start_times: Sequence[float] | Tensor | None = None,
+        row_time_std: float = 0.0,
     ) -> SensorTiming:
         """The timing from the exposure time in s and the frame rate: ``N_e = T_e / T_row``, ``m = 1 / (rate T_row)``.
 
@@ -149,7 +154,8 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        return cls(row_time, exposure / row_time, period / row_time, scan_axis, readout_direction, frame_start_times)
+        others = scan_axis, readout_direction, frame_start_times, row_time_std
+        return cls(row_time, exposure / row_time, period / row_time, *others)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -282,11 +288,13 @@ class SensorTiming:
             "scan_axis": "x" if self.scan_axis == -1 else "y",
             "readout_direction": self.readout_direction,
             "frame_start_times": None if starts is None else [float(start) for start in starts],
+            "row_time_std": float(self.row_time_std),
         }
 
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
-        return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
+        times = self.row_time, self.exposure_rows, self.frame_rows
+        return RowTiming(*times, frame_start_times=self.frame_start_times, row_time_std=self.row_time_std)
 
 
 class SensorSection(Section):
@@ -315,6 +323,8 @@ class SensorSection(Section):
     frame_start_times: list[float] | None = None
     """Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced (dropped frames,
     irregular clocks); strictly increasing."""
+    row_time_std: float = 0.0
+    """Standard deviation of row_time in s, which those of frequencies and amplitudes then contain."""
     full_scale: float | None = None
     """Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."""
 
@@ -340,6 +350,7 @@ class SensorSection(Section):
             self.scan_axis,
             self.readout_direction,
             self.frame_start_times,
+            self.row_time_std,
         )
 
 
