@@ -48,7 +48,8 @@ def simulation_section() -> Any:
     class CameraSection(Section):
         focal_length: float
         principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
-        distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=5, max_length=5)
+        distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=4, max_length=5)
+        fisheye: bool = False
 
     class VibrationSection(Section):
         """Fields of ``Vibration``, which checks their values; an axis is one number (one tone) or a list of tones."""

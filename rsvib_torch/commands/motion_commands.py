@@ -104,6 +104,8 @@ class KnownOptions(shared.StackCommand):
     """Unit of x and y: px, an angle, or an angular rate."""
     focal_length: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
     """Focal length in px; required for angles and angular rates."""
+    lens_profile: Path | None = option(None, show_default="a lens without distortion")
+    """With a gyroscope: lens profile of Gyroflow (JSON)."""
     time_unit: TimeUnit = "s"
     """Unit of the times."""
     flip_x: bool = False
@@ -148,12 +150,16 @@ def known(given: KnownOptions) -> Answer:
     """
     manifest = given.restored.with_name(f"{given.restored.name}.manifest.json")
     outputs = [*io.stack_files(given.restored), manifest]
-    shared.check_new(outputs, given.overwrite or "resume" in given.processing, [*given.inputs, given.motion])
+    shared.check_new(
+        outputs, given.overwrite or "resume" in given.processing, [*given.inputs, given.motion, given.lens_profile]
+    )
     recorded = _recorded(given)
-    camera = None
-    if given.unit is None and given.focal_length is not None:
-        camera = rsvib_torch.Camera(given.focal_length)
     info, scale, options = given.planned_restoration()
+    camera = None
+    if given.lens_profile is not None:
+        camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
+    elif given.unit is None and given.focal_length is not None:
+        camera = rsvib_torch.Camera(given.focal_length)
     info, timing = replace(info, full_scale=scale), given.settings.timing
     io.check_stack_target(
         given.restored, shared.restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info
@@ -217,9 +223,11 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     """The recording."""
     if given.offset is not None and given.offsets is not None:
         raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
+    if given.lens_profile is not None and given.focal_length is not None:
+        raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
     if given.unit is not None:
-        if given.fit_row_time:
-            raise ValueError("--fit-row-time is for a gyroscope, without --unit")
+        if given.fit_row_time or given.lens_profile is not None:
+            raise ValueError("--fit-row-time and --lens-profile are for a gyroscope, without --unit")
         return rsvib_torch.read_motion(
             given.motion,
             unit=given.unit,

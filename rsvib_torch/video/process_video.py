@@ -23,6 +23,7 @@ from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
 from rsvib_torch.results.presentation import plain_values
@@ -108,6 +109,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     if recording == Path("auto"):
         recording = split_range(source)[0]
     rates = None if recording is None else read_gyroscope(recording)
+    if rates is None and options.lens_profile is not None:
+        raise ValueError("lens_profile belongs to a gyroscope: give gyroscope as well")
     video, at_once = _planned(source, timing, options, rates)
     job = video.frames.job
     if sink.suffix.lower() not in CONTAINERS:
@@ -123,6 +126,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "steady": options.steady,
             "crop_limit": options.crop_limit,
             "gyroscope": None if recording is None else fingerprint(recording),
+            "camera": video.camera and asdict(video.camera),
             "stabilised": video.stabilised,
             "exposures": None if video.exposures is None else [min(video.exposures), max(video.exposures)],
         },
@@ -163,7 +167,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         sink,
         options,
         header,
-        inputs=[*stack_files(source), *([] if recording is None else [recording])],
+        inputs=[*stack_files(source), *(Path(file) for file in (recording, options.lens_profile) if file is not None)],
         windows=video.parts,
         compute=compute,
         write=write,
@@ -206,8 +210,10 @@ def _planned(
         starts = starts - starts[0]
     stabilised = track is not None and track.stabilised
     stated = None if exposures is None else exposures.tolist()
-    passes = VideoPasses(frames, starts.tolist(), options.steady, options.crop_limit, rates, stated, stabilised)
-    return passes, at_once
+    profile, (height, width) = options.lens_profile, frames.size
+    camera = None if profile is None else Camera.from_gyroflow(profile, width, height)
+    steadied = options.steady, options.crop_limit
+    return VideoPasses(frames, starts.tolist(), *steadied, rates, camera, stated, stabilised), at_once
 
 
 def _restored_parts(

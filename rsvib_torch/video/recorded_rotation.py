@@ -46,7 +46,7 @@ class RecordedRotation:
         before = torch.searchsorted(of_camera.times, middles, right=True) - 1
         samples = Rotation.from_rotvec(table(of_camera.attitude(float(times[0]))[before]))
         rest = Rotation.from_rotvec(table(of_camera.rotation(of_camera.times[before], middles)))
-        return cls(of_camera, Camera(found.focal_length), times, samples * rest)
+        return cls(of_camera, found.motion.camera or Camera(found.focal_length), times, samples * rest)
 
     def apart(self, number: int, others: slice) -> Array:
         """(n, 4) components of the path from a frame to others: x, y (px), roll (rad), and a zoom of 0."""

@@ -199,5 +199,5 @@ def _on_half_pixels(motion: Vibration | FreeMotion) -> Vibration | FreeMotion:
     factors = torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64)
     if isinstance(motion, Vibration):
         return motion.scaled(factors)
-    camera = motion.camera and replace(motion.camera, focal_length=0.5 * motion.camera.focal_length)
+    camera = motion.camera and motion.camera.scaled(0.5)
     return FreeMotion(motion.coefficients * factors[:, None], motion.start, motion.spacing, camera=camera)

@@ -17,6 +17,7 @@ from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.sampling import recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
@@ -66,6 +67,7 @@ class VideoPasses:
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
+    camera: Camera | None  # whose lens is known; None: its focal length is fitted
     exposures: list[float] | None  # s, of the frames; None: all that of the sensor
     stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
 
@@ -149,7 +151,8 @@ class VideoPasses:
         timing, size = self.frames.job.timing, self.frames.size
         tracks = tracks_of_pairs(pairs, self.starts, timing, size)
         starts = tensor(np.array([self.starts[index : index + 2] for index in pairs]))
-        found = align_rates(tracks, starts, size if timing.scan_axis == -2 else size[::-1], timing, rates)
+        rows_first, fitted = size if timing.scan_axis == -2 else size[::-1], self.camera is None
+        found = align_rates(tracks, starts, rows_first, timing, rates, self.camera, fit_focal_length=fitted)
         if not found.reliable:
             raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {'; '.join(found.reasons)}")
         return found
