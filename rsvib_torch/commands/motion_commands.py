@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -24,6 +26,8 @@ from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit,
 from rsvib_torch.text import measured_text
 
 if TYPE_CHECKING:
+    import torch
+
     from rsvib_torch.io.stack_info import StackInfo
     from rsvib_torch.results.presentation import Result
 
@@ -123,6 +127,9 @@ class KnownOptions(shared.StackCommand):
     """Estimate the focal length from the frames as well."""
     fit_row_time: bool = False
     """With a gyroscope: estimate the row time from the frames as well."""
+    ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
+    """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
+    for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
     force: bool = False
     """Restore even if the recording does not explain the motion of the frames, or the restored frames are judged no
     better than the input."""
@@ -155,12 +162,8 @@ def known(given: KnownOptions) -> Answer:
     )
     recorded = _recorded(given)
     info, scale, options = given.planned_restoration()
-    camera = None
-    if given.lens_profile is not None:
-        camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
-    elif given.unit is None and given.focal_length is not None:
-        camera = rsvib_torch.Camera(given.focal_length)
     info, timing = replace(info, full_scale=scale), given.settings.timing
+    ignore = _ignored(given.ignore or (), (info.shape[-2], info.shape[-1]))
     io.check_stack_target(
         given.restored, shared.restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info
     )
@@ -172,7 +175,14 @@ def known(given: KnownOptions) -> Answer:
         fitted = {"fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
         with working("aligning the recording"):
             found = stacks.align_stack(
-                given.stack, info, timing, recorded, camera=camera, offsets=given.offsets, **fitted
+                given.stack,
+                info,
+                timing,
+                recorded,
+                camera=_camera(given, info),
+                offsets=given.offsets,
+                ignore=ignore,
+                **fitted,
             )
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curve(found)
@@ -184,7 +194,9 @@ def known(given: KnownOptions) -> Answer:
         placed = recorded.retimed(given.offset)
         _check_covers(given, recorded, placed, io.timing_from_first_frame(timing, info), info.shape)
     # 2. Whether it explains the offsets of rows; rates were compared by the alignment.
-    check = _check_motion(given, info, timing, placed) if isinstance(recorded, rsvib_torch.FreeMotion) else None
+    check = None
+    if isinstance(recorded, rsvib_torch.FreeMotion):
+        check = _check_motion(given, info, timing, placed, ignore)
     if check is not None:
         results["Motion of the frames"] = [check.summary()]
         data["check"] = _without_curve(check)
@@ -243,6 +255,28 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     return rsvib_torch.read_gyroscope(given.motion)
 
 
+def _camera(given: KnownOptions, info: StackInfo) -> rsvib_torch.Camera | None:
+    """The stated lens of a gyroscope."""
+    if given.lens_profile is not None:
+        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
+    return rsvib_torch.Camera(given.focal_length) if given.unit is None and given.focal_length is not None else None
+
+
+def _ignored(regions: Sequence[str], size: tuple[int, int]) -> torch.Tensor | None:
+    """Mask (H, W) of the regions of frames, as ``--ignore`` states them; None without regions."""
+    import torch  # noqa: PLC0415
+
+    mask = torch.zeros(size, dtype=torch.bool)
+    for region in regions:
+        if not re.fullmatch(r"\d*:\d*(,\d*:\d*)?", region):
+            raise ValueError(f"--ignore must be rows, or rows and columns, such as 400: or :60,500:, got {region!r}")
+        part = mask[tuple(slice(*(int(end) if end else None for end in ends.split(":"))) for ends in region.split(","))]
+        if part.numel() == 0:
+            raise ValueError(f"--ignore {region} has no pixel of frames of {size[0]} rows and {size[1]} columns")
+        part.fill_(True)
+    return mask if regions else None
+
+
 def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float, std: float) -> rsvib_torch.SensorTiming:
     """The timing with another row time, and the same exposure and frame period in seconds."""
     rows = timing.row_time / row_time
@@ -277,7 +311,11 @@ def _check_covers(
 
 
 def _check_motion(
-    given: KnownOptions, info: StackInfo, timing: rsvib_torch.SensorTiming, motion: rsvib_torch.FreeMotion
+    given: KnownOptions,
+    info: StackInfo,
+    timing: rsvib_torch.SensorTiming,
+    motion: rsvib_torch.FreeMotion,
+    ignore: torch.Tensor | None,
 ) -> gyroscope.MotionCheck | None:
     """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
 
@@ -288,7 +326,7 @@ def _check_motion(
         return None
     try:
         with working("comparing the motion"):
-            check = stacks.check_stack_motion(given.stack, info, timing, motion)
+            check = stacks.check_stack_motion(given.stack, info, timing, motion, ignore)
     except ValueError as error:
         if given.offset is None:
             raise
