@@ -85,7 +85,7 @@ from .row_time import (
     calibrate_row_time_by_motion,
 )
 from .stacks import StackReport, VibrationCorrector, iterate_stack, process_stack, read_manifest, restore_block
-from .tracking import TrackedFrame, VibrationTracker
+from .tracking import TrackedFrame, VibrationTracker, follow_vibration
 from .video import Margins, VideoBorder, process_video
 
 __all__ = [
@@ -144,6 +144,7 @@ __all__ = [
     "diagnose_timing",
     "find_cameras",
     "find_slanted_edges",
+    "follow_vibration",
     "gain_figure",
     "iterate_stack",
     "judge_restoration",
