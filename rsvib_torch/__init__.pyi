@@ -27,7 +27,7 @@ from .detection import (
     detect_vibration,
     diagnose_timing,
 )
-from .evaluation import MtfCurve, SlantedEdge, find_slanted_edges, offset_endpoint_error, psnr, slanted_edge_mtf, ssim
+from .evaluation import MtfCurve, SlantedEdge, find_slanted_edges, psnr, slanted_edge_mtf, ssim
 from .export import camera_isd, sampling_map, write_gcsv, write_isd, write_stmap
 from .gyroscope import (
     AccelerometerComparison,
@@ -72,7 +72,6 @@ from .restoration import (
     RestorationWarning,
     VibrationRestorer,
     judge_restoration,
-    predict_noise_gain,
     restoration_mtf,
     restore,
     trusted_vibration,
@@ -150,10 +149,8 @@ __all__ = [
     "judge_restoration",
     "motion_figure",
     "mtf_figure",
-    "offset_endpoint_error",
     "offset_figure",
     "open_stack",
-    "predict_noise_gain",
     "process_stack",
     "process_video",
     "psf_figure",
