@@ -150,8 +150,9 @@ class VideoFrames:
                 motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
             source = source_map(motion, timing, plane.shape[-2:])
             results.append(moved_back(plane, source))
-            limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
-            visible.append(np.all((source >= 0) & (source <= limits), axis=0))
+            if self.masks:
+                limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
+                visible.append(np.all((source >= 0) & (source <= limits), axis=0))
         return RestoredFrame(results, visible if self.masks else None)
 
     def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
