@@ -18,7 +18,6 @@ import argparse
 import csv
 import statistics
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -98,39 +97,24 @@ def windows(count: int) -> range:
 
 
 def row_times(folder: Path) -> None:
-    """Row times of windows of frames, whose scatter is an error that does not depend on their standard deviations.
-
-    Of the phone with its gyroscope and from the frames alone, of the drone from the frames alone.
-    """
+    """Row times of windows of frames, whose scatter is an error that does not depend on their standard deviations."""
     times, frames = phone_frames(folder)
     rate = (len(times) - 1) / (times[-1] - times[0])
-    with (folder / "phone_gyro" / "gyroscope.csv").open(newline="") as text, tempfile.TemporaryDirectory() as scratch:
-        rates = [(row["time_s"], row["x_rad_s"], row["y_rad_s"]) for row in csv.DictReader(text)]
-        motion = Path(scratch) / "motion.csv"
-        motion.write_text("time,x,y\n" + "\n".join(",".join(row) for row in rates) + "\n")
-        focal_length = PHONE_CAMERA.focal_length
-        recorded = rsv.read_motion(motion, unit="rad/s", focal_length=focal_length, signs=(1.0, -1.0))
-    for model in ("gyroscope", "frames alone"):
-        found = []
-        for first in windows(len(times)):
-            options = {}
-            if model == "gyroscope":
-                offsets = tuple(times[first] + clock for clock in CLOCK_RANGE)
-                options = {"recorded": recorded, "offsets": offsets, "fit_gain": True}
-            result = rsv.calibrate_row_time_by_motion(
-                frames[first : first + WINDOW, ..., :SCENE_ROWS, :],
-                frame_rate=rate,
-                row_time=(5e-6, 1 / (rate * 600)),
-                exposure_time=PHONE_EXPOSURE,
-                **options,
-            )
-            print(f"phone, {model}, frames {first} to {first + WINDOW - 1}:\n{result}\n", flush=True)
-            if result.row_time is not None:
-                found.append(1e6 * result.row_time * (1 if result.readout_direction != "reverse" else -1))
-        if len(found) > 1:
-            listed = ", ".join(f"{value:.2f}" for value in found)
-            spread = f"standard deviation of a window {statistics.stdev(found):.2f} us ({listed})"
-            print(f"phone, {model}: median {statistics.median(found):.2f} us, {spread}")
+    found = []
+    for first in windows(len(times)):
+        result = rsv.calibrate_row_time_by_motion(
+            frames[first : first + WINDOW, ..., :SCENE_ROWS, :],
+            frame_rate=rate,
+            row_time=(5e-6, 1 / (rate * 600)),
+            exposure_time=PHONE_EXPOSURE,
+        )
+        print(f"phone, frames {first} to {first + WINDOW - 1}:\n{result}\n", flush=True)
+        if result.row_time is not None:
+            found.append(1e6 * result.row_time * (1 if result.readout_direction != "reverse" else -1))
+    if len(found) > 1:
+        listed = ", ".join(f"{value:.2f}" for value in found)
+        spread = f"standard deviation of a window {statistics.stdev(found):.2f} us ({listed})"
+        print(f"phone: median {statistics.median(found):.2f} us, {spread}")
     frames = rsv.read_stack(folder / "drone_gyro" / "karma.mp4")
     for first in windows(len(frames)):
         result = rsv.calibrate_row_time_by_motion(frames[first : first + WINDOW], frame_rate=DRONE_RATE)
