@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
-from itertools import count, groupby
+from itertools import chain, count, groupby, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_vi
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
@@ -44,12 +45,14 @@ from rsvib_torch.video.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMot
 # measured less well, because objects at other distances move beside them.
 _MORE_SHAKING, _VISIBLE_SHAKING = {"frame_to_frame": 1.1, "rows": 1.5}, 0.1  # -, px
 
+_JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
+
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
 Frame = NDArray[Any]
 Planes = list[Frame]
-_Restored = tuple[FrameTrack, Frame | str, RestoredFrame]  # a frame as stored, or why it cannot be read, and restored
+_Restored = tuple[FrameTrack, RestoredFrame]
 
 
 class _Output(NamedTuple):
@@ -77,7 +80,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
     states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
 
-    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
+    Two frames of each part of 32 are judged: of a part that restoration makes worse, no vibration is undone. Frames
+    that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
     parts of 32 frames in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
     the first frames of each part is compared with that of the input: a video that shakes more is not written.
 
@@ -150,8 +154,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         check_info_target(sink, content, check_folder=False)
         output = _Output(sink, content, border, margins)
         with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
-            for part, frames in parts:
-                _encode_part(video, motion, folder, part, frames, output, progress)
+            for part, frames, verdicts in parts:
+                _encode_part(video, motion, folder, part, frames, verdicts, output, progress)
         _check_shaking(folder)
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
@@ -218,24 +222,35 @@ def _planned(
 
 def _restored_parts(
     video: VideoPasses, motion: VideoMotion, folder: RunFolder, at_once: int, progress: Callable[[], None]
-) -> Generator[tuple[int, Iterator[_Restored]], None, None]:
-    """Number and restored frames of each part that is not in the folder."""
+) -> Generator[tuple[int, Iterator[_Restored], dict[int, RestorationVerdict | None]], None, None]:
+    """Number and restored frames of each part that is not in the folder, and the verdicts on the parts so far."""
+    verdicts: dict[int, RestorationVerdict | None] = {}
 
     def missing() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
         with closing(video.decoded()) as decoded:
-            for index, frame in enumerate(decoded):
-                if index // PART_FRAMES not in folder:
-                    yield video.track(motion, index), frame
-                else:
-                    progress()
+            for part, frames in groupby(enumerate(decoded), lambda one: one[0] // PART_FRAMES):
+                if part in folder:
+                    for _ in frames:
+                        progress()
+                    continue
+                tracked = ((video.track(motion, index), frame) for index, frame in frames)
+                first = list(islice(tracked, _JUDGED_FRAMES))
+                verdicts[part] = video.verdict(first)
+                for track, frame in chain(first, tracked):
+                    yield video.left_alone(track) if _is_worse(verdicts[part]) else track, frame
 
     def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
-        return track, frame, video.frames.restored(frame, track)
+        return track, video.frames.restored(frame, track)
 
     share_one_heap()
     threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
     with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
-        yield from groupby(frames, lambda one: one[0].index // PART_FRAMES)
+        for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
+            yield part, of_part, verdicts
+
+
+def _is_worse(verdict: RestorationVerdict | None) -> bool:
+    return verdict is not None and verdict.overall == "worse"
 
 
 def _encode_part(
@@ -244,6 +259,7 @@ def _encode_part(
     folder: RunFolder,
     part: int,
     frames: Iterator[_Restored],
+    verdicts: dict[int, RestorationVerdict | None],
     output: _Output,
     progress: Callable[[], None],
 ) -> None:
@@ -251,7 +267,6 @@ def _encode_part(
     layout, name = video.frames, f"{part:06d}{output.path.suffix.lower()}"
     tracks: list[FrameTrack] = []
     written: list[Frame] = []  # the first frames
-    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames without fault
     before: Planes | None = None  # the frame before, without margins cut off
     if part > 0:
         with folder.open(f"{part - 1:06d}.npy") as file:
@@ -260,7 +275,7 @@ def _encode_part(
         with disk_errors_named(folder):
             encoded = part_of_video(folder.create(name), output.path, output.info, layout.picture)
             write = opened.enter_context(encoded)
-        for track, frame, restored in frames:
+        for track, restored in frames:
             if tracks:
                 progress()  # the frame before is complete
             before = _without_gaps(restored, before, layout, output.border)
@@ -270,14 +285,10 @@ def _encode_part(
             if len(tracks) < CHECKED_FRAMES:
                 written.append(final)
             tracks.append(track)
-            if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
-                follows = bool(pair) and pair[-1][0].index == track.index - 1
-                pair = [*pair, (track, frame)] if follows else [(track, frame)]
         with disk_errors_named(folder):
             opened.close()  # the file is complete
     assert before is not None
-    verdict = video.verdict(pair) if len(pair) == 2 else None
-    record = video.record(part, tracks, motion, verdict, written)
+    record = video.record(part, tracks, motion, verdicts[part], written)
     folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
     progress()
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
@@ -173,6 +173,13 @@ class VideoPasses:
         exposure = None if self.exposures is None else self.exposures[index]
         return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
 
+    def left_alone(self, track: FrameTrack) -> FrameTrack:
+        """What is removed from a frame of a part that restoration makes worse: no vibration."""
+        if not isinstance(track.motion, Vibration):
+            return track
+        still = track.motion.scaled(0.0) if self.steady == 0 else track.motion
+        return replace(track, motion=replace(still, amplitude=torch.zeros_like(still.amplitude)))
+
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
         widest = np.zeros(4)
@@ -206,15 +213,18 @@ class VideoPasses:
             "rows": np.sqrt(np.square(rows).mean(0)).tolist(),
         }
 
-    def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
+    def verdict(self, frames: list[tuple[FrameTrack, Frame | str]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
-        (first, one), (_, other) = frames
+        usable = (pair for pair in pairwise(frames) if all(track.fault is None for track, _ in pair))
+        (first, one), (second, other) = next(usable, ((None, ""), (None, "")))
+        if first is None or second is None or isinstance(one, str) or isinstance(other, str):
+            return None
         if not isinstance(first.motion, Vibration):
             return None
         pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
         images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)
         motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
-        interval = frames[1][0].time - first.time
+        interval = second.time - first.time
         return pair_verdict(images, self.frames.job.timing, motion, interval, self.frames.options)
 
     def record(
