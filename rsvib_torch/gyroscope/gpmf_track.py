@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation, oriented
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
+from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation
 
 Array = NDArray[np.float64]
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
@@ -50,7 +50,7 @@ def read_gpmf(path: Path) -> AngularRates:
     source = f"{path.name}, GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
     if any(part.stabilised for part in parts):
         source += ", images that the camera has stabilised (IORI)"
-    rates = oriented(rates, orientation) if orientation else rates
+    rates = rates @ orientation_matrix(orientation).numpy().T if orientation else rates
     return angular_rates(path, _sample_times(parts), rates, source)
 
 

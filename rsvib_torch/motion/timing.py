@@ -10,7 +10,7 @@ import itertools
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -112,7 +112,8 @@ class SensorTiming:
         if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
         check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
-        check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
+        row_time_std = check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
+        object.__setattr__(self, "row_time_std", row_time_std)
         object.__setattr__(self, "row_time", row_time)
         object.__setattr__(self, "exposure_rows", exposure_rows)
         object.__setattr__(self, "frame_rows", frame_rows)
@@ -281,15 +282,8 @@ class SensorTiming:
     def to_dict(self) -> dict[str, Any]:
         """The arguments that make this timing, as plain numbers and texts."""
         starts = self.frame_start_times
-        return {
-            "row_time": float(self.row_time),
-            "exposure_rows": float(self.exposure_rows),
-            "frame_rows": float(self.frame_rows),
-            "scan_axis": "x" if self.scan_axis == -1 else "y",
-            "readout_direction": self.readout_direction,
-            "frame_start_times": None if starts is None else [float(start) for start in starts],
-            "row_time_std": float(self.row_time_std),
-        }
+        scan_axis = "x" if self.scan_axis == -1 else "y"
+        return asdict(self) | {"scan_axis": scan_axis, "frame_start_times": None if starts is None else list(starts)}
 
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""

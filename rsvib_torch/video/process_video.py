@@ -235,9 +235,10 @@ def _restored_parts(
                     continue
                 tracked = ((video.track(motion, index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
-                verdicts[part] = video.verdict(first)
+                verdicts[part] = verdict = video.verdict(first)
+                is_worse = verdict is not None and verdict.overall == "worse"
                 for track, frame in chain(first, tracked):
-                    yield video.left_alone(track) if _is_worse(verdicts[part]) else track, frame
+                    yield video.left_alone(track) if is_worse else track, frame
 
     def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
         return track, video.frames.restored(frame, track)
@@ -247,10 +248,6 @@ def _restored_parts(
     with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
         for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
             yield part, of_part, verdicts
-
-
-def _is_worse(verdict: RestorationVerdict | None) -> bool:
-    return verdict is not None and verdict.overall == "worse"
 
 
 def _encode_part(

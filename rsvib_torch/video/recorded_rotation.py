@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
-from rsvib_torch.gyroscope.rotation_search import orientation_matrix
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.numerics.tables import Array, table, tensor
