@@ -80,9 +80,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
     states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
 
-    Two frames of each part of 32 are judged: of a part that restoration makes worse, no vibration is undone. Frames
-    that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
-    parts of 32 frames in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
+    Two frames of each part of 32 are judged: of a part that is worse and shakes more than as taken, no vibration is
+    undone. Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is
+    encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
     the first frames of each part is compared with that of the input: a video that shakes more is not written.
 
     Args:
@@ -236,7 +236,8 @@ def _restored_parts(
                 tracked = ((video.track(motion, index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
                 verdicts[part] = verdict = video.verdict(first)
-                is_worse = verdict is not None and verdict.overall == "worse"
+                # Parallax makes two frames worse that shake less: corners decide.
+                is_worse = verdict is not None and verdict.overall == "worse" and video.shakes_more(motion, first)
                 for track, frame in chain(first, tracked):
                     yield video.left_alone(track) if is_worse else track, frame
 

@@ -213,6 +213,13 @@ class VideoPasses:
             "rows": np.sqrt(np.square(rows).mean(0)).tolist(),
         }
 
+    def shakes_more(self, motion: VideoMotion, frames: list[tuple[FrameTrack, Frame | str]]) -> bool:
+        """Whether frames that follow each other shake more when they are restored, or it is unknown."""
+        planes = [self.frames.restored(frame, track).planes for track, frame in frames]
+        known = [self.frames.frame(one) for one in planes if one is not None]
+        measured = self.shaking(motion, frames[0][0].index, known) if len(known) == len(frames) else None
+        return measured is None or any(after > before for before, after in measured.values())
+
     def verdict(self, frames: list[tuple[FrameTrack, Frame | str]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
         usable = (pair for pair in pairwise(frames) if all(track.fault is None for track, _ in pair))

@@ -115,7 +115,7 @@ def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path, method):
 def test_a_part_that_restoration_makes_worse_is_left_as_it_is(frames, tmp_path):
     """The frames by which the second part is judged do not vibrate; the tones are those of all frames."""
     paused = frames.copy()
-    paused[PART : PART + 2] = (255 * STILL).round().transpose(1, 2, 0)
+    paused[PART : PART + 4] = (255 * STILL).round().transpose(1, 2, 0)
     clip = write(tmp_path / "clip.mp4", paused)
     report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS)
     windows = read_manifest(report.manifest).windows
