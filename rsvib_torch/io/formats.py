@@ -15,8 +15,6 @@ from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, 
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import quoted
 
-Frame = Array
-
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
 # folder, which the caller renames when it is complete (``rsvib_torch/files/atomic.py``).
@@ -60,7 +58,7 @@ class StackFormat:
     name: str
     endings: tuple[str, ...]
     open: Callable[[Path], FrameReader]
-    write: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
+    write: Callable[[Path, StackInfo, Iterator[Array], str | None], None] | None = None
     dtypes: tuple[str, ...] = (
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
@@ -145,12 +143,6 @@ FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACK
 
 def register_format(form: StackFormat) -> None:
     """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
-
-    Args:
-        form: The format; see the contract above ``StackFormat``.
-
-    Raises:
-        ValueError: If it has no ending, or one without a dot or in upper case.
 
     Example:
         >>> register_format(StackFormat("portable", ("pgm",), open=lambda path: None))

@@ -155,7 +155,7 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
         info: What the file states, from ``read_stack_info``.
 
     Warns:
-        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
+        TimingWarning: If it states another frame rate than the sensor has, or irregular times that are too rough.
 
     Example:
         >>> import rsvib_torch as rsv

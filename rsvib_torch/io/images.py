@@ -41,17 +41,17 @@ def image_info(path: Path) -> StackInfo:
         head = file.read(_LONGEST_HEADER)  # Pillow would search a file of any size for it, at 20 MB/s
         file_size = file.seek(0, io.SEEK_END)
         image = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
-        info = _png_info(image, head, file_size) if is_png else _jpeg_info(image)
+        if is_png:
+            info = _png_info(image, head, file_size)
+        elif image.mode in ("L", "RGB"):
+            channels = (3,) * (image.mode == "RGB")
+            shape = (1, *channels, image.height, image.width)
+            info = StackInfo(shape, "uint8", 255.0, channels_last=image.mode == "RGB")
+        else:
+            raise ValueError(f"pixels are {image.mode}; expected grey or RGB")
         if file_size > 4 * np.dtype(info.dtype).itemsize * math.prod(info.shape) + _LONGEST_HEADER:
             raise ValueError(f"{file_size} bytes are too many for {image.width} x {image.height} px")
         return replace(info, **exif_fields(image.info.get("exif", b"")))
-
-
-def _jpeg_info(image: Any) -> StackInfo:
-    if image.mode not in ("L", "RGB"):
-        raise ValueError(f"pixels are {image.mode}; expected grey or RGB")
-    shape = (1, 3, image.height, image.width) if image.mode == "RGB" else (1, image.height, image.width)
-    return StackInfo(shape, "uint8", 255.0, channels_last=image.mode == "RGB")
 
 
 def _png_info(image: Any, head: bytes, file_size: int) -> StackInfo:
@@ -121,13 +121,8 @@ _ENDINGS = (*_PNG, *_TIFF, *_JPEG)
 _PNG_TYPES = ("uint8", "uint16")
 
 
-def _natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Key that sorts frame9 before frame10."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
-
-
 def _frame_files(path: Path) -> list[Path]:
+    """The files of a folder in natural order (frame9 before frame10), or one file."""
     if not path.is_dir():
         return [path]
     visible = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]
@@ -137,7 +132,12 @@ def _frame_files(path: Path) -> list[Path]:
         raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
     if not found:
         raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files")
-    return sorted(files[found[0]], key=_natural_key)
+
+    def parts(file: Path) -> list[tuple[int, int, str]]:
+        split = re.split(r"(\d+)", file.name)
+        return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in split if part]
+
+    return sorted(files[found[0]], key=parts)
 
 
 def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
@@ -177,11 +177,6 @@ def _read_frame(file: Path) -> Array:
         return reader.frame(0)
 
 
-def _without_position(info: StackInfo) -> StackInfo:
-    """What must be the same in all files of a folder."""
-    return replace(info, resolution=None, frame_times=None)
-
-
 def open_images(path: Path) -> BlockReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
@@ -196,7 +191,7 @@ def open_images(path: Path) -> BlockReader:
             continue
         if first is None:
             first = (info, file)
-        if _without_position(info) != _without_position(first[0]):
+        if replace(info, resolution=first[0].resolution, frame_times=first[0].frame_times) != first[0]:
             raise ValueError(
                 f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
             )

@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -31,6 +32,8 @@ _MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a min
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
+    Damage of single frames is detected when they are read.
+
     Args:
         path: As in ``read_stack``.
 
@@ -38,8 +41,7 @@ def open_stack(path: PathLike) -> FrameReader:
         An object with ``info``, ``frame(index)`` and ``close()``.
 
     Raises:
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
+        ValueError: If it is not a readable stack.
 
     Example:
         >>> reader = open_stack("frames.tif")  # doctest: +SKIP
@@ -129,8 +131,7 @@ def _read_pixels(
     infos: list[StackInfo] = []
     count = 0  # frames of all files
     for path in paths:
-        reader = open_stack(path)
-        try:
+        with closing(open_stack(path)) as reader:
             info = reader.info
             infos.append(info)
             first = infos[0]
@@ -142,11 +143,10 @@ def _read_pixels(
             count += info.shape[0]
             joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
             frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
+            pixel_bytes = (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
             check_fits(
                 f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
-                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
-                + frame_bytes
-                + info.decoding_bytes,
+                pixel_bytes + frame_bytes + info.decoding_bytes,
                 "process the stack in windows (iterate_stack, process_stack, rsvib run)",
             )
             pixels = np.empty(info.shape, dtype)
@@ -155,8 +155,6 @@ def _read_pixels(
                 frame = reader.frame(index)
                 pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path), first.nodata)
                 advance()
-        finally:
-            reader.close()
         parts.append(pixels)
     return parts[0] if len(parts) == 1 else np.concatenate(parts), stated, first
 
@@ -170,12 +168,7 @@ class LoadedFrames(NamedTuple):
 
 
 def load_frames(frames: FramesOrFiles, full_scale: float | None) -> LoadedFrames:
-    """Read frames that are given by the paths of their files; other frames are returned unchanged.
-
-    Example:
-        >>> load_frames([[[0.5]]], None)
-        LoadedFrames(frames=[[[0.5]]], full_scale=None, info=None)
-    """
+    """Read frames that are given by the paths of their files; other frames are returned unchanged."""
     if isinstance(frames, (str, os.PathLike)):
         paths: list[PathLike] = [frames]
     elif isinstance(frames, (list, tuple)) and frames and all(isinstance(item, (str, os.PathLike)) for item in frames):

@@ -21,12 +21,7 @@ from rsvib_torch.numerics.tables import Array
 
 
 def stack_files(path: PathLike) -> list[Path]:
-    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars).
-
-    Example:
-        >>> [path.name for path in stack_files("frames.raw")]
-        ['frames.raw', 'frames.raw.json']
-    """
+    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars)."""
     path, _ = split_range(Path(path))
     form = FORMATS.get(path.suffix.lower())
     return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
@@ -84,11 +79,7 @@ def check_stack_target(
     full_scale: float | None = None,
     like: StackInfo | None = None,
 ) -> float | None:
-    """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed.
-
-    Returns:
-        The full scale that would be used; None for floats.
-    """
+    """Raise the error that ``write_stack`` would raise for frames of this shape, or return their full scale."""
     if len(shape) not in (3, 4) or min(shape) < 1:
         raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
     kind = np.dtype(dtype or np.float32)
@@ -103,16 +94,10 @@ def check_stack_target(
 def metadata_not_kept(
     like: StackInfo, path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None
 ) -> tuple[str, ...]:
-    """What a file states about its frames and the file with the restored frames will not state.
+    """What a file states about its frames and the file ``path`` with the restored frames will not state.
 
-    Args:
-        like: The stack that is restored.
-        path: The stack to write.
-        shape: Its shape, (T, H, W) or (T, C, H, W).
-        dtype: Its data type; None for the same.
-
-    Returns:
-        Names of tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
+    ``shape`` is that of the restored frames, ``dtype`` their data type if it is another one. The result has names of
+    tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
 
     Example:
         >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
@@ -130,9 +115,8 @@ def metadata_not_kept(
     lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
     if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
         lost = [name for name in lost if not name.endswith(DIFFERENT)]
-    lost += ["full scale"] * (stated and "full_scale" not in keeps)
-    lost += ["resolution"] * (like.resolution is not None and "resolution" not in keeps)
-    lost += ["orientation"] * (like.orientation != 1 and "orientation" not in keeps)
+    others = {"full_scale": stated, "resolution": like.resolution is not None, "orientation": like.orientation != 1}
+    lost += [name.replace("_", " ") for name, has in others.items() if has and name not in keeps]
     lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
     return tuple(lost)
 

@@ -72,7 +72,7 @@ def _pages(tif: Any) -> list[_Page]:
 
 def _is_complete(page: Any, size: int) -> bool:
     """Whether the stored pixels of a page lie within a file of ``size`` bytes."""
-    ends = map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
+    ends = [] if page is None else map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
     return max(ends, default=size + 1) <= size
 
 
@@ -155,25 +155,24 @@ def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
 def _page_reader(
     path: Path,
     info: StackInfo,
-    page: Callable[[int], Any],
-    complete: Sequence[bool],
+    pages: Sequence[Any],
+    of_frames: Sequence[Sequence[int]],
     shape: tuple[int, ...],
     order: tuple[int, ...],
     close: Callable[[], None],
 ) -> BlockReader:
-    """Reader of frames of equal numbers of pages, one frame after another.
+    """Reader of the frames that consist of the ``pages`` with the numbers ``of_frames``.
 
-    ``page`` returns a page by its number, ``complete`` states whether its stored pixels lie within the file. The pages
-    of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with leading
-    axes of length 1.
+    The pages of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with
+    leading axes of length 1.
     """
-    count = len(complete) // info.shape[0]
+    size = path.stat().st_size
 
     def read(first: int, _: int) -> Array:
-        numbers = range(first * count, (first + 1) * count)
-        if not all(complete[number] for number in numbers):
+        of_frame = [pages[number] for number in of_frames[first]]
+        if not all(_is_complete(page, size) for page in of_frame):
             raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
-        stored = np.stack([page(number).asarray(maxworkers=1) for number in numbers]).reshape(shape)
+        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame]).reshape(shape)
         return stored.transpose(order).reshape(1, *info.shape[1:])
 
     return BlockReader(path, info, read, close=close)
@@ -196,10 +195,8 @@ def _open_pages(path: Path, tif: Any, pages: Sequence[_Page], close: Callable[[]
     info = _info(tif, (len(frames), *shape), first.dtype, first.photometric, channels_last=last)
     lost = {"thumbnails and masks": None} if len(frames) < len(pages) else {}
     info = replace(info, metadata={**info.metadata, **lost})
-    complete, order = [page.complete for page in frames], (2, 0, 1) if last else tuple(range(len(shape)))
-    return _page_reader(
-        path, info, lambda number: tif.pages[frames[number].number], complete, first.shape, order, close
-    )
+    order = (2, 0, 1) if last else tuple(range(len(shape)))
+    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], first.shape, order, close)
 
 
 def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader:
@@ -213,20 +210,15 @@ def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader
         close()
         return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
     size = path.stat().st_size
-    complete = [page is not None and _is_complete(page, size) for page in pages]
-    _check_complete(complete, math.prod(shape) * series.dtype.itemsize, size)
-    time = order[len(order) - len(info.shape)] if T > 1 else None
-    if len(pages) % T == 0 and (time is None or all(size == 1 for size in shape[:time])):
-        frame_shape = tuple(1 if i == time else size for i, size in enumerate(shape))
-        return _page_reader(path, info, lambda number: pages[number], complete, frame_shape, order, close)
-    if not all(complete):
-        raise ValueError("truncated: its pages are not in the order of the frames")
-
-    def read(*_: int) -> Array:
-        pixels: Array = series.asarray(maxworkers=1)
-        return pixels.reshape(shape).transpose(order).reshape(info.shape)
-
-    return BlockReader(path, info, read, T, T * info.frame_bytes, close)  # a copy if axes are reordered
+    _check_complete([_is_complete(page, size) for page in pages], math.prod(shape) * series.dtype.itemsize, size)
+    time = order[len(order) - len(info.shape)] if T > 1 else 0
+    of_pages = next(i for i in range(len(shape) + 1) if math.prod(shape[:i]) == len(pages))  # axes with one page each
+    if T > 1 and time >= of_pages:
+        raise ValueError(f"axes {series.axes}: a page has several frames; expected one frame per page")
+    numbers = np.arange(len(pages)).reshape(*shape[:of_pages], *[1] * (len(shape) - of_pages))
+    of_frames = np.moveaxis(numbers, time, 0).reshape(T, -1).tolist()
+    frame_shape = tuple(1 if T > 1 and i == time else size for i, size in enumerate(shape))
+    return _page_reader(path, info, pages, of_frames, frame_shape, order, close)
 
 
 def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> None:

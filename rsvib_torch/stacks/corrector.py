@@ -12,12 +12,7 @@ from rsvib_torch.restoration import VibrationRestorer
 
 
 class CorrectedFrames(NamedTuple):
-    """Result of ``VibrationCorrector``.
-
-    Attributes:
-        frames: The restored frames, in the shape of the input.
-        detection: The vibration of each stack with its verdict; axes that are not reliable are not corrected.
-    """
+    """Restored frames in the shape of the input, and the detections; axes that are not reliable are not corrected."""
 
     frames: Tensor
     detection: DetectionResult

@@ -69,9 +69,8 @@ class WindowResult(Summarised):
             frames ``indices`` if it was followed from frame to frame; None if it failed.
         restoration: Details of the restoration; None without a detection.
         error: Why detection or restoration failed.
-        unchanged: Indices of ``frames`` that are as taken, in a window that is restored: those of a vibration that was
-            followed, whose motion is not known.
         bad_frames: Frames of ``window.written`` that could not be used, with the reason; they are not in ``frames``.
+        unchanged: Indices of ``frames`` of a restored window that are as taken, because their motion is not known.
     """
 
     window: Window
@@ -185,22 +184,18 @@ class StackJob:
                 found = detection = self.given[window.index]
             else:
                 found = detection = detect_vibration(frames, timing, **self.detection)
-                followed = self._followed_instead(as_taken, usable, detection)
-                if followed is not None:
-                    return followed
+                if self.follow == "auto" and may_change(detection, len(usable)):
+                    followed = self._followed(as_taken, usable)
+                    reliable = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
+                    if reliable > detection.reliable.sum():
+                        return followed
             if found is None or self.restoration is None:
                 missing = "no detection was given for this window" if found is None else None
                 return replace(as_taken, detection=detection, error=missing)
-            joint = bool(self.restoration.get("joint", False))
-            restoration = restore_trusted(
-                frames,
-                timing,
-                found,
-                self.restoration,
-                force=self.force,
-                first_frames=len(kept) if len(kept) > 1 and not joint else None,
-                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
-            )
+            first_frames = len(kept) if len(kept) > 1 and not self.restoration.get("joint", False) else None
+            most_pairs = 8 if window.alone else 2  # limits the time of the verdict
+            limits = {"first_frames": first_frames, "most_pairs": most_pairs}
+            restoration = restore_trusted(frames, timing, found, self.restoration, force=self.force, **limits)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
         one_image = self.joined and restoration.restored
@@ -229,14 +224,11 @@ class StackJob:
         usable: dict[int, NDArray[Any]] = {}
         faults: dict[int, str] = {}
         for index, frame in zip(window.frames, pixels, strict=True):
-            if isinstance(frame, str):
-                faults[index] = frame
-                continue
-            fault = frame_fault(frame, index, self.full_scale, nodata=self.info.nodata)
-            if fault is None:
-                usable[index] = frame
-            else:
+            fault = frame_fault(frame, index, self.full_scale, self.info.nodata)
+            if fault is not None:
                 faults[index] = fault
+            elif not isinstance(frame, str):
+                usable[index] = frame
         return usable, faults
 
     def _images(self, frames: Mapping[int, NDArray[Any]]) -> Tensor:
@@ -245,16 +237,6 @@ class StackJob:
             return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
         stored = np.stack(list(frames.values()))
         return counts_to_frames(stored, self.full_scale, str(self.source), self.info.nodata).to(self.device)
-
-    def _followed_instead(
-        self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]], steady: DetectedVibration
-    ) -> WindowResult | None:
-        """The result of a window whose tones may change, if more of its axes are reliable than of a steady one."""
-        if self.follow != "auto" or not may_change(steady, len(usable)):
-            return None
-        followed = self._followed(as_taken, usable)
-        better = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
-        return followed if better > steady.reliable.sum() else None
 
     def _followed(self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]]) -> WindowResult:
         """The result of a window whose vibration is followed, from its usable frames and those around it."""
@@ -412,25 +394,14 @@ def plan_job(
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
+    on_gpu = device != "cpu"
     restored = options if isinstance(options, StackOptions) else None
     run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
     restoration = None if restored is None else dict(restored.restoration or {})
     follow = _follows(options, restoration, detection, run.given if run.motion is None else run.motion)
-    job = StackJob(
-        Path(source),
-        info,
-        timing,
-        full_scale,
-        detection,
-        restoration,
-        None if run.given is None else dict(enumerate(run.given)),
-        run.motion,
-        run.bad_frames,
-        restored is not None and restored.force,
-        device,
-        options.window,
-        follow,
-    )
+    given, force = None if run.given is None else dict(enumerate(run.given)), restored is not None and restored.force
+    of_run = (given, run.motion, run.bad_frames, force, device, options.window, follow)
+    job = StackJob(Path(source), info, timing, full_scale, detection, restoration, *of_run)
     if job.mosaic is not None:
         check_mosaic(job.mosaic, info.shape, str(source))
     if job.restoration is not None:
@@ -439,20 +410,14 @@ def plan_job(
     windows = cut_windows(info.shape[0], job.window, margin)
     if options.workers is not None:
         most = options.workers
-    elif device != "cpu":
+    elif on_gpu:
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not here:  # the memory of other machines is not known
         return job, windows, most
     at_once = windows_at_once(
-        info,
-        job.window,
-        memory=options.memory,
-        most=most,
-        restoration=job.restoration,
-        on_gpu=device != "cpu",
-        margin=margin,
+        info, job.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
     )
     return job, windows, at_once
 
@@ -478,18 +443,11 @@ def restore_block(
         frames: (T, H, W) or (T, C, H, W), as stored.
         timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
         detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
+        restoration: Options of ``restore`` that keep the size, for frames whose full scale is 1.
         full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
         channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
-
-    Returns:
-        Restored frames.
-
-    Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
-            to have their channels last.
 
     Example:
         >>> restored = array.map_overlap(  # doctest: +SKIP
@@ -502,7 +460,7 @@ def restore_block(
             "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
         )
     options = dict(restoration or {})
-    if options.get("joint", False) is True:
+    if options.get("joint") is True:
         raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
     for name in ("scale", "mosaic"):
         if options.get(name) not in (None, 1):

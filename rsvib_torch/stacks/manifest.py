@@ -49,11 +49,11 @@ class StackManifest(Result, file_format="rsvib stack"):
         versions: Versions of the packages that computed it.
         output: Name of the output; None for detection only.
         bad_frames: Index of each frame that could not be used, with the reason.
+        windows: Result of every window.
         not_kept: Metadata of the input that the output does not contain.
         margins: px that were cut off the sides of the frames of a video.
         gyroscope: Of a video whose path is that of a gyroscope: its axes, clock and bias (rad/s), and the focal length
             (px), as in ``RotationAlignment``.
-        windows: Result of every window.
     """
 
     input: dict[str, Any]
@@ -87,13 +87,9 @@ class StackManifest(Result, file_format="rsvib stack"):
             ends = (record.first, record.last) if frame is None else (frame, frame)
             first: dict[str, Any] = {"window": record.window, "first_frame": ends[0], "last_frame": ends[1]}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
-            note = record.error or "; ".join(map(str, record.left_alone))
-            last = {
-                "frames": record.frames,
-                "outcome": record.outcome,
-                "bad_frames": len(record.bad_frames),
-                "note": note,
-            }
+            last: dict[str, Any] = {"frames": record.frames, "outcome": record.outcome}
+            last["bad_frames"] = len(record.bad_frames)
+            last["note"] = record.error or "; ".join(map(str, record.left_alone))
             last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
             tones = [{}] if found is None else found.tone_lines(pixel_size)
             lines += [{**first, **tone, **last} for tone in tones]
@@ -197,16 +193,9 @@ class StackManifest(Result, file_format="rsvib stack"):
         vibration = [text_table(*self.tone_table(pixel_size)), spread]
         followed = [record for record in self.windows if record.followed is not None]
         if followed and self.settings.get("follow") == "auto":
-            which = (
-                "all windows"
-                if len(followed) == len(self.windows)
-                else f"{len(followed)} of {len(self.windows)} windows"
-            )
-            vibration.append(
-                wrapped(
-                    f"the tones change within {which}, which were therefore followed from frame to frame (--follow)"
-                )
-            )
+            which = "all" if len(followed) == len(self.windows) else f"{len(followed)} of {len(self.windows)}"
+            text = f"the tones change within {which} windows, which were therefore followed from frame to frame"
+            vibration.append(wrapped(f"{text} (--follow)"))
         if self.gyroscope is not None:
             found = self.gyroscope
             axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
@@ -223,18 +212,21 @@ class StackManifest(Result, file_format="rsvib stack"):
         if data["predicted_gain_db"] is not None:
             low, high = data["predicted_gain_db"].values()
             restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
-        still = self._has_no_tone()
+        # All windows were measured, and nothing else than missing tones is stated against any axis.
+        codes = {
+            "failed" if one is None else one.codes((axis,))
+            for one in self.detections()
+            for axis in range(2 if one is None else one.vibration.num_axes)
+        }
+        still = codes == {"no_tone"}
         if still:
             text = "the camera stands still, or moves uniformly or by less than the noise"
             vibration.append(wrapped(f"no window has a significant tone: {text}"))
         for name, notes in data["left_alone"].items():
             if notes and not still:
                 window, note = next(iter(notes.items()))
-                restoration.append(
-                    wrapped(
-                        f"{name} unchanged in {number_of(len(notes), 'window')}; in window {window}: {note['text']}"
-                    )
-                )
+                where = number_of(len(notes), "window")
+                restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
         if data["errors"]:
             window, error = next(iter(data["errors"].items()))
             failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
@@ -246,15 +238,6 @@ class StackManifest(Result, file_format="rsvib stack"):
         """What has a detection."""
         followed = [record.followed is not None for record in self.windows]
         return "frames" if all(followed) else "windows or frames" if any(followed) else "windows"
-
-    def _has_no_tone(self) -> bool:
-        """Whether all windows were measured, and nothing else than missing tones is stated against any axis."""
-        codes = [
-            one.codes((axis,)) if one is not None else "failed"
-            for one in self.detections()
-            for axis in range(2 if one is None else one.vibration.num_axes)
-        ]
-        return bool(codes) and set(codes) == {"no_tone"}
 
     def detections(self) -> list[DetectedVibration | None]:
         """The detection of every window, or of every frame of a window that was followed; None where it failed."""
@@ -285,13 +268,11 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
             if i not in pairs:
                 tones.append([])
             tones[pairs.get(i, -1)].append((amplitude, frequency))
-    described = []
+    described: list[dict[str, Any]] = []
     for tone in tones:
-        entry: dict[str, Any] = {"windows": len(tone)}
+        described.append({"windows": len(tone), "first": tone[0][0], "last": tone[-1][0]})
         for name, values in zip(("amplitude", "frequency"), zip(*tone, strict=True), strict=True):
-            entry |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
-        entry |= {"first": tone[0][0], "last": tone[-1][0]}
-        described.append(entry)
+            described[-1] |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 
 
@@ -323,11 +304,9 @@ def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> dict[str
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> dict[str, Any]:
     """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
     given = None
-    if job.given is not None:
-        records = plain_values([detected and DetectedVibration.of(detected) for detected in job.given.values()])
-        given = hashlib.sha256(json.dumps(records).encode()).hexdigest()
-    elif job.motion is not None:
-        given = hashlib.sha256(json.dumps(plain_values(job.motion)).encode()).hexdigest()
+    if job.given is not None or job.motion is not None:
+        detected = [one and DetectedVibration.of(one) for one in (job.given or {}).values()]
+        given = hashlib.sha256(json.dumps(plain_values([*detected, job.motion])).encode()).hexdigest()
     header = {
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
         "settings": {
@@ -374,13 +353,7 @@ def manifest_text(
 
 @checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
-    """Read the manifest of a complete run.
-
-    Args:
-        path: The ``manifest.json``.
-
-    Raises:
-        ValueError: If it is not a complete manifest.
+    """Read the ``manifest.json`` of a complete run.
 
     Example:
         >>> manifest = read_manifest("restored.tif.manifest.json")  # doctest: +SKIP

@@ -85,10 +85,6 @@ def align_stack(
     Angular rates are compared with 48 pairs of neighbouring frames over the whole stack, a motion with three runs of 16
     frames; of stacks that are not longer, all frames are used. ``info`` describes the stack, with its full scale;
     ``timing`` is that of the caller.
-
-    Raises:
-        OSError: If the stack cannot be read.
-        ValueError: As ``align_motion``.
     """
     timing = timing_from_first_frame(timing, info)
     if isinstance(recorded, AngularRates):

@@ -121,17 +121,14 @@ class RunFolder:
             except OSError as error:
                 if error.errno in (errno.ELOOP, errno.ENOTDIR):
                     raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
-                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
                     raise
-                warnings.warn(  # as those of some clusters
-                    f"{self.path}: the file system has no locks ({error.strerror}): start no other run with this "
-                    "output",
-                    stacklevel=2,
-                )
-            if self._has_its_name():
+                text = f"the file system has no locks ({error.strerror}): start no other run with this output"
+                warnings.warn(f"{self.path}: {text}", stacklevel=2)
+            keeps = self._has_its_name()  # otherwise another process has removed it
+            if keeps:
                 opened.pop_all()
-                return True
-            return False  # another process has removed it
+            return keeps
 
     def _has_its_name(self) -> bool:
         with suppress(FileNotFoundError):
@@ -190,15 +187,11 @@ class RunFolder:
             self._append(header)
             os.fsync(self._folder)
         for window in list(self._windows):
-            if not self._is_whole(window):
+            whole = False  # whether its files are those that were written
+            with suppress(OSError):
+                whole = all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
+            if not whole:
                 del self._windows[window]
-
-    def _is_whole(self, window: int) -> bool:
-        """Whether the files of a window are those that were written."""
-        try:
-            return all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
-        except OSError:
-            return False
 
     def _entry(self, window: int) -> dict[str, Any]:
         """The line of a window, which is not kept in memory."""
@@ -358,12 +351,11 @@ class StackReport(Summarised):
             lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
         if self.resumed:
             lines.append(f"windows complete before this run: {self.resumed}")
+        see = f"see {self.manifest.name}"
         if self.failed:
-            lines.append(
-                f"detection or restoration failed in {number_of(self.failed, 'window')}: see {self.manifest.name}"
-            )
+            lines.append(f"detection or restoration failed in {number_of(self.failed, 'window')}: {see}")
         if self.bad_frames:
-            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
+            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: {see}")
         return "\n".join(lines)
 
 
