@@ -62,19 +62,16 @@ def as_numbers(name: str, value: object, device: torch.device | None = None) -> 
     try:
         return torch.tensor(value, dtype=torch.float64, device="cpu" if device is None else device)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise TypeError(
-            f"{name} must be a number, a tensor, or numbers in lists of equal lengths, got {described(value)}"
-        ) from error
+        expected = "a number, a tensor, or numbers in lists of equal lengths"
+        raise TypeError(f"{name} must be {expected}, got {described(value)}") from error
 
 
 def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
     """Raise a ``ValueError`` unless tensors have the stated shapes.
 
-    Args:
-        values: Tensors by name; None and names without a stated shape are omitted.
-        shapes: Axes of a tensor: a size; a name for a size of at least 1 that is the same in all tensors, with its
-            limits if there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or
-            ``[...]`` for these or none. ``...`` alone, for values that are not tensors, is not checked.
+    Stated are the axes: a size; a name for a size of at least 1 that is the same in all tensors, with its limits if
+    there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
+    or none. ``...`` alone, for values that are not tensors, is not checked; None is omitted.
 
     Example:
         >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
@@ -98,12 +95,12 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
         if not fits or batch not in batches:
             names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
-            limits = {axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high}
-            sizes_known = [f"{axis} = {(limits | known)[axis]}" for axis in names if axis in limits | known]
-            where = f" with {', '.join(sizes_known)}" if sizes_known else ""
-            raise ValueError(
-                f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}"
-            )
+            limits = {
+                axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high
+            } | known
+            where = ", ".join(f"{axis} = {limits[axis]}" for axis in names if axis in limits)
+            expected = f"({', '.join(names)}{',' * (len(names) == 1)}){' with ' * bool(where)}{where}"
+            raise ValueError(f"{name} must have shape {expected}, got {shape}")
         known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
         if batch or lead == "...":
             known["..."] = batch
@@ -125,9 +122,8 @@ def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> Non
     """Check that tensors are floating-point images of the shapes of ``check_shapes``."""
     for name, image in images.items():
         if not image.is_floating_point():
-            raise TypeError(
-                f"{name} must be a floating-point tensor, got {image.dtype}; divide counts by their full scale"
-            )
+            problem = f"must be a floating-point tensor, got {image.dtype}"
+            raise TypeError(f"{name} {problem}; divide counts by their full scale")
     check_shapes(images, shapes)
 
 

@@ -89,11 +89,10 @@ def export(given: ExportOptions) -> Answer:
         found = read_json(given.camera_isd, "ISD")
         rows = found.get("image_lines")
         motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)
-        written = exports.write_isd(
-            out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
-        )
-        form = "frame camera with jitter polynomials"
-        form = form if written == "frame" else "line scanner with one quaternion per row"
+        of_isd: Table = {"frame": given.frame, "model": given.model, "tolerance": given.tolerance}
+        written = exports.write_isd(out, motion, timing, found, **of_isd)
+        forms = {"frame": "frame camera with jitter polynomials"}
+        form = forms.get(written, "line scanner with one quaternion per row")
         data |= {"model": written, "frame": given.frame}
         return Answer({"Sensor model": [f"frame {given.frame} as a {form}"]}, data, [out])
     shape, count = _extent(given)
@@ -116,9 +115,7 @@ def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
         shape = io.read_stack_info(given.frames).shape
         size, count = size or (shape[-2], shape[-1]), shape[0] if count is None else count
     if size is None or count is None:
-        raise ValueError(
-            "the size and the number of the frames are not known: give --frames, or --size and --num-frames"
-        )
+        raise ValueError("size and number of the frames are not known: give --frames, or --size and --num-frames")
     return size, count
 
 
@@ -131,17 +128,15 @@ def _trusted(
         motion, reasons = restoration.trusted_vibration(detected, timing, count, rows)
         notes = [str(replace(one, details={**one.details, "action": "exported"})) for one in reasons]
         if not bool(motion.moving_axes().any()):
-            raise ValueError(
-                f"nothing to export: {'; '.join(notes) or 'no vibration'}; --force exports it nevertheless"
-            )
+            why = "; ".join(notes) or "no vibration"
+            raise ValueError(f"nothing to export: {why}; --force exports it nevertheless")
         for note in notes:
             warn(note)
     if given.focal_length is None:
         return motion
     if motion.camera is not None:
-        raise ValueError(
-            f"the vibration was detected with focal_length={motion.camera.focal_length:g} px; omit --focal-length"
-        )
+        known = f"focal_length={motion.camera.focal_length:g} px"
+        raise ValueError(f"the vibration was detected with {known}; omit --focal-length")
     return motion.with_camera(rsvib_torch.Camera(given.focal_length))
 
 

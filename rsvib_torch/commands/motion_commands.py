@@ -70,8 +70,7 @@ def motion(given: MotionOptions) -> Answer:
     if isinstance(result, detection.MotionDetection):
         rows, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
         columns |= {f"std_{name}": np.interp(times, rows, stds[:, axis]) for axis, name in enumerate("xy")}
-    digits = {"time": 9}
-    texts = {name: [f"{value:.{digits.get(name, 5)}f}" for value in values] for name, values in columns.items()}
+    texts = {name: [f"{v:.{9 if name == 'time' else 5}f}" for v in values] for name, values in columns.items()}
     reports.write_columns(out, texts)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
     restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
@@ -163,17 +162,17 @@ def known(given: KnownOptions) -> Answer:
     results: dict[str, list[str]] = {}
     data: Table = {"alignment": None, "check": None}
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
-        fitted = {"fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
+        fitted: Table = {"camera": camera, "fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
         with working("aligning the recording"):
-            found = stacks.align_stack(
-                given.stack, info, timing, recorded, camera=camera, offsets=given.offsets, **fitted
-            )
+            found = stacks.align_stack(given.stack, info, timing, recorded, offsets=given.offsets, **fitted)
         results["Recording on the clock of the frames"] = [found.summary()]
         data["alignment"] = _without_curve(found)
         _refuse(given, found.reasons)
         placed = found.motion
-        if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):
-            timing = _with_row_time(timing, found.row_time)
+        if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
+            rows = timing.row_time / found.row_time
+            in_rows = {"exposure_rows": rows * timing.exposure_rows, "frame_rows": rows * timing.frame_rows}
+            timing = replace(timing, row_time=found.row_time, **in_rows)
     else:
         placed = recorded.retimed(given.offset)
         _check_covers(given, recorded, placed, io.timing_from_first_frame(timing, info), info.shape)
@@ -184,21 +183,11 @@ def known(given: KnownOptions) -> Answer:
         data["check"] = _without_curve(check)
     # 3. Restoration in windows.
     counts = info.shape[0] > 8
-    window = {"window": given.settings.stack["window"]} if "window" in given.settings.stack else {}
+    of_run = {"restoration": options, "full_scale": scale, "force": given.force, "device": str(given.torch_device)}
+    of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
-        run = stacks.process_stack(
-            given.stack,
-            given.restored,
-            timing,
-            motion=placed,
-            restoration=options,
-            full_scale=scale,
-            force=given.force,
-            device=str(given.torch_device),
-            manifest=manifest,
-            progress=progress if counts else None,
-            **window | given.processing,
-        )
+        of_run |= {"manifest": manifest, "progress": progress if counts else None}
+        run = stacks.process_stack(given.stack, given.restored, timing, motion=placed, **of_run)
     note_lost(given.restored, run.not_kept)
     stored = stacks.read_manifest(manifest)
     first = None if run.first is None else run.first.restoration
@@ -233,14 +222,6 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
             "--unit; axes and clock of a gyroscope are estimated from the frames"
         )
     return rsvib_torch.read_gyroscope(given.motion)
-
-
-def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float) -> rsvib_torch.SensorTiming:
-    """The timing with another row time, and the same exposure and frame period in seconds."""
-    rows = timing.row_time / row_time
-    return replace(
-        timing, row_time=row_time, exposure_rows=rows * timing.exposure_rows, frame_rows=rows * timing.frame_rows
-    )
 
 
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
@@ -333,16 +314,11 @@ def compare(given: CompareOptions) -> Answer:
         shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-    times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    record = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    found = detection.DetectionResult.load(given.vibration)
+    stated = {"pixel_size": given.pixel_size, "offset": given.offset, "offsets": given.offsets}
     with working("comparing"):
-        result = gyroscope.compare_accelerometer(
-            detection.DetectionResult.load(given.vibration),
-            times,
-            acceleration,
-            pixel_size=given.pixel_size,
-            offset=given.offset,
-            offsets=given.offsets,
-        )
+        result = gyroscope.compare_accelerometer(found, *record, **stated)
         if given.out is not None:
             result.plot(given.out)
     files = [] if given.out is None else [given.out]
@@ -424,26 +400,18 @@ def calibrate(given: CalibrateOptions) -> Answer:
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
     with working("measuring the motion" if given.by_motion else "measuring the flicker"):
         if given.by_motion:
-            result = row_time.calibrate_row_time_by_motion(
-                stack,
-                frame_rate=given.frame_rate or 0.0,
-                row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
-                exposure_time=given.exposure[0] if given.exposure else None,
-                scan_axis=axis,
-                readout_direction=given.readout_direction,
-            )
+            exposure = given.exposure[0] if given.exposure else None
+            limits = (given.row_time[0], given.row_time[1]) if given.row_time else None
+            known: Table = {"row_time": limits, "exposure_time": exposure, "readout_direction": given.readout_direction}
+            frame_rate = given.frame_rate or 0.0
+            result = row_time.calibrate_row_time_by_motion(stack, frame_rate=frame_rate, scan_axis=axis, **known)
         elif given.flicker_frequency is None:
-            exposure = given.exposure or []
-            result = row_time.calibrate_row_time_by_exposure(stack, exposure, scan_axis=axis, gamma=given.gamma)
+            exposures = given.exposure or []
+            result = row_time.calibrate_row_time_by_exposure(stack, exposures, scan_axis=axis, gamma=given.gamma)
         else:
+            known = {"on_fraction": given.on_fraction, "light_contrast": given.light_contrast, "gamma": given.gamma}
             result = row_time.calibrate_row_time(
-                stack,
-                given.flicker_frequency,
-                frame_rate=given.frame_rate,
-                on_fraction=given.on_fraction,
-                light_contrast=given.light_contrast,
-                scan_axis=axis,
-                gamma=given.gamma,
+                stack, given.flicker_frequency, frame_rate=given.frame_rate, scan_axis=axis, **known
             )
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
@@ -476,12 +444,8 @@ def _check_given(given: CalibrateOptions) -> None:
                 "--by-motion and --frame-rate for frames of a vibrating camera"
             )
         return
-    light = {
-        "--frequency": given.flicker_frequency,
-        "--on-fraction": given.on_fraction,
-        "--light-contrast": given.light_contrast,
-    }
-    for name, value in light.items():
+    light = {"--frequency": given.flicker_frequency, "--on-fraction": given.on_fraction}
+    for name, value in (light | {"--light-contrast": given.light_contrast}).items():
         if value is not None:
             raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
     if given.frame_rate is None:

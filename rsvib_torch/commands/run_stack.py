@@ -121,17 +121,10 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
     counts = info.shape[0] > chosen.window
+    of_run = common | given.processing | {"bad_frames": chosen.bad_frames, "manifest": out / "manifest.json"}
     with working(f"restoring {frames.name}", counts=counts) as progress:
-        result = stacks.process_stack(
-            frames,
-            restored,
-            settings.timing,
-            **common,
-            **given.processing,
-            bad_frames=chosen.bad_frames,
-            manifest=out / "manifest.json",
-            progress=progress if counts else None,
-        )
+        of_run["progress"] = progress if counts else None
+        result = stacks.process_stack(frames, restored, settings.timing, **of_run)
     first = result.first
     if first is None:  # the run was complete before, or its first window was
         first = next(iter(stacks.iterate_stack(frames, settings.timing, **common, **resources)))
@@ -218,28 +211,27 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
         "--mosaic": restoration.get("mosaic"),
         "--optics-sigma": restoration.get("optics"),
     }
-    refused = [name for name, value in only_windows.items() if value]
+    refused = ", ".join(name for name, value in only_windows.items() if value)
     if refused:
         raise ValueError(
-            f"{', '.join(refused)} cannot be used with --video, which follows the frames one by one; give --output "
-            "restored.mp4 instead of --video, which processes windows"
+            f"{refused} cannot be used with --video, which follows the frames one by one; give --output restored.mp4 "
+            "instead of --video, which processes windows"
         )
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = out / "manifest.json"
+    of_run = common | given.moved | given.processing | {"manifest": manifest}
     with working(f"restoring {frames.name}", counts=True) as progress:
-        result = video.process_video(
-            frames,
-            restored,
-            settings.timing,
-            **common,
-            **given.moved,
-            **given.processing,
-            manifest=manifest,
-            progress=progress,
-        )
+        result = video.process_video(frames, restored, settings.timing, **of_run, progress=progress)
     stored = stacks.read_manifest(manifest)
-    drawn = written.draw_safely(out / "before_after.png", lambda: _followed_figure(frames, restored, stored))
+    index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
+
+    def comparison() -> Figure:
+        raw = _frame(frames, index, stored.settings["full_scale"])
+        raw = raw if stored.margins is None else video.Margins(**stored.margins).cut(raw)
+        return reports.comparison_figure(raw, _frame(restored, index, None))
+
+    drawn = written.draw_safely(out / "before_after.png", comparison)
     with whole_folder(out) as folder:
         names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, manifest, given.pixel_size)]
     if result.bad_frames:
@@ -265,12 +257,3 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     answer.files += [out / name for name in names]
     answer.next_steps.append(answers.page_step(frames, out / "report", settings, "--manifest", manifest))
     return answer
-
-
-def _followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
-    """Draw one of the first frames of a video beside the restored one."""
-    index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
-    raw = _frame(frames, index, manifest.settings["full_scale"])
-    if manifest.margins is not None:
-        raw = video.Margins(**manifest.margins).cut(raw)
-    return reports.comparison_figure(raw, _frame(restored, index, None))

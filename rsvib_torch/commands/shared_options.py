@@ -4,7 +4,7 @@ import itertools
 import os
 import re
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -65,18 +65,19 @@ def rate(text: str) -> float:
     return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
-def _range_of_frames(text: str) -> str:
-    """START:END, as it was given."""
-    if re.fullmatch(r"\d*:\d*", text) is None:
-        raise typer.BadParameter(f"expected START:END such as 100:200, 100: or :200, got {text!r}")
-    return text
+def _of_form(pattern: str, expected: str) -> Callable[[str], str]:
+    """Parser of a text of a form, which returns it as it was given."""
+
+    def parse(text: str) -> str:
+        if re.fullmatch(pattern, text) is None:
+            raise typer.BadParameter(f"expected {expected}, got {text!r}")
+        return text
+
+    return parse
 
 
-def _axes(text: str) -> str:
-    """Names of axes with commas between them, as they were given."""
-    if not set(text.split(",")) <= {*AXES}:
-        raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
-    return text
+_range_of_frames = _of_form(r"\d*:\d*", "START:END such as 100:200, 100: or :200")
+_axes = _of_form(rf"({'|'.join(AXES)})(,({'|'.join(AXES)}))*", "axes such as x,y or x,y,roll,zoom")
 
 
 def size_of(text: str, expected: str) -> tuple[int, int]:
@@ -159,17 +160,17 @@ class CameraOptions:
                 raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
             shape = io.read_stack_info(frames).shape
             sensor = sensor | {"row_time": self.readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
+        if self.config is None and frames is not None and "row_time" in sensor:
+            exposure = None if "exposure_time" in sensor else stated_exposure(frames)
+            sensor = sensor | ({} if exposure is None else {"exposure_time": exposure})
+            if "exposure_time" in sensor and "frame_rate" not in sensor:
+                frame_rate = stated_rate(io.read_stack_info(frames))
+                if frame_rate is not None:
+                    note(
+                        f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it"
+                    )
+                    sensor = sensor | {"frame_rate": frame_rate}
         missing = [option for name, option in _TIMES.items() if name not in sensor]
-        if self.config is None and "--exposure" in missing and "--row-time" not in missing and frames is not None:
-            exposure = stated_exposure(frames)
-            if exposure is not None:
-                missing.remove("--exposure")
-                sensor = sensor | {"exposure_time": exposure}
-        if self.config is None and missing == ["--frame-rate"] and frames is not None:
-            frame_rate = stated_rate(io.read_stack_info(frames))
-            if frame_rate is not None:
-                note(f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it")
-                sensor, missing = sensor | {"frame_rate": frame_rate}, []
         if self.config is None and missing:
             raise ValueError(
                 f"the camera is not described: give {', '.join(missing)}, or --config FILE (rsvib init FRAMES writes "
@@ -306,10 +307,9 @@ def check_new(
     check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
-        names = ", ".join(path.name for path in existing)
+        found = f"{existing[0].parent}: {', '.join(path.name for path in existing)}"
         raise FileExistsError(
-            f"results exist already in {existing[0].parent}: {names}; choose another name, or replace them with "
-            "--overwrite"
+            f"results exist already in {found}; choose another name, or replace them with --overwrite"
         )
 
 

@@ -68,8 +68,7 @@ def print_notes(info: io.StackInfo, config: Config) -> None:
 
 def _detect(stack: Stack, config: Config) -> detection.DetectionResult:
     with working("detecting the vibration"):
-        result: detection.DetectionResult = detection.detect_vibration(stack.frames, stack.timing, **config.detection)
-    return result
+        return detection.detect_vibration(stack.frames, stack.timing, **config.detection)
 
 
 def _restore(
@@ -92,9 +91,7 @@ def restore_and_save(
 ) -> stacks.RestoredFrames:
     """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
     result = _restore(stack, motion, options, force)
-    frames = result.frames
-    if stack.info.nodata is not None:
-        frames = stacks.without_data(frames, stack.frames)
+    frames = result.frames if stack.info.nodata is None else stacks.without_data(result.frames, stack.frames)
     with working(f"writing {path.name}"):
         io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
     not_kept = io.metadata_not_kept(stack.info, path, tuple(frames.shape))
@@ -226,14 +223,9 @@ def detect(given: DetectOptions) -> Answer:
         title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
         answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
         if any(record.followed is not None for record in stored.windows):
-            run = (
-                "run",
-                frames,
-                out / "restored",
-                *settings.arguments,
-                *["--follow"] * (windows.get("follow") is True),
-            )
-            answer.next_steps.append(answers.next_step("restore the frames", *run))
+            run = ("run", frames, out / "restored", *settings.arguments)
+            follow = ["--follow"] * (windows.get("follow") is True)
+            answer.next_steps.append(answers.next_step("restore the frames", *run, *follow))
         else:
             answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     answer.files += [out / name for name in names]
@@ -321,26 +313,16 @@ def _restore_windows(given: RestoreOptions) -> Answer:
             "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
         )
     if any(record.followed is not None for record in manifest.windows):
-        raise ValueError(
-            f"{vibration}: its vibration was followed from frame to frame, and is not that of windows; repeat rsvib run"
-        )
+        followed = "its vibration was followed from frame to frame, and is not that of windows"
+        raise ValueError(f"{vibration}: {followed}; repeat rsvib run")
     if not isinstance(window, int):
         raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
     info, scale, options = given.planned_restoration(given.restoration)
     print_notes(info, given.settings)
+    common = {"restoration": options, "full_scale": scale, "force": given.force, "device": str(given.torch_device)}
+    common |= {"window": window, "given": manifest.detections()}
     with working(f"restoring {given.stack.name}", counts=True) as progress:
-        result = stacks.process_stack(
-            given.stack,
-            given.restored,
-            given.settings.timing,
-            window=window,
-            given=manifest.detections(),
-            restoration=options,
-            full_scale=scale,
-            force=given.force,
-            device=str(given.torch_device),
-            progress=progress,
-        )
+        result = stacks.process_stack(given.stack, given.restored, given.settings.timing, **common, progress=progress)
     written.note_lost(given.restored, result.not_kept)
     answer = answers.windows_answer("Vibration", stacks.read_manifest(result.manifest), result)
     answer.files += [given.restored, result.manifest]
@@ -428,8 +410,8 @@ def report(given: ReportOptions) -> Answer:
 
 def _edge_box(text: str) -> reports.Box:
     """Position of a slanted edge (top, left, height, width) in px."""
-    numbers = [part.strip() for part in text.split(",")]
-    if len(numbers) != 4 or not all(number.isdecimal() for number in numbers):
+    numbers = [int(part) for part in text.split(",") if part.strip().isdecimal()]
+    if len(numbers) != 4 or text.count(",") != 3:
         raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
-    top, left, height, width = map(int, numbers)
+    top, left, height, width = numbers
     return top, left, height, width

@@ -65,10 +65,6 @@ def write_gcsv(
         num_frames: Number of frames; the samples cover their exposures.
         sample_rate: Samples per second; by default as stated above.
 
-    Raises:
-        ValueError: If the motion has no camera, is a batch, or zooms, which rates do not contain; or if too many
-            samples are necessary.
-
     Example:
         >>> import tempfile
         >>> from rsvib_torch import Camera, SensorTiming, Vibration

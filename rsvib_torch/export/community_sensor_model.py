@@ -77,9 +77,6 @@ def camera_isd(
         radii: Semi-major and semi-minor axis of the body in km; by default those of the Earth.
         ephemeris_time: Time of the middle of the frame in s.
 
-    Returns:
-        The ISD, which ``json.dump`` can write.
-
     Example:
         >>> isd = camera_isd(Camera(2e5), (1024, 1024), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
         >>> isd["focal_length_model"], isd["detector_center"]
@@ -100,6 +97,7 @@ def camera_isd(
     if any(camera.distortion):  # usgscsm does not divide by the focal length
         lens = {"radtan": {"coefficients": [k1 / f**2, k2 / f**4, p1 / f, p2 / f, k3 / f**6]}}
     once = {"ephemeris_times": [ephemeris_time], "reference_frame": 1}
+    centre = [0.5 * side + offset for side, offset in zip((width, height), camera.principal_point, strict=True)]
     return {
         "name_model": _FRAME,
         "name_platform": "unknown",
@@ -115,10 +113,7 @@ def camera_isd(
         "focal2pixel_lines": [0.0, 0.0, 1.0],
         "focal2pixel_samples": [0.0, 1.0, 0.0],
         "focal_length_model": {"focal_length": f},
-        "detector_center": {
-            "line": 0.5 * height + camera.principal_point[1],
-            "sample": 0.5 * width + camera.principal_point[0],
-        },
+        "detector_center": dict(zip(("sample", "line"), centre, strict=True)),
         "interpolation_method": "lagrange",
         "optical_distortion": lens,
         "radii": {"semimajor": radii[0], "semiminor": radii[1], "unit": "km"},
@@ -169,11 +164,7 @@ def write_isd(
         tolerance: Largest error of a position in px, in both directions between image and ground.
 
     Returns:
-        The model that was written.
-
-    Raises:
-        ValueError: If the motion is a batch, the ISD lacks a field or has another focal length, columns are exposed one
-            after another, or no permitted model is accurate enough; the message states the errors and their reasons.
+        The model that was written. An error states why no permitted model is accurate enough.
 
     Example:
         >>> import tempfile
@@ -209,26 +200,18 @@ def write_isd(
                 "them: motion.with_camera(...)"
             )
     reasons = []
-    found: Table | None = None
-    written: Literal["frame", "line-scan"] = "frame"
-    if model in ("auto", "frame"):
-        found, reason = _with_jitter(camera, lines, displacement, timing, tolerance)
-        reasons.append(reason)
-    if found is None and model in ("auto", "line-scan"):
-        written = "line-scan"
-        if timing.readout_direction == "reverse":
-            reasons.append("line-scan: rows are read from bottom to top")
-        else:
-            found, reason = _as_line_scan(camera, displacement, timing, tolerance)
-            reasons.append(reason)
-    if found is None:
-        raise ValueError(
-            f"no sensor model represents this motion within {tolerance:g} px ({'; '.join(reasons)}); pass a larger "
-            "tolerance, or export the exact positions with write_stmap"
-        )
-    with whole_file(path) as part:
-        part.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return written
+    models: dict[Literal["frame", "line-scan"], Any] = {"frame": _with_jitter, "line-scan": _as_line_scan}
+    for name, build in models.items():
+        found, reason = build(camera, lines, displacement, timing, tolerance) if model in ("auto", name) else (None, "")
+        if found is not None:
+            with whole_file(path) as part:
+                part.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            return name
+        reasons += [reason] * bool(reason)
+    raise ValueError(
+        f"no sensor model represents this motion within {tolerance:g} px ({'; '.join(reasons)}); pass a larger "
+        "tolerance, or export the exact positions with write_stmap"
+    )
 
 
 def _displacements(motion: Motion, timing: SensorTiming, size: tuple[int, int], frame: int) -> tuple[Array, Array]:
@@ -372,9 +355,11 @@ def _with_jitter(
 
 
 def _as_line_scan(
-    camera: _Camera, displacement: Array, timing: SensorTiming, tolerance: float
+    camera: _Camera, _: Array, displacement: Array, timing: SensorTiming, tolerance: float
 ) -> tuple[Table | None, str]:
     """The ISD of a line scanner with one quaternion per row, None if it is not accurate enough, and its error."""
+    if timing.readout_direction == "reverse":
+        return None, "line-scan: rows are read from bottom to top"
     rows = len(displacement)
     line = np.arange(rows)[:, None] - _PADDING + 0.5
     sample = np.linspace(0.5, camera.size[1] - 0.5, _COLUMNS)

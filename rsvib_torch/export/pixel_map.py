@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import tifffile
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
@@ -71,16 +70,6 @@ def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frame
         yield torch.from_numpy(places).movedim(0, -1)
 
 
-def _channels(positions: Tensor, convention: StmapConvention) -> NDArray[np.float32]:
-    """(H, W, 3): the map in a convention, and 1 where the position lies in the frame, else 0."""
-    height, width = positions.shape[:2]
-    x, y = positions.unbind(-1)
-    inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-    if convention == "nuke":
-        x, y = (x + 0.5) / width, (height - 0.5 - y) / height
-    return torch.stack([x, y, inside.to(x)], -1).to(torch.float32).cpu().numpy()
-
-
 @checks_arguments
 def write_stmap(
     folder: str | os.PathLike[str],
@@ -128,10 +117,15 @@ def write_stmap(
         >>> round(float(cv2.remap(frame, map_x, map_y, cv2.INTER_LINEAR)[25, 30]), 2)  # a quarter of a period: X = 2 px
         32.0
     """
-    digits = max(4, math.ceil(math.log10(num_frames + 1)))
+    digits, (height, width) = max(4, math.ceil(math.log10(num_frames + 1))), size
     names = []
     with whole_folder(folder) as part:
         for frame, positions in enumerate(_maps(motion, timing, size, num_frames)):
+            x, y = positions.unbind(-1)
+            inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+            if convention == "nuke":
+                x, y = (x + 0.5) / width, (height - 0.5 - y) / height
             names.append(f"stmap_{frame:0{digits}d}.tif")
-            tifffile.imwrite(part / names[-1], _channels(positions, convention), photometric="rgb")
+            channels = torch.stack([x, y, inside.to(x)], -1).to(torch.float32).cpu().numpy()
+            tifffile.imwrite(part / names[-1], channels, photometric="rgb")
     return [Path(folder, name) for name in names]

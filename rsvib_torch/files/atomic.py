@@ -22,10 +22,7 @@ Kind = Literal["file", "folder", "tree"]
 
 def nearest_folder(path: Path) -> Path:
     """The lowest existing folder above ``path``."""
-    parent = path.absolute().parent
-    while not parent.exists() and parent != parent.parent:
-        parent = parent.parent
-    return parent
+    return next((folder for folder in path.absolute().parents if folder.exists()), path.absolute())
 
 
 def sync(path: Path) -> None:
@@ -45,26 +42,14 @@ def sync(path: Path) -> None:
         os.close(file)
 
 
-def sync_tree(path: Path) -> None:
-    """``sync`` a file, or a folder with everything in it."""
-    for folder, _, names in os.walk(path, topdown=False):
-        for name in names:
-            sync(Path(folder, name))
-        sync(Path(folder))
-    if path.is_file():
-        sync(path)
-
-
 def make_folder(path: Path) -> None:
     """Create a folder, and those above it, if it does not exist; its name is on the disk when the function returns."""
     existing = nearest_folder(path)
     path.mkdir(parents=True, exist_ok=True)
-    folder = path.absolute().parent
-    while True:
+    for folder in path.absolute().parents:
         sync(folder)
-        if folder in (existing, folder.parent):
+        if folder == existing:
             return
-        folder = folder.parent
 
 
 def remove_abandoned(path: Path) -> None:
@@ -177,7 +162,9 @@ def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[s
     check_target(target, kind, parent_exists=False)
     with temporary_folder(target) as folder:
         yield folder / target.name
-        sync_tree(folder)
+        for place, _, names in os.walk(folder, topdown=False):
+            for name in (*names, ""):
+                sync(Path(place, name))
         make_folder(target.parent)
         if kind == "folder" and target.is_dir():
             moves = [(file, target / file.name) for file in sorted((folder / target.name).iterdir())]

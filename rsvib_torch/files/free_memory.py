@@ -36,14 +36,13 @@ def check_fits(what: str, needed: int, remedy: str) -> None:
         raise ValueError(f"{what} need {size_text(needed)} of memory, of which {size_text(free)} are free; {remedy}")
 
 
-def _free_addresses() -> list[int]:
+def _free_addresses() -> Iterator[int]:
     """Free parts of address space and data segment, if they are limited (``ulimit -v``, ``-d``, some batch systems)."""
-    limits = {"vms": resource.getrlimit(resource.RLIMIT_AS)[0], "data": resource.getrlimit(resource.RLIMIT_DATA)[0]}
-    limits = {name: limit for name, limit in limits.items() if limit != resource.RLIM_INFINITY}
-    if not limits:
-        return []
     used = psutil.Process().memory_info()
-    return [limit - int(getattr(used, name, 0)) for name, limit in limits.items()]
+    for name, kind in (("vms", resource.RLIMIT_AS), ("data", resource.RLIMIT_DATA)):
+        limit = resource.getrlimit(kind)[0]
+        if limit != resource.RLIM_INFINITY:
+            yield limit - int(getattr(used, name, 0))
 
 
 # Folder of the groups, and names of limits, usage, and files in the page cache (https://docs.kernel.org/admin-guide:

@@ -6,6 +6,7 @@ frames can be read without them.
 
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any
@@ -48,12 +49,7 @@ def orientation_of(value: object) -> int:
 
 
 def camera_name(make: object, model: object) -> str | None:
-    """Make and model of a camera as one name; None without a model.
-
-    Example:
-        >>> camera_name("Apple", "iPhone 12"), camera_name("Canon", "Canon EOS R5")
-        ('Apple iPhone 12', 'Canon EOS R5')
-    """
+    """Make and model of a camera as one name, with the make once (Canon, Canon EOS R5); None without a model."""
     maker, name = (one_line("" if text is None else str(text).replace("\0", " "), 60) for text in (make, model))
     repeated = name.casefold().startswith(maker.casefold())
     return None if not name else name if repeated else f"{maker} {name}"
@@ -121,17 +117,11 @@ def exif_fields(data: bytes) -> Table:
         details = exif.get_ifd(ExifTags.IFD.Exif)
     except Exception:  # damaged metadata raise errors of many types
         return {}
-    taken, changed = (
-        _seconds_of_date(date, details.get(fraction, ""))
-        for date, fraction in (
-            (details.get(ExifTags.Base.DateTimeOriginal), ExifTags.Base.SubsecTimeOriginal),
-            (exif.get(ExifTags.Base.DateTime), ExifTags.Base.SubsecTime),
-        )
-    )
-    fields = {
-        "orientation": orientation_of(exif.get(ExifTags.Base.Orientation)),
-        "camera": camera_name(exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)),
-    }
+    tags = ExifTags.Base
+    taken = _seconds_of_date(details.get(tags.DateTimeOriginal), details.get(tags.SubsecTimeOriginal, ""))
+    changed = _seconds_of_date(exif.get(tags.DateTime), details.get(tags.SubsecTime, ""))
+    fields = {"orientation": orientation_of(exif.get(tags.Orientation))}
+    fields |= {"camera": camera_name(exif.get(tags.Make), exif.get(tags.Model))}
     return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 
@@ -180,10 +170,9 @@ def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> Table:
         return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
     if "frame_rate" in metadata:
         return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
-    try:
+    with suppress(Exception):  # damaged metadata raise errors of many types
         return _times_of_other_programs(tif, count)
-    except Exception:  # damaged metadata raise errors of many types
-        return {}
+    return {}
 
 
 def _times_of_other_programs(tif: Any, count: int) -> Table:

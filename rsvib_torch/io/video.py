@@ -6,7 +6,7 @@ applied; the videos that are written state it.
 
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -42,6 +42,7 @@ _GOPRO_FIRMWARE = {
     "HD7.01": "GoPro HERO7 Black",
 }  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
+_END: Any = object()  # of packets
 
 
 def _av() -> Any:
@@ -59,11 +60,9 @@ def open_container(video: Path | BinaryIO) -> Any:
 def _orientation(frame: Any) -> int:
     """Value of the orientation tag that corresponds to the display matrix of a frame."""
     data = frame.side_data.get("DISPLAYMATRIX")
-    if data is None:
-        return 1
-    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-    signs = tuple(round(value / max(map(abs, (a, b, c, d, 1)))) for value in (a, b, c, d))
-    return next((tag for tag, matrix in _MATRICES.items() if matrix == signs), 1)
+    matrix = np.zeros(5) if data is None else np.frombuffer(bytes(data), np.int32)[:5][[0, 1, 3, 4]]
+    signs = tuple(np.rint(matrix / max(1, *np.abs(matrix))).tolist())
+    return next((tag for tag, stored in _MATRICES.items() if stored == signs), 1)
 
 
 def _conversion() -> Any:
@@ -91,17 +90,13 @@ def _pixels(frame: Any) -> NDArray[Any]:
 
 def _frames(container: Any) -> Generator[Any, None, None]:
     """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped."""
-    av, stream = _av(), container.streams.best("video")
+    av, stream, packet = _av(), container.streams.best("video"), None
     stream.thread_type = "AUTO"
     packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            yield from packet.decode()
-        except av.error.InvalidDataError:
-            continue
+    while packet is not _END:
+        with suppress(av.error.InvalidDataError):
+            packet = next(packets, _END)
+            yield from () if packet is _END else packet.decode()
 
 
 @dataclass(frozen=True)
@@ -181,9 +176,8 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         if not stream.frames and "matroska" in container.format.name and len(container.streams) == 1:
             duration = 1e-6 * (container.duration or 0)  # of the longest of several streams
         decoded = float(known[-1] - known[0] + (1 / rate if rate else 0)) if rising else duration
-        if (
-            len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration
-        ):  # .avi also counts empty frames
+        # .avi also counts empty frames
+        if len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration:
             raise ValueError(f"truncated: {len(times)} frames, {decoded:.3g} of {duration:.3g} s, can be decoded")
         info = StackInfo(
             (len(times), *pixels.shape),
@@ -254,16 +248,13 @@ class VideoReader:
     def _decode(self, expected: Fraction | None) -> Any:
         """The frame of an expected presentation time in s; None if it cannot be decoded."""
         while True:
-            frame = next(self._decoding, None) if self._early is None else self._early
-            self._early = None
-            if frame is None or frame.pts is None or expected is None:
+            frame, self._early = self._early or next(self._decoding, None), None
+            time = None if frame is None or expected is None else _time_of(frame, frame)
+            if time is None or expected is None or time == expected:
                 return frame
-            time = Fraction(frame.pts) * frame.time_base
             if time > expected:
                 self._early = frame
                 return None
-            if time == expected:
-                return frame
 
     def close(self) -> None:
         """Close the file."""
@@ -452,14 +443,8 @@ def part_of_video(
 ) -> Iterator[Callable[[NDArray[Any]], None]]:
     """Encode consecutive frames of a video into a new file; only ``join_parts`` gives them their times.
 
-    Args:
-        file: The file, which is complete when the block ends without an exception.
-        video: Name of the video, whose ending selects container and codec.
-        info: Content of the video.
-        picture: As in ``VideoEncoder``.
-
-    Yields:
-        Function that encodes a frame.
+    The ending of ``video`` selects container and codec. The block gets a function that encodes a frame; the file is
+    complete when it ends without an exception.
     """
     ending, numbers = video.suffix.lower(), count()
     with ExitStack() as opened:

@@ -77,13 +77,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
 ) -> None:
-    """Write a figure as an image file, atomically.
-
-    Args:
-        figure: The figure.
-        path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
-        dpi: Pixels per inch.
-    """
+    """Write a figure as an image file, atomically; its ending selects the format (``.png``, ``.svg``, ``.pdf``)."""
     write_figure(figure, path, dpi)
 
 
@@ -105,10 +99,20 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
-def _two_panels() -> tuple[Figure, list[tuple[int, str, Axes]]]:
-    """A figure with a panel for x and y, each with the number and the name of its axis."""
-    figure, panels = _panels(13, 4.2, 1, 2, sharex=True)
-    return figure, list(zip(range(2), "xy", panels[0], strict=True))
+def _axes_figure(
+    times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]], labels: Sequence[str], **style: Any
+) -> Figure:
+    """A panel for x and y each with curves over times in s, and labels of x, of y, and before the name of the axis.
+
+    A curve has its label on both panels, values (N, 2), and a colour (None: that of the axis).
+    """
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
+        for texts, values, other in curves:
+            panel.plot(1e3 * times.cpu(), values[:, axis].cpu(), color=other or colour, label=texts[axis], **style)
+        panel.legend(**_LEGEND_ABOVE, ncols=len(curves))
+        plain_axes(panel, *labels[:2], heading=f"{labels[2]} {name}")
+    return figure
 
 
 def _plot_axes(
@@ -140,7 +144,7 @@ def _symbol(label: str, **style: Any) -> Line2D:
     return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
 
 
-def _legend_below(figure: Figure, symbols: list[Line2D]) -> None:
+def _legend_below(figure: Figure, *symbols: Line2D) -> None:
     figure.legend(handles=symbols, loc="outside lower center", ncols=len(symbols), fontsize=9.5, frameon=False)
 
 
@@ -199,12 +203,12 @@ def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, he
     sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
     figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
     points = [_draw_offsets(panels[0, column], panels[1, column], result, axis) for column, axis in enumerate(axes)]
-    symbols = [
+    _legend_below(
+        figure,
         _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
         _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
         _symbol("not measured", color=_GREY, marker="x", markersize=5),
-    ]
-    _legend_below(figure, symbols)
+    )
     bar = figure.colorbar(points[-1], ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
@@ -288,13 +292,13 @@ def windows_figure(
             first = quantity == "amplitude"
             label, heading = ("", f"Tones along {name}") if first else (time_label, "")
             plain_axes(panel, label, f"{quantity} ({unit})", heading=heading)
-    symbols = [
+    _legend_below(
+        figure,
         _symbol("strongest tone, reliable", color=_INK),
         _symbol("not reliable", color=_INK, markerfacecolor="white"),
         _symbol("weaker tone", color=_GREY),
         _symbol("detection failed", color=_GREY, marker="", linewidth=None, linestyle=":"),
-    ]
-    _legend_below(figure, symbols)
+    )
     return figure
 
 
@@ -339,51 +343,43 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     return figure
 
 
-def _title_refusal(panel: Axes, result: detection.MotionDetection | detection.SweptTone) -> None:
-    """State above a figure which axes are not reliable, with the first reason."""
-    lines = [
+def _detected_motion_figure(result: detection.MotionDetection | detection.SweptTone) -> Figure:
+    """Draw a swept tone, or a free motion at the rows of the frames with a band of two standard deviations."""
+    if isinstance(result, detection.SweptTone):
+        figure = motion_figure(result.motion)
+        panel = figure.axes[0]
+    else:
+        figure, ((panel,),) = _panels(8, 3.6)
+        for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
+            _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
+        plain_axes(panel, "time (ms)", "displacement (px)")
+    lines = [  # which axes are not reliable, with the first reason
         textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
         for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
         if not bool(good)
     ]
     panel.set_title("\n".join(lines), **_TITLE)
-
-
-def _swept_figure(result: detection.SweptTone) -> Figure:
-    figure = motion_figure(result.motion)
-    _title_refusal(figure.axes[0], result)
     return figure
 
 
-def free_motion_figure(result: detection.MotionDetection) -> Figure:
-    """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
-    figure, ((panel,),) = _panels(8, 3.6)
-    for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
-        _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
-    plain_axes(panel, "time (ms)", "displacement (px)")
-    _title_refusal(panel, result)
-    return figure
-
-
-def verdict_figure(verdict: RestorationVerdict) -> Figure:
+def _verdict_figure(verdict: RestorationVerdict) -> Figure:
     """Draw the displacement between the frames of each pair before and after restoration, and the improvement."""
     figure, (panels,) = _panels(10, 3.4, 1, 3)
-    pairs = np.arange(len(verdict.outcome))
-    for axis in range(2):
-        for values, style, colour, label in (
-            (verdict.misfit_before, "o-", _X_COLOUR, "frames as taken"),
-            (verdict.misfit_after, "s-", _Y_COLOUR, "after restoration"),
-            (verdict.resolution, ":", _GREY, "smallest visible"),
-        ):
-            panels[axis].plot(pairs, values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
-        panels[axis].set_ylim(bottom=0)
-    panels[0].legend(**_LEGEND)
-    panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_X_COLOUR, markersize=4)
-    panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
+    curves = (
+        (verdict.misfit_before, "o-", _X_COLOUR, "frames as taken"),
+        (verdict.misfit_after, "s-", _Y_COLOUR, "after restoration"),
+        (verdict.resolution, ":", _GREY, "smallest visible"),
+    )
     titles = ("displacement along x (px rms)", "displacement along y (px rms)", "estimated improvement (dB)")
-    for panel, title in zip(panels, titles, strict=True):
+    for axis, (panel, title) in enumerate(zip(panels, titles, strict=True)):
+        for values, style, colour, label in curves if axis < 2 else ():
+            panel.plot(values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
         panel.xaxis.get_major_locator().set_params(integer=True)
         plain_axes(panel, "pair of frames", title=title)
+        panel.set_ylim(bottom=0 if axis < 2 else None)
+    panels[0].legend(**_LEGEND)
+    panels[2].plot(verdict.predicted_gain.cpu(), "o-", color=_X_COLOUR, markersize=4)
+    panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
     return figure
 
 
@@ -628,13 +624,13 @@ def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
-    figure, panels = _two_panels()
-    times, good = (values.cpu().numpy() for values in (1e3 * curve.times, curve.good))
-    for axis, name, panel in panels:
-        offsets = curve.offsets[..., axis].cpu().numpy()[good]
-        std = None if curve.std is None else curve.std[..., axis].cpu().numpy()[good]
-        panel.errorbar(times[good], offsets, std, fmt=".", color=_AXIS_COLOURS[name], ecolor=_GRID, zorder=2)
-        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
+    times, offsets = curve.times[curve.good], curve.offsets[curve.good]
+    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
+    figure = _axes_figure(times, [(("measured",) * 2, offsets, None)], labels, marker=".", linestyle="none")
+    for axis, panel in enumerate(figure.axes if curve.std is not None else ()):
+        assert curve.std is not None
+        bars = (values.cpu() for values in (1e3 * times, offsets[:, axis], curve.std[curve.good][:, axis]))
+        panel.errorbar(*bars, fmt="none", ecolor=_GRID, zorder=1)
     return figure
 
 
@@ -689,45 +685,31 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
                 place = {"textcoords": "offset points", "fontsize": 8, "ha": "center"}
                 panels[0, axis].annotate(text, (at, amplitude), (0, 4), **place)
                 labelled.append(at)
-    symbols = [
+    _legend_below(
+        figure,
         _symbol("displacement", color=_X_COLOUR, marker="", linewidth=0.8),
         _symbol("noise (rms)", color=_INK, marker="", linewidth=0.9, linestyle="--"),
         _symbol("blind: the frames cannot show this frequency", color=_BLIND_COLOUR, marker="s", markersize=9),
-    ]
-    _legend_below(figure, symbols)
+    )
     return figure
 
 
 def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    figure, panels = _two_panels()
-    for axis, name, panel in panels:
-        for what, rms, offsets, colour in (
-            ("offsets", result.before, result.offsets, _GREY),
-            ("without the motion", result.after, result.residual, _AXIS_COLOURS[name]),
-        ):
-            label = f"{what} {measured_text(rms[axis], digits=3)} px rms"
-            panel.plot(1e3 * result.times.cpu(), offsets[:, axis].cpu(), ".", color=colour, label=label)
-        panel.axhline(0.0, color=_INK, linewidth=0.8)
-        panel.legend(fontsize=9)
-        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
-    return figure
+    before, after = ([measured_text(rms, digits=3) for rms in of_axes] for of_axes in (result.before, result.after))
+    curves = [([f"offsets {rms} px rms" for rms in before], result.offsets, _GREY)]
+    curves += [([f"without the motion {rms} px rms" for rms in after], result.residual, None)]
+    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
+    return _axes_figure(result.times, curves, labels, marker=".", linestyle="none")
 
 
 def _accelerometer_figure(result: gyroscope.AccelerometerComparison) -> Figure:
     """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
-    figure, panels = _two_panels()
     times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
     shown = (times - middle).abs() < 4 / result.frequency.min()  # 8 periods of the slowest tone
-    for axis, name, panel in panels:
-        for label, values, colour in (
-            ("accelerometer", result.measured, _GREY),
-            ("frames", result.predicted, _AXIS_COLOURS[name]),
-        ):
-            panel.plot(1e3 * times[shown], values[shown, axis], color=colour, label=label, linewidth=1.2)
-        panel.legend(ncols=2, **_LEGEND_ABOVE)
-        plain_axes(panel, "time on the clock of the frames (ms)", "acceleration (m/s²)", heading=f"Along {name}")
-    return figure
+    curves = [(("accelerometer",) * 2, result.measured[shown], _GREY), (("frames",) * 2, result.predicted[shown], None)]
+    labels = ("time on the clock of the frames (ms)", "acceleration (m/s²)", "Along")
+    return _axes_figure(times[shown], curves, labels, linewidth=1.2)
 
 
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
@@ -755,8 +737,8 @@ FIGURES.update(
             followed.times.tolist(), [followed[index] for index in range(len(followed.times))]
         ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
-        (detection.MotionDetection, 0): free_motion_figure,
-        (detection.SweptTone, 0): _swept_figure,
+        (detection.MotionDetection, 0): _detected_motion_figure,
+        (detection.SweptTone, 0): _detected_motion_figure,
         (RowTimeCalibration, 0): _calibration_figure,
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,
@@ -769,6 +751,6 @@ FIGURES.update(
         ),
         (RestorationMtf, 0): _restoration_mtf_figure,
         (OffsetCurve, 0): _measured_offsets_figure,
-        (RestorationVerdict, 0): verdict_figure,
+        (RestorationVerdict, 0): _verdict_figure,
     }
 )

@@ -62,11 +62,9 @@ def verdict_table(
     head = [*axis_head(batch_shape), *head]
     if not batch_shape:
         return [text_table(head, rows), *verdict_lines(reliable, reasons)]
-    verdicts = {
-        tuple(labels): "reliable" if bool(reliable[at]) else "not reliable"
-        for at, labels in axis_rows(batch_shape, reliable.shape[-1])
-    }
-    return [text_table([*head, "verdict"], [[*row, verdicts[tuple(row[:2])]] for row in rows])]
+    good = {tuple(labels): bool(reliable[at]) for at, labels in axis_rows(batch_shape, reliable.shape[-1])}
+    verdicts = ["reliable" if good[tuple(row[:2])] else "not reliable" for row in rows]
+    return [text_table([*head, "verdict"], [[*row, text] for row, text in zip(rows, verdicts, strict=True)])]
 
 
 def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
@@ -281,9 +279,6 @@ class Result(Summarised):
         Args:
             pixel_size: Size of a pixel in m, in the plane in which the motion is wanted (sensor or object); columns in
                 um, um/s and m/s^2 are added then.
-
-        Raises:
-            TypeError: If this kind of result has no table.
         """
         raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
 
@@ -348,9 +343,8 @@ class Result(Summarised):
         if draw is None:
             drawn = sorted({kind.__name__ for kind, _ in FIGURES})
             if type(self).__name__ in drawn:
-                raise ValueError(
-                    f"a batch of shape {tuple(self.batch_shape)} has no figure: select one, result[0].plot()"
-                )
+                shape = tuple(self.batch_shape)
+                raise ValueError(f"a batch of shape {shape} has no figure: select one, result[0].plot()")
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
@@ -385,7 +379,5 @@ class JudgedResult(Result):
         for name, (dimensions, values, attributes) in super()._variables(inside):
             yield name, (dimensions, values, attributes)
             if name == "reliable" and dimensions[-1:] == ("axis",):
-                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object).reshape(
-                    values.shape
-                )
-                yield "reasons", (dimensions, codes, {})
+                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object)
+                yield "reasons", (dimensions, codes.reshape(values.shape), {})
