@@ -75,10 +75,7 @@ class ImageMotion:
         return _with_turns(self.vibration.mean_displacement(starts, self.exposure_time[:, None]))
 
     def move(self, points: Tensor) -> Tensor:
-        """Positions (B, S, 2) in the frame of scene points (B, S, 2) in px, both (x, y).
-
-        Newton's method for the row that shows each point, as in ``rows_showing``.
-        """
+        """Positions (x, y) in the frame of scene points (B, S, 2) in px, by Newton's method for their rows."""
         x, y = (points[..., 1 - axis] - 0.5 * (self.size[axis] - 1) for axis in (1, 0))
         rows, exposure = points[..., 1], self.exposure_time[:, None]
         for _ in range(8):
@@ -94,10 +91,7 @@ class ImageMotion:
 
     @full_precision
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
-        """Form frames (B, C, R, W) from still images of the same shape, in row order, with mirrored boundaries.
-
-        Half-precision images are formed in float32.
-        """
+        """Form frames (B, C, R, W) in row order from still images, with mirrored boundaries, at least in float32."""
         dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
         components, weights = self.trajectory()
         strips = self._strips()
@@ -174,9 +168,8 @@ def _axis_ranges(name: str, value: Range, *, at_least: float = -math.inf) -> tup
     ranges = []
     for pair in pairs:
         if len(pairs) != 2 or not isinstance(pair, Sequence) or len(pair) != 2:
-            raise TypeError(
-                f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {quoted(value)}"
-            )
+            forms = "a number, (low, high) or ((low, high), (low, high)) for x and y"
+            raise TypeError(f"{name} must be {forms}, got {quoted(value)}")
         low, high = (check_number(name, number, at_least=at_least) for number in pair)
         if low > high:
             raise ValueError(f"{name} must not have low above high, got ({low:g}, {high:g})")
@@ -297,8 +290,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             raise ValueError("no vibration has been drawn yet: call the augmentation first")
         taken = self._gate(params).to(torch.float64)
         drawn = {name: params[name] for name in ("amplitude", "frequency", "phase", "image_motion")}
-        drawn |= {"amplitude": drawn["amplitude"] * taken[:, None, None]}
-        drawn |= {"image_motion": drawn["image_motion"] * taken[:, None]}
+        drawn["amplitude"] = drawn["amplitude"] * taken[:, None, None]
+        drawn["image_motion"] = drawn["image_motion"] * taken[:, None]
         step = self._recording_length(params)
         return Vibration(**{name: value[::step] for name, value in drawn.items()}, camera=None)
 
@@ -311,9 +304,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     ) -> Tensor:
         """Distort and blur images (B, C, H, W)."""
         if channels_appear_last(input.shape):
-            raise ValueError(
-                f"images of shape {tuple(input.shape)} appear to have their channels last: pass images.movedim(-1, -3)"
-            )
+            shape = tuple(input.shape)
+            raise ValueError(f"images of shape {shape} appear to have their channels last: pass images.movedim(-1, -3)")
         if input.numel() == 0:
             return input
         images = frames_to_row_order(input, self.timing)
@@ -364,8 +356,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def _motion(self, params: Parameters, like: Tensor) -> ImageMotion:
         """The drawn motion of a batch in row order."""
         drawn = {name: params[name].to(dtype=torch.float64, device=like.device) for name in _DRAWN}
-        exposure_rows = drawn.pop("exposure_rows")
-        amplitude = drawn.pop("amplitude")
+        exposure_rows, amplitude = drawn.pop("exposure_rows"), drawn.pop("amplitude")
         vibration = Vibration(amplitude, camera=None, **drawn).to_row_order(self.timing)
         self.timing.check_rows(self._size(params)[0])
         length = self._recording_length(params)
@@ -394,8 +385,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
 
     def inverse_transform(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise an error: the blur is inverted by restoration only."""
-        raise NotImplementedError(
-            "RollingShutterVibration has no inverse; restore(frames, timing, vibration) removes a known vibration"
-        )
+        remedy = "restore(frames, timing, vibration) removes a known vibration"
+        raise NotImplementedError(f"RollingShutterVibration has no inverse; {remedy}")
 
     inverse_boxes = inverse_keypoints = inverse_transform

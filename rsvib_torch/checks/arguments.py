@@ -51,10 +51,7 @@ def check_tensor(name: str, value: object) -> Tensor:
 
 
 def as_numbers(name: str, value: object, device: torch.device | None = None) -> Tensor:
-    """Return a copy of a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
-
-    By default on the device of a tensor.
-    """
+    """A copy of a number, tensor or nested list as a float64 tensor, by default on its device; gradients are kept."""
     if isinstance(value, Tensor):
         return check_tensor(name, value).to(dtype=torch.float64, device=device, copy=True)
     if isinstance(value, np.ma.MaskedArray):
@@ -171,15 +168,6 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Check the arguments of a function against its annotations before each call.
 
     Arguments that accept arrays are left to ``as_tensor``, which the function calls. Compiled graphs omit the checks.
-
-    Example:
-        >>> @checks_arguments
-        ... def doubled(count: int) -> int:
-        ...     return 2 * count
-        >>> doubled("3")
-        Traceback (most recent call last):
-        ...
-        TypeError: count must be a whole number, got '3' (str)
     """
     parameters = inspect.signature(function).parameters.values()
     # inspect.Signature.bind would take longer than the checks; calls that it refuses are refused by the function

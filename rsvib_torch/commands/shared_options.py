@@ -150,10 +150,7 @@ class CameraOptions:
     """Replace results that exist already."""
 
     def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
-        """Configuration file and the options that replace its keys, or the options alone.
-
-        Without either the frame rate is the one that the file of the frames states.
-        """
+        """Configuration file and the options that replace its keys, or these alone and what the frames state."""
         sensor = self.sensor
         if self.readout_time is not None:
             if self.config is not None or "row_time" in sensor or frames is None:

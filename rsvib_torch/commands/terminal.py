@@ -69,19 +69,14 @@ def current_output() -> Output:
 
 
 def print_line(message: str) -> None:
-    """Print a text to standard output; long lines are not wrapped, and control codes are escaped.
-
-    Raises:
-        OSError: If it cannot be written, as in a pipe whose reader has ended.
-    """
+    """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
     try:
         print(printable(message, lines=True), flush=True)
-    except OSError as error:
+    except OSError as error:  # as in a pipe whose reader has ended
         # what is left in the buffer would fail again at the exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise OSError(
-            f"the answer cannot be written to standard output ({error.strerror}); the files are complete"
-        ) from error
+        problem = f"the answer cannot be written to standard output ({error.strerror})"
+        raise OSError(f"{problem}; the files are complete") from error
 
 
 def show_answer(command: str, answer: Answer) -> None:

@@ -103,9 +103,8 @@ def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _
 def _lay_out_lines(height: int, width: int, generator: torch.Generator) -> list[_Line]:
     """Main roads, and a river as the last line."""
     count = 4
-    angle = (
-        math.pi * (torch.arange(count, device="cpu") + 0.8 * torch.rand(count, generator=generator, **FLOAT)) / count
-    )
+    steps = torch.arange(count, device="cpu") + 0.8 * torch.rand(count, generator=generator, **FLOAT)
+    angle = math.pi * steps / count
     share = 0.2 + 0.6 * torch.rand(count, 2, generator=generator, **FLOAT)
     through = torch.tensor([width, height], device="cpu") * share
     level = through[:, 0] * angle.cos() + through[:, 1] * angle.sin()
@@ -217,10 +216,8 @@ def _plan_buildings(
 ) -> Tensor:
     """Rows of buildings along the streets of every town and works district, and a few farms in the fields.
 
-    Returns:
-        (N, 8) buildings that do not overlap: centre x and y, half of the two sides, direction of the first side in
-        rad, tone of the roof, length of the shadow, all lengths in px, and 1 where the two sides of the roof differ
-        in tone, 0 where it is flat.
+    The (N, 8) values are centre x and y, half of the two sides, direction of the first side in rad, tone of the roof,
+    length of the shadow, all lengths in px, and 1 where the two sides of the roof differ in tone, 0 where it is flat.
     """
     kinds = enumerate(districts.kind.view(-1).tolist())
     plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]

@@ -58,9 +58,6 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
 def in_threads(
     work: Callable[..., Result], items: Generator[tuple[Any, ...], None, None], *, at_once: int, threads: int = 1
 ) -> Generator[Result, None, None]:
-    """Results of ``work(*item)`` in the order of the items, from ``at_once`` threads, while one more item is made.
-
-    Each thread uses a number of ``threads`` of PyTorch.
-    """
+    """Results of ``work(*item)`` in order, from ``at_once`` threads with ``threads`` of PyTorch each."""
     with _pool(at_once, threads, items) as pool:
         yield from in_order(items, lambda item: pool.submit(work, *item), lambda: at_once + 1, Future.result, deque())

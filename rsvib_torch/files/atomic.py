@@ -85,10 +85,9 @@ def error_of_full_disk(error: Exception) -> int | None:
 
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder on the file system of ``path``; those that killed processes left for it are removed.
+    """A temporary folder on the file system of ``path``, which errors of a full disk name.
 
-    Raises:
-        OSError: With the name of ``path``, if the disk is full.
+    Those that killed processes left for it are removed.
     """
     parent = nearest_folder(path)
     remove_abandoned(path)
@@ -126,13 +125,14 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
     if size > _LONGEST_NAME:
         raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} fit")
     check_not_special(path)
-    if kind == "file" and path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
-    if kind == "file" and parent_exists and not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
-    if kind != "file" and path.exists() and not path.is_dir():
+    if kind == "file":
+        if path.is_dir():
+            raise IsADirectoryError(f"cannot write {path}: it is a folder")
+        if parent_exists and not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
+    elif path.exists() and not path.is_dir():
         raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
-    if kind != "file" and path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+    elif path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 

@@ -30,10 +30,7 @@ def attributes_of(info: StackInfo) -> Table:
 
 
 def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
-    """Interpret a stored array of (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it, as a stack.
-
-    The attributes are those of ``attributes_of``, or times of other programs; all may be missing.
-    """
+    """A stored array as a stack; the attributes are those of ``attributes_of``, or times of other programs."""
     axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
     if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
         raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")

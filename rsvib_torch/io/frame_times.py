@@ -42,10 +42,7 @@ class _Spacing:
 
 
 def _spacing(info: StackInfo) -> _Spacing | None:
-    """Spacing according to the times or the frame rate of a file; None if it states neither.
-
-    Impossible ones are refused.
-    """
+    """Spacing by the times or the frame rate of a file; None if it states neither. Impossible ones are refused."""
     few = info.frame_times is None or len(info.frame_times) < 2
     if few and info.frame_rate is None:
         return None
@@ -98,12 +95,6 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     numbers of intervals apart to within their error or 2 % of a period, the result consists of multiples of the
     sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are
     returned as they are if their error is less than a tenth of a period.
-
-    Example:
-        >>> info = StackInfo((4, 8, 8), "uint8", 255.0, (0.0, 0.033, 0.067, 0.2), time_error=0.001)
-        >>> timing = SensorTiming(row_time=1 / 30000, exposure_rows=100, frame_rows=1000)
-        >>> [round(30 * time) for time in exposure_times(info, timing)]
-        [0, 1, 2, 6]
     """
     if info.frame_times is None and info.frame_numbers is not None:
         return tuple(number * timing.frame_period for number in info.frame_numbers)
@@ -165,10 +156,10 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
         [0.0, 0.0333, 0.1]
     """
     of_stack = timing_of_stack(timing, info)
-    if timing.frame_start_times is not None or of_stack.frame_start_times is None:
+    times = of_stack.frame_start_times
+    if timing.frame_start_times is not None or times is None:
         return of_stack
-    times = [float(time) for time in of_stack.frame_start_times]
-    return replace(of_stack, frame_start_times=tuple(time - times[0] for time in times))
+    return replace(of_stack, frame_start_times=tuple(float(time) - float(times[0]) for time in times))
 
 
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:

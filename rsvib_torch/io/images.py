@@ -90,10 +90,7 @@ def decode_image(path: Path) -> Array:
 
 
 def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
-    """Write one frame (H, W) or (C, H, W).
-
-    Full scale, resolution and orientation are stored as chunks ``tEXt``, ``pHYs`` and ``eXIf``.
-    """
+    """Write one frame (H, W) or (C, H, W), with full scale, resolution and orientation in chunks of their own."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))

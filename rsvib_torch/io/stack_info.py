@@ -243,10 +243,7 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
 
 @contextmanager
 def readable_stack(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception of a decoder of a ``kind`` of files, which may have every type, into a ``ValueError``.
-
-    A file without read permission remains an ``OSError``.
-    """
+    """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""
     if not path.is_dir():
         with path.open("rb"):
             pass

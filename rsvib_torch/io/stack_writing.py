@@ -30,10 +30,7 @@ def stack_files(path: PathLike) -> list[Path]:
 def check_info_target(
     path: Path, info: StackInfo, compression: str | None = None, *, check_folder: bool = True
 ) -> StackFormat:
-    """The format in which ``path`` is written; raises the error that writing would raise.
-
-    Without ``check_folder``, its folder need not exist.
-    """
+    """The format in which ``path`` is written, or the error of writing; ``check_folder``: its folder must exist."""
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
     if form.write is None:

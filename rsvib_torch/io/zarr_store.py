@@ -79,10 +79,7 @@ _DIMENSIONS = {"T": "frame", "C": "channel", "H": "y", "W": "x"}
 
 
 def write_zarr(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a group with the array ``frames``, one chunk per frame, as ``xarray.open_zarr`` reads it.
-
-    Arguments as in ``StackFormat.write``.
-    """
+    """Write a group with the array ``frames``, one chunk per frame, as ``xarray.open_zarr`` reads it."""
     group = _zarr().create_group(store=str(path), zarr_format=3)
     array = group.create_array(
         "frames",

@@ -35,8 +35,7 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
-from rsvib_torch.results.figures import FIGURES
-from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
 from rsvib_torch.results.result_files import figure_png, write_figure
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.text import measured_text
@@ -538,10 +537,7 @@ def _finish_mtf(panel: Axes, highest: float, label: str, legend: str | None = No
 
 
 def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[tuple[int, int]]:
-    """Corners (row, column) of the ``count`` square windows with the strongest detail that do not overlap.
-
-    They avoid a border of ``rim`` px where the image (H, W) is large enough.
-    """
+    """Corners (row, column) of ``count`` windows with the strongest detail that do not overlap, ``rim`` px inside."""
     rim = min(rim, (min(image.shape) - size) // 2)
     image = image[rim : image.shape[0] - rim, rim : image.shape[1] - rim]
     down, right = (functional.pad(image.diff(dim=d), pad) for d, pad in ((0, (0, 0, 0, 1)), (1, (0, 1))))

@@ -109,17 +109,13 @@ def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None
     """
     check_single("result", result)
     curve = result.offsets
-    count = curve.times.shape[-1]
-    columns = {
-        "earlier_frame": curve.pairs[:, :1].expand(-1, count),
-        "later_frame": curve.pairs[:, 1:].expand(-1, count),
-        "row": curve.rows.expand_as(curve.times),
-        "time_s": curve.times,
-    }
+    earlier, later = curve.pairs.T[..., None]
+    columns = {"earlier_frame": earlier, "later_frame": later, "row": curve.rows, "time_s": curve.times}
+    columns = {name: values.expand_as(curve.times) for name, values in columns.items()}
     axes = ("x_px", "y_px", "roll_rad", "zoom")[: result.vibration.num_axes]
     curves = {"offset": curve.offsets, "fitted": result.fitted, "residual": curve.offsets - result.fitted}
-    for kind, values_of_axes in curves.items():
-        columns |= {f"{kind}_{name}": values_of_axes[..., axis] for axis, name in enumerate(axes)}
+    for kind, values in curves.items():
+        columns |= {f"{kind}_{name}": values[..., axis] for axis, name in enumerate(axes)}
     columns["quality"] = curve.quality
     if curve.std is not None:
         columns |= {f"std_{name}": curve.std[..., axis] for axis, name in enumerate(axes)}

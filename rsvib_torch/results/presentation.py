@@ -23,7 +23,7 @@ from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_met
 from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_number, described, needed_package
 from rsvib_torch.files.reading import Table
-from rsvib_torch.results.figures import FIGURES, figure_of
+from rsvib_torch.results.higher_packages import imported
 from rsvib_torch.results.reason import texts
 from rsvib_torch.results.result_files import figure_png, result_of, save_result, write_figure
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     import pandas
     import xarray
     from matplotlib.figure import Figure
+
+# The function that draws a result of this type with this number of leading dimensions (0: not a batch).
+FIGURES: "dict[tuple[type, int], Callable[[Any], Figure]]" = {}
 
 # Text
 
@@ -80,12 +83,7 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
 
 
 def plain_values(value: object) -> Any:
-    """A value as JSON can store it: tensors as nested lists, None for numbers that are not finite, results as tables.
-
-    Example:
-        >>> plain_values({"amplitude": torch.tensor([1.5, float("nan")]), "reasons": ("blind",)})
-        {'amplitude': [1.5, None], 'reasons': ['blind']}
-    """
+    """A value as JSON can store it: tensors as nested lists, results as tables, None for NaN and infinity."""
     if isinstance(value, Tensor):
         return plain_values(value.detach().cpu().tolist())
     if hasattr(value, "to_dict"):
@@ -109,10 +107,7 @@ def joined_columns(lines: Sequence[Mapping[str, object]]) -> dict[str, list[obje
 
 
 def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict[str, float]:
-    """Amplitude A in px, and those of velocity 2 pi f A and acceleration (2 pi f)^2 A, with units in the names.
-
-    The size of a pixel is in m.
-    """
+    """Amplitude A in px, and of velocity and acceleration, with units in the names; a pixel has a size in m."""
     angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
     return {
         "amplitude_um": 1e6 * metres,
@@ -339,7 +334,7 @@ class Result(Summarised):
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
         """Draw the result, and write the picture (PNG, SVG, PDF) if a path is given; notebooks show the figure."""
-        draw = figure_of(type(self), len(self.batch_shape))
+        draw = self._figure_function()
         if draw is None:
             drawn = sorted({kind.__name__ for kind, _ in FIGURES})
             if type(self).__name__ in drawn:
@@ -351,9 +346,13 @@ class Result(Summarised):
             write_figure(figure, path)
         return figure
 
+    def _figure_function(self) -> "Callable[[Any], Figure] | None":
+        imported("figures")  # adds to the table
+        return FIGURES.get((type(self), len(self.batch_shape)))
+
     def _repr_html_(self) -> str:
         text = super()._repr_html_()
-        if figure_of(type(self), len(self.batch_shape)) is None:
+        if self._figure_function() is None:
             return text
         return f'{text}<img src="{data_uri(figure_png(self.plot(), dpi=70), "image/png")}">'
 

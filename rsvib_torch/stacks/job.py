@@ -326,10 +326,7 @@ def stored_frame(read: Callable[[int], NDArray[Any]], index: int) -> NDArray[Any
 
 
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
-    """Windows with the pixels of their frames as stored, or why they cannot be read.
-
-    The frames that neighbours share are read once.
-    """
+    """Windows with the pixels of their frames, or why they cannot be read; frames that two share are read once."""
     with closing(job.open()) as reader:
         last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
         shared = 1 + (2 * MARGIN if job.follow else 0)
@@ -354,11 +351,7 @@ def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
 def _follows(
     options: StackDetectionOptions, restoration: OptionTable, detection: OptionTable, given: object
 ) -> bool | Literal["auto"]:
-    """Whether the vibration is followed; ``"auto"`` is not where options are given that frames one by one do not have.
-
-    Raises:
-        ValueError: If it is requested with such an option.
-    """
+    """Whether it is followed; ``"auto"`` is not where options are given that frames one by one do not have."""
     if options.follow is True:
         if detection or given is not None:
             raise ValueError("follow=True has no options of detection, and no given detections")

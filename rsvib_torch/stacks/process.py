@@ -43,9 +43,6 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
     Yields:
         One ``WindowResult`` per window, in order.
 
-    Raises:
-        ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
-
     Example:
         >>> for result in iterate_stack("frames.tif", timing, window=3):  # doctest: +SKIP
         ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
@@ -67,9 +64,7 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
         options: Options.
 
     Raises:
-        OSError: If the stack cannot be read, or the manifest cannot be written.
-        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
-            ``sink`` is a file of the stack.
+        ValueError: If detection fails in all first windows, or ``sink`` is a file of the stack.
 
     Example:
         >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
@@ -107,11 +102,9 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     Raises:
         FileExistsError: If there is an interrupted run and ``resume`` is False.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
-        ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
-            detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
-            or versions differ from those of the run to resume, or its journal is damaged.
+        ValueError: If a window does not fit into the memory, detection fails in all first windows, an output is or
+            contains the input or lies inside it, or input, settings or versions differ from those of the run to resume.
 
     Example:
         >>> import tempfile
@@ -165,8 +158,13 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
         return {"not_kept": metadata_not_kept(job.info, sink, (folder.written, *out.shape[1:]))}
 
+    def stored(folder: RunFolder) -> Iterator[NDArray[Any]]:
+        for name in folder.files():
+            with folder.open(name) as file:
+                yield from np.load(file, allow_pickle=False)
+
     def write(folder: RunFolder) -> None:
-        write_frames(form, sink, out.with_frames(folder.written), _stored_frames(folder), compression)
+        write_frames(form, sink, out.with_frames(folder.written), stored(folder), compression)
 
     report = run_to_file(
         sink,
@@ -190,8 +188,7 @@ def _watched(
 ) -> Iterator[StoredWindow]:
     """The results of the remaining windows, while their frames are counted.
 
-    Raises:
-        ValueError: If detection has failed in every window so far (``errors`` before these); ``fail`` is called before.
+    If detection has failed in every window so far (``errors`` before these), ``fail`` is called, and it is an error.
     """
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
@@ -207,10 +204,3 @@ def _watched(
             done += window.kept
             if progress is not None:
                 progress(done, total)
-
-
-def _stored_frames(folder: RunFolder) -> Iterator[NDArray[Any]]:
-    """The frames of all windows in order."""
-    for name in folder.files():
-        with folder.open(name) as file:
-            yield from np.load(file, allow_pickle=False)

@@ -56,10 +56,7 @@ def compared_runs(count: int) -> list[slice]:
 
 
 def part_of_stack(source: Path, info: StackInfo, timing: SensorTiming, part: slice) -> tuple[Tensor, SensorTiming]:
-    """Some frames of a stack, as ``read_stack`` returns them, and the timing from the start of its first frame.
-
-    The full scale is that of ``info``.
-    """
+    """Some frames of a stack with the full scale of ``info``, and the timing from the start of its first frame."""
     check_stack_fits(info.with_frames(part.stop - part.start))
     starts = timing.frame_starts(info.shape[0])
     times = (starts[part] - starts[0]).tolist()
