@@ -128,46 +128,34 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
     first = result.first
     if first is None:  # the run was complete before, or its first window was
         first = next(iter(stacks.iterate_stack(frames, settings.timing, **common, **resources)))
-    names: list[str] = []
-    with whole_folder(out) as folder:
-        if len(first.frames):
-            with working("drawing the frames"):
-                names += written.draw_safely(folder / "before_after.png", lambda: _comparison(given, common, first))
-        names += [restored.name, "manifest.json"]
-        if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
-            assert first.restoration is not None
-            restoration = common["restoration"]
-            reports.write_restoration(folder / "restoration.json", first.restoration, restoration, result.not_kept)
-            timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*written.write_detection(folder, first.detection, timing, given.pixel_size), "restoration.json"]
-        else:
-            names += written.write_windows(folder, out / "manifest.json", given.pixel_size)
-    answer = _answer_of_windows(given, restored, result, first, info.shape[0])
-    answer.files += [out / name for name in names]
-    return answer
-
-
-def _answer_of_windows(
-    given: RunOptions, restored: Path, result: stacks.StackReport, first: stacks.WindowResult, count: int
-) -> Answer:
-    """What a run on a stack of ``count`` frames found and did, with its warnings."""
-    frames, out = given.stack, given.out
     if result.bad_frames:
         warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
     written.note_lost(restored, result.not_kept)
-    if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
-        assert first.restoration is not None
-        answers.warn_of_restoration(first.restoration)
-        answer = answers.stack_answer(frames, first.detection, given.pixel_size, first.restoration, count)
-        more, steps = [], answers.steps_after_detection(first.detection, frames, given.settings)
-    else:
-        stored = stacks.read_manifest(out / "manifest.json")
-        written.warn_of_failures(stored)
-        answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
-        more, steps = ["--manifest", str(out / "manifest.json")], []
+    found, restoration = first.detection, first.restoration
+    names, more, steps = [restored.name, "manifest.json"], ["--manifest", str(out / "manifest.json")], []
+    with whole_folder(out) as folder:
+        if len(first.frames):
+            with working("drawing the frames"):
+                picture = folder / "before_after.png"
+                names = written.draw_safely(picture, lambda: _comparison(given, common, first)) + names
+        # one vibration of all frames, which was not followed
+        if result.windows == 1 and restoration is not None and isinstance(found, detection.DetectionResult):
+            of_run = (common["restoration"], result.not_kept)
+            reports.write_restoration(folder / "restoration.json", restoration, *of_run)
+            timing = io.timing_from_first_frame(settings.timing, info)
+            names += [*written.write_detection(folder, found, timing, given.pixel_size), "restoration.json"]
+            answers.warn_of_restoration(restoration)
+            answer = answers.stack_answer(frames, found, given.pixel_size, restoration, info.shape[0])
+            more, steps = [], answers.steps_after_detection(found, frames, settings)
+        else:
+            names += written.write_windows(folder, out / "manifest.json", given.pixel_size)
+            stored = stacks.read_manifest(out / "manifest.json")
+            written.warn_of_failures(stored)
+            answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     if result.restored:
-        steps.insert(0, answers.page_step(frames, out / "report", given.settings, *more))
+        steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
     answer.next_steps += steps
+    answer.files += [out / name for name in names]
     return answer
 
 

@@ -39,7 +39,6 @@ class Stack:
 
     frames: Tensor  # (T, H, W) or (T, C, H, W), full scale 1
     info: io.StackInfo  # data type and metadata of the file, with exposure times for frame times
-    full_scale: float | None  # count that corresponds to full scale; None for floating point
     timing: rsvib_torch.SensorTiming  # the sensor, with the frame times of the file
 
 
@@ -57,7 +56,7 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     print_notes(info, config)
     times = io.exposure_times(info, config.timing)
     info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
-    return Stack(frames.to(given.torch_device), info, scale, timing)
+    return Stack(frames.to(given.torch_device), info, timing)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -78,26 +77,6 @@ def _restore(
     with working("restoring and judging"):
         result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
     answers.warn_of_restoration(result, output)
-    return result
-
-
-def restore_and_save(
-    path: Path,
-    stack: Stack,
-    motion: Motion | DetectedVibration,
-    options: Table,
-    force: bool,
-    report: Path | None = None,
-) -> stacks.RestoredFrames:
-    """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
-    result = _restore(stack, motion, options, force)
-    frames = result.frames if stack.info.nodata is None else stacks.without_data(result.frames, stack.frames)
-    with working(f"writing {path.name}"):
-        io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
-    not_kept = io.metadata_not_kept(stack.info, path, tuple(frames.shape))
-    written.note_lost(path, not_kept)
-    if report is not None:
-        reports.write_restoration(report, result, options, not_kept)
     return result
 
 
@@ -287,7 +266,14 @@ def restore_frames(given: RestoreOptions) -> Answer:
     if report is not None:
         check_writable(report)
     stack = load(given, options)
-    result = restore_and_save(restored, stack, detected, options, given.force, report)
+    result = _restore(stack, detected, options, given.force)
+    images = result.frames if info.nodata is None else stacks.without_data(result.frames, stack.frames)
+    with working(f"writing {restored.name}"):
+        io.write_stack(restored, images, dtype=info.dtype, full_scale=scale, like=stack.info)
+    not_kept = io.metadata_not_kept(stack.info, restored, tuple(images.shape))
+    written.note_lost(restored, not_kept)
+    if report is not None:
+        reports.write_restoration(report, result, options, not_kept)
     return Answer(
         {"Vibration": [detected.summary()], "Restoration": answers.restoration_lines(result, len(stack.frames))},
         {"detection": detected.to_dict(), "restoration": reports.restoration_data(result)},
