@@ -4,7 +4,8 @@ import itertools
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -123,9 +124,7 @@ def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> t
     """Row time in s of a camera model in the mode of the frames, and where it comes from."""
     if "frame_rate" not in values:
         raise ValueError(f"the mode of {camera} depends on the frame rate: give --frame-rate")
-    columns, rows = info.shape[-1], info.shape[-2]
-    if values.get("scan_axis") == "x":
-        columns, rows = rows, columns
+    rows, columns = info.shape[-2:] if values.get("scan_axis") != "x" else info.shape[:-3:-1]
     mode = camera_mode(camera, width=columns, height=rows, frame_rate=values["frame_rate"])
     time = measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std)
     return mode.row_time, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
@@ -133,15 +132,11 @@ def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> t
 
 def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -> str:
     """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
-    with working(f"reading {path}"):
-        reader = io.open_stack(path)
-        info = reader.info
-        first = reader.frame(0)
-        reader.close()
+    with working(f"reading {path}"), closing(io.open_stack(path)) as reader:
+        info, first = reader.info, reader.frame(0)
     size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
     note(f"{path}: {size}")
-    values = dict(given)
-    rows = info.shape[-1] if values.get("scan_axis") == "x" else info.shape[-2]
+    values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
     stated = stated_rate(info)
     if stated is not None and "frame_rate" not in given:
         values["frame_rate"] = stated
@@ -191,14 +186,9 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
 
 def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
     """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
-    questions: dict[str, tuple[str, Callable[[str], float]]] = {
-        "frame_rate": ("--frame-rate", rate),
-        "row_time": ("--row-time", seconds),
-        "exposure_time": ("--exposure", seconds),
-    }
-    if "full_scale" in likely:
-        questions["full_scale"] = ("--full-scale", rate)
-    missing = {name: question for name, question in questions.items() if name not in values}
+    known = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
+    known |= {"full_scale": "--full-scale"} if "full_scale" in likely else {}
+    missing = {name: stated for name, stated in known.items() if name not in values}
 
     def hint(name: str) -> str:  # how to find a value, with the limits that follow from the frames
         if name == "row_time" and values.get("frame_rate"):
@@ -207,14 +197,14 @@ def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: s
         return f"{_HINTS[name]} Frame 0 indicates {likely[name]:g}." if name in likely else _HINTS[name]
 
     if missing and not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise MistakesError(f"{stated} is missing. {hint(name)}" for name, (stated, _) in missing.items())
-    for name, (stated, convert) in missing.items():
+        raise MistakesError(f"{stated} is missing. {hint(name)}" for name, stated in missing.items())
+    for name, stated in missing.items():
         typer.echo(f"\n{hint(name)}", err=True)
         limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
         longest = limits[name] / values["frame_rate"] if name in limits else math.inf
 
-        def checked_answer(text: str, convert: Callable[[str], float] = convert, longest: float = longest) -> float:
-            value = convert(text)
+        def checked_answer(text: str, is_time: bool = name in limits, longest: float = longest) -> float:
+            value = seconds(text) if is_time else rate(text)
             if not 0 < value <= longest:
                 limit = "" if math.isinf(longest) else f" and at most {longest:.4g} s; units such as us can be added"
                 raise typer.BadParameter(f"expected a number above 0{limit}; got {text!r}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 
 _RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
+_USUAL = (None, False, 1, "pass")  # values of options that change nothing
 _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
@@ -178,28 +180,18 @@ def _frame(path: Path, index: int, full_scale: float | None) -> Tensor:
     """A frame of a stack, with 0 for missing pixels."""
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
 
-    reader = io.open_stack(path)
-    scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
-    frame: Tensor = counts_to_frames(reader.frame(index)[None], scale, str(path), nodata)[0].nan_to_num(0.0)
-    reader.close()
-    return frame
+    with closing(io.open_stack(path)) as reader:
+        scale, pixels = full_scale or reader.info.full_scale, reader.frame(index)[None]
+    return counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
 
 
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
-    only_windows = {
-        "--window": given.windows.get("window"),
-        "--follow": given.windows.get("follow"),
-        "--bad-frames skip": given.windows.get("bad_frames") == "skip",
-        "--scheduler": "scheduler" in given.processing,
-        "--compression": "compression" in given.processing,
-        "--joint": restoration.get("joint"),
-        "--scale": restoration.get("scale", 1) != 1,
-        "--mosaic": restoration.get("mosaic"),
-        "--optics-sigma": restoration.get("optics"),
-    }
-    refused = ", ".join(name for name, value in only_windows.items() if value)
+    stated = given.windows | given.processing | restoration
+    of_windows = ("window", "follow", "bad_frames", "scheduler", "compression", "joint", "scale", "mosaic", "optics")
+    changed = [name for name in of_windows if stated.get(name) is True or stated.get(name) not in _USUAL]
+    refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
     if refused:
         raise ValueError(
             f"{refused} cannot be used with --video, which follows the frames one by one; give --output restored.mp4 "

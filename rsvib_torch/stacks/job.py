@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -132,24 +133,15 @@ class StackJob:
             raise ValueError(f"{self.source} has changed since it was first opened; start again")
         return reader
 
-    @property
-    def joined(self) -> bool:
-        """Whether the frames of a window become one image."""
-        return self.restoration is not None and self.restoration.get("joint", False) is True
-
-    @property
-    def scale(self) -> int:
-        """Points of the result per pixel."""
-        return 1 if self.restoration is None else int(self.restoration.get("scale", 1))
-
-    @property
-    def mosaic(self) -> str | None:
-        """Pattern of raw frames; None for others."""
-        return None if self.restoration is None else self.restoration.get("mosaic")
+    @cached_property
+    def chosen(self) -> RestorationOptions:
+        """All options of ``restore``; ``joint=True`` makes one image of a window."""
+        return RestorationOptions(**(self.restoration or {}))
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
-        return enlarged(frames if self.mosaic is None else colour_frames(frames, self.mosaic), self.scale)
+        mosaic = self.chosen.mosaic
+        return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
 
     def content(self, out: StackInfo, timing: SensorTiming) -> StackInfo:
         """The output ``out`` with full scale, times and frame rate; ``timing`` is that of the caller."""
@@ -192,13 +184,13 @@ class StackJob:
             if found is None or self.restoration is None:
                 missing = "no detection was given for this window" if found is None else None
                 return replace(as_taken, detection=detection, error=missing)
-            first_frames = len(kept) if len(kept) > 1 and not self.restoration.get("joint", False) else None
+            first_frames = len(kept) if len(kept) > 1 and not self.chosen.joint else None
             most_pairs = 8 if window.alone else 2  # limits the time of the verdict
             limits = {"first_frames": first_frames, "most_pairs": most_pairs}
             restoration = restore_trusted(frames, timing, found, self.restoration, force=self.force, **limits)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
-        one_image = self.joined and restoration.restored
+        one_image = self.chosen.joint is True and restoration.restored
         restored = restoration.frames if one_image else restoration.frames[: len(kept)]
         if self.info.nodata is not None:
             restored = without_data(restored, frames if one_image else frames[: len(kept)])
@@ -282,14 +274,14 @@ class StackJob:
         written = list(result.window.written)
         restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
         frames = []
-        for index in [written[len(written) // 2]] if self.joined else written:
+        for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
             if index in restored and index not in result.unchanged:
                 frames.append(counts(restored[index]))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                if self.scale != 1 or self.mosaic is not None:  # the shape of restored ones
+                if self.chosen.scale != 1 or self.chosen.mosaic is not None:  # the shape of restored ones
                     taken = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
                     frame = counts(self._unchanged(taken)[0])
                 frames.append(frame)
@@ -339,13 +331,17 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 
 
+def _together(restoration: OptionTable) -> list[str]:
+    """Those of ``_TOGETHER`` that change something."""
+    given = restoration or {}
+    return [name for name in _TOGETHER if given.get(name) is True or given.get(name) not in (None, False, 1)]
+
+
 def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
     """Options of ``restore`` without those that frames which are restored one by one do not have."""
-    given = dict(restoration or {})
-    for name in _TOGETHER:
-        if given.pop(name, None) not in (None, False, 1):
-            raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
-    return given
+    for name in _together(restoration):
+        raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
+    return {name: value for name, value in (restoration or {}).items() if name not in _TOGETHER}
 
 
 def _follows(
@@ -357,8 +353,7 @@ def _follows(
             raise ValueError("follow=True has no options of detection, and no given detections")
         single_frame_options(restoration)
     elif options.follow == "auto":
-        together = any((restoration or {}).get(name) not in (None, False, 1) for name in _TOGETHER)
-        return False if detection or given is not None or together else "auto"
+        return False if detection or given is not None or _together(restoration) else "auto"
     return options.follow
 
 
@@ -395,10 +390,9 @@ def plan_job(
     given, force = None if run.given is None else dict(enumerate(run.given)), restored is not None and restored.force
     of_run = (given, run.motion, run.bad_frames, force, device, options.window, follow)
     job = StackJob(Path(source), info, timing, full_scale, detection, restoration, *of_run)
-    if job.mosaic is not None:
-        check_mosaic(job.mosaic, info.shape, str(source))
-    if job.restoration is not None:
-        check_optics(RestorationOptions(**job.restoration).optics)
+    if job.chosen.mosaic is not None:
+        check_mosaic(job.chosen.mosaic, info.shape, str(source))
+    check_optics(job.chosen.optics)
     margin = MARGIN if job.follow else 0
     windows = cut_windows(info.shape[0], job.window, margin)
     if options.workers is not None:

@@ -131,7 +131,9 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             f"given has {len(given)} detections for {len(windows)} windows of at most {job.window} frames; "
             "pass one for each window"
         )
-    out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
+    joined = job.chosen.joint is True
+    out = job.info.with_frames(len(windows) if joined else job.info.shape[0])
+    out = out.restored_as(job.chosen.scale, job.chosen.mosaic)
     out = job.content(out, timing)
     form = check_info_target(sink, out, compression, check_folder=False)
     first: WindowResult | None = None
@@ -144,7 +146,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     def compute(folder: RunFolder) -> dict[str, Any]:
         remaining = [window for window in windows if window.index not in folder]
-        frames = len(remaining) if job.joined else sum(window.kept for window in remaining)
+        frames = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
         frames += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
         check_space(sink, frames * out.frame_bytes)
