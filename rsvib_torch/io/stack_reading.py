@@ -65,15 +65,9 @@ def read_stack_info(path: PathLike) -> StackInfo:
     """Read what a file states about its stack: shape, data type and full scale, without its pixels.
 
     Arguments and errors are those of ``open_stack``; unknown values are None.
-
-    Example:
-        >>> info = read_stack_info("frames.tif")  # doctest: +SKIP
-        >>> info.shape, info.dtype, info.full_scale  # doctest: +SKIP
-        ((3, 64, 48), 'uint16', 4095.0)
     """
-    reader = open_stack(path)
-    reader.close()
-    return reader.info
+    with closing(open_stack(path)) as reader:
+        return reader.info
 
 
 @checks_arguments

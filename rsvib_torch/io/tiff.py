@@ -75,11 +75,9 @@ def _is_complete(page: Any, size: int) -> bool:
     return max(ends, default=size + 1) <= size
 
 
-def _with_channels_first(values: Any, axes: str) -> Any:
-    """Pixels, or the shape, of a page with channels before the image axes."""
-    if axes != "YXS":
-        return values
-    return (values[2], *values[:2]) if isinstance(values, tuple) else np.moveaxis(values, -1, 0)
+def _with_channels_first(shape: tuple[int, ...], axes: str) -> tuple[int, ...]:
+    """The shape of a page with channels before the image axes."""
+    return (shape[2], *shape[:2]) if axes == "YXS" else shape
 
 
 def _check_complete(complete: Sequence[bool], nbytes: int, size: int) -> None:
@@ -117,12 +115,6 @@ def _info(tif: Any, shape: tuple[int, ...], dtype: np.dtype, photometric: Any, *
         **tiff_times(tif, shape[0], metadata),
     )
     return replace(info, metadata=read_metadata(tif, info))
-
-
-def _all_series(tif: Any) -> Sequence[Any]:
-    """The series of pages of a file, with their axes of length 1: an option from tifffile 2026.5.2 on."""
-    series: Sequence[Any] = tif.series(squeeze=False) if callable(tif.series) else tif.series
-    return series
 
 
 def _axes_of(series: Any) -> tuple[str, tuple[int, ...]]:
@@ -174,7 +166,7 @@ def _page_reader(
     return BlockReader(path, info, read, close=close)
 
 
-def _open_pages(path: Path, tif: Any, pages: Sequence[_Page], close: Callable[[], None]) -> BlockReader:
+def _open_pages(path: Path, tif: Any, pages: Sequence[_Page]) -> BlockReader:
     """Reader of a file in which every page is a frame, thumbnails and masks excepted."""
     frames = [page for page in pages if not page.secondary] or pages
     first = tif.pages[frames[0].number]
@@ -182,28 +174,27 @@ def _open_pages(path: Path, tif: Any, pages: Sequence[_Page], close: Callable[[]
         raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
     for page in frames:
         if page.kind != frames[0].kind:
-            raise ValueError(
-                f"frames of different size or kind: page {page.number} is {page.kind}, page {first.index} is "
-                f"{frames[0].kind}"
-            )
+            kinds = f"page {page.number} is {page.kind}, page {first.index} is {frames[0].kind}"
+            raise ValueError(f"frames of different size or kind: {kinds}")
     _check_complete([page.complete for page in frames], sum(page.nbytes for page in frames), path.stat().st_size)
     last, shape = first.axes == "YXS", _with_channels_first(first.shape, first.axes)
     info = _info(tif, (len(frames), *shape), first.dtype, first.photometric, channels_last=last)
     lost = {"thumbnails and masks": None} if len(frames) < len(pages) else {}
     info = replace(info, metadata={**info.metadata, **lost})
     order = (2, 0, 1) if last else tuple(range(len(shape)))
-    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], first.shape, order, close)
+    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], first.shape, order, tif.close)
 
 
-def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader:
+def _open_series(path: Path, tif: Any) -> BlockReader:
     """Reader of a file whose pages are arranged as one array."""
-    series = _all_series(tif)[0]
+    # with axes of length 1, which is an option from tifffile 2026.5.2 on
+    series = (tif.series(squeeze=False) if callable(tif.series) else tif.series)[0]
     info, order = _series_info(tif, series)
     shape, pages, T = _axes_of(series)[1], series.pages, info.shape[0]
     in_order = tuple(sorted(order))
     frame_by_frame = order == in_order or (info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order)
     if series.dataoffset is not None and frame_by_frame:
-        close()
+        tif.close()
         return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
     size = path.stat().st_size
     _check_complete([_is_complete(page, size) for page in pages], math.prod(shape) * series.dtype.itemsize, size)
@@ -214,7 +205,7 @@ def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader
     numbers = np.arange(len(pages)).reshape(*shape[:of_pages], *[1] * (len(shape) - of_pages))
     of_frames = np.moveaxis(numbers, time, 0).reshape(T, -1).tolist()
     frame_shape = tuple(1 if T > 1 and i == time else size for i, size in enumerate(shape))
-    return _page_reader(path, info, pages, of_frames, frame_shape, order, close)
+    return _page_reader(path, info, pages, of_frames, frame_shape, order, tif.close)
 
 
 def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> None:
@@ -230,7 +221,6 @@ def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> 
 _PROGRAMS = (
     "shaped lsm mmstack ome imagej ndtiff fluoview stk sis svs scn qpi ndpi bif avs eer philips scanimage nih mdgel"
 )
-_ARRANGED = frozenset(_PROGRAMS.split())
 
 
 def _are_arranged(tif: Any, count: int) -> bool:
@@ -242,7 +232,7 @@ def _are_arranged(tif: Any, count: int) -> bool:
         if pages < count:
             _check_one_page_per_frame(shape, metadata.get("axes", ""), pages)
             return False
-    if not tif.flags & _ARRANGED:
+    if not tif.flags & set(_PROGRAMS.split()):
         return False  # the series of all pages takes 0.3 ms per page
     tif.pages.useframes = count > 1
     try:
@@ -262,7 +252,7 @@ def open_tiff(path: Path) -> BlockReader:
         tif = opened.enter_context(tifffile.TiffFile(path))
         pages = _pages(tif)
         arranged = _are_arranged(tif, len(pages))
-        reader = _open_series(path, tif, tif.close) if arranged else _open_pages(path, tif, pages, tif.close)
+        reader = _open_series(path, tif) if arranged else _open_pages(path, tif, pages)
         opened.pop_all()
         return reader
 

@@ -6,7 +6,7 @@ applied; the videos that are written state it.
 
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -137,11 +137,8 @@ def _listed_times(container: Any, stream: Any) -> list[Fraction | None] | None:
 
 def _camera(tags: dict[str, str]) -> str | None:
     """Make and model of the camera in the tags of a video: QuickTime, Android, or the firmware of GoPro."""
-    for make, model in (
-        ("com.apple.quicktime.make", "com.apple.quicktime.model"),
-        ("com.android.manufacturer", "com.android.model"),
-        ("make", "model"),
-    ):
+    makes = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
+    for make, model in zip(makes, ("com.apple.quicktime.model", "com.android.model", "model"), strict=True):
         if tags.get(model):
             return camera_name(tags.get(make), tags[model])
     return _GOPRO_FIRMWARE.get(tags.get("firmware", "")[:6])
@@ -161,14 +158,12 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         size = stream.width * stream.height
         check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
         times = _listed_times(container, stream)
-        with open_container(path) as again:
-            frames = _frames(again)
+        with open_container(path) as again, closing(_frames(again)) as frames:
             first = next(frames, None)
             if first is None:
                 raise ValueError("no frame can be decoded")
             if times is None:
                 times = [_time_of(frame, stream) for frame in chain([first], frames)]
-            frames.close()
         known = [time for time in times if time is not None]
         rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
         pixels, rate = _pixels(first), stream.average_rate
@@ -464,6 +459,7 @@ def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
         source, output = open_source(info, opened), open_output(path, opened)
         if source is not None:
             output.metadata.update(source.metadata)
+        durations = np.diff(ticks, append=2 * ticks[-1] - ticks[-2] if len(ticks) > 1 else ticks[0] + 1).tolist()
         video: Any = None
         index = 0
         for part in parts:
@@ -473,15 +469,12 @@ def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
                     video.time_base = unit
                     sound = Sound(output, source)
                 for packet in container.demux(container.streams.video[0]):
-                    if packet.size == 0:  # the last packet of a stream
-                        continue
-                    sound.write(ticks[index] * unit)
-                    last = index + 1 == len(ticks)
-                    packet.stream, packet.time_base = video, unit
-                    packet.pts = packet.dts = ticks[index]
-                    packet.duration = ticks[index] - ticks[index - 1] if last else ticks[index + 1] - ticks[index]
-                    output.mux(packet)
-                    index += 1
+                    if packet.size > 0:  # not the last packet of a stream
+                        sound.write(ticks[index] * unit)
+                        packet.stream, packet.time_base, packet.duration = video, unit, durations[index]
+                        packet.pts = packet.dts = ticks[index]
+                        output.mux(packet)
+                        index += 1
         if index != len(ticks):
             raise ValueError(f"{path}: the parts have {index} frames, expected {len(ticks)}; delete them to start over")
         sound.write()

@@ -224,10 +224,9 @@ def offset_figure(result: DetectionResult) -> Figure:
     13 frames, the upper panels have the 9 neighbouring frames with the largest residual, and the lower ones all.
 
     Example:
-        >>> from rsvib_torch.datasets import example_frames
-        >>> from rsvib_torch.detection import detect_vibration
-        >>> frames, timing, _ = example_frames()
-        >>> [panel.get_ylabel() for panel in offset_figure(detect_vibration(frames, timing, method="bands")).axes]
+        >>> import rsvib_torch as rsv
+        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> [panel.get_ylabel() for panel in offset_figure(rsv.detect_vibration(frames, timing, method="bands")).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     axes = result.vibration.num_axes
@@ -261,10 +260,9 @@ def windows_figure(
         time_label: Label of the horizontal axis.
 
     Example:
-        >>> from rsvib_torch.datasets import example_frames
-        >>> from rsvib_torch.detection import detect_vibration
-        >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> parts = [detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> import rsvib_torch as rsv
+        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
+        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
         >>> len(windows_figure([0.0, 2 * timing.frame_period], parts).axes)
         4
     """
@@ -390,10 +388,9 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     et al. 2023). Blind frequencies are dashed lines.
 
     Example:
-        >>> from rsvib_torch.datasets import example_frames
-        >>> from rsvib_torch.detection import detect_vibration
-        >>> frames, timing, _ = example_frames()
-        >>> gain_figure(detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
+        >>> import rsvib_torch as rsv
+        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> gain_figure(rsv.detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
         'frequency (Hz)'
     """
     check_single("result", result)

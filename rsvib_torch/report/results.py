@@ -54,8 +54,7 @@ def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = N
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
+        >>> frames, timing, _ = rsv.datasets.example_frames()
         >>> path = tempfile.mkdtemp() + "/vibration.json"
         >>> rsv.write_vibration(path, rsv.detect_vibration(frames, timing))
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
@@ -142,8 +141,7 @@ def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: flo
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
+        >>> frames, timing, _ = rsv.datasets.example_frames()
         >>> path = tempfile.mkdtemp() + "/tones.csv"
         >>> rsv.write_table(path, rsv.detect_vibration(frames, timing, tones=1))
         >>> with open(path) as file:

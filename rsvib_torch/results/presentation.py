@@ -131,15 +131,6 @@ _DIMENSIONS = {"A": "axis", "F": "frequency", "K": "tone", "N": "row", "P": "pai
 Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dimensions, values, attributes
 
 
-def _dimensions(stated: str, count: int, name: str) -> tuple[str, ...]:
-    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``."""
-    symbols = [entry.partition("=")[0] for entry in stated.split() if "..." not in entry]
-    batch = count - len(symbols)
-    leading = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
-    named = [_DIMENSIONS.get(symbol, f"{name}_{symbol.lower()}") for symbol in symbols]
-    return (*leading, *named)
-
-
 # Results
 
 
@@ -311,7 +302,11 @@ class Result(Summarised):
             elif isinstance(value, Tensor) and name in self.shapes:
                 full = "_".join(dict.fromkeys((*inside, name)))  # offsets of the curve "offsets" are "offsets"
                 unit = {"units": self.units[name]} if name in self.units else {}
-                yield full, (_dimensions(self.shapes[name], value.ndim, full), value.detach().cpu().numpy(), unit)
+                symbols = [entry.partition("=")[0] for entry in self.shapes[name].split() if "..." not in entry]
+                batch = value.ndim - len(symbols)
+                dimensions = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
+                dimensions += [_DIMENSIONS.get(symbol, f"{full}_{symbol.lower()}") for symbol in symbols]
+                yield full, (tuple(dimensions), value.detach().cpu().numpy(), unit)
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The same result with ``function``, which must preserve values, applied to every tensor.

@@ -32,8 +32,7 @@ class VibrationCorrector(nn.Module):
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
+        >>> frames, timing, _ = rsv.datasets.example_frames()
         >>> corrector = rsv.VibrationCorrector(timing, restoration={"method": "dewarp"})
         >>> corrector
         VibrationCorrector(

@@ -353,11 +353,5 @@ def manifest_text(
 
 @checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
-    """Read the ``manifest.json`` of a complete run.
-
-    Example:
-        >>> manifest = read_manifest("restored.tif.manifest.json")  # doctest: +SKIP
-        >>> manifest.detections()[0].vibration.frequency[:, 0].tolist()  # Hz, first window  # doctest: +SKIP
-        [110.0, 90.0]
-    """
+    """Read the ``manifest.json`` of a complete run."""
     return StackManifest.load(path)

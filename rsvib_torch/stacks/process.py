@@ -65,9 +65,6 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
 
     Raises:
         ValueError: If detection fails in all first windows, or ``sink`` is a file of the stack.
-
-    Example:
-        >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
     """
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
@@ -109,8 +106,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames(num_frames=4)
+        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
         >>> rsv.write_stack(f"{folder}/frames.npy", frames)
         >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}

@@ -34,10 +34,6 @@ tones = 1
 """
 
 
-def _write_yxt(path: Path, counts: Counts, **options: Any) -> None:
-    write_tiff(path, np.ascontiguousarray(np.moveaxis(counts, 0, -1)), metadata={"axes": "YXT"}, **options)
-
-
 def _write_fortran(path: Path, counts: Counts) -> None:
     np.save(path, np.asfortranarray(counts))
 
