@@ -107,6 +107,7 @@ from .stacks import read_manifest as read_manifest
 from .stacks import restore_block as restore_block
 from .tracking import TrackedFrame as TrackedFrame
 from .tracking import VibrationTracker as VibrationTracker
+from .tracking import follow_vibration as follow_vibration
 from .video import Margins as Margins
 from .video import VideoBorder as VideoBorder
 from .video import process_video as process_video

@@ -40,7 +40,6 @@ def rms(values):
 # Every public function of frames: the call, and the axes of the frames in its result, if it returns frames.
 FUNCTIONS = {
     "detect_vibration": lambda frames, **options: rsv.detect_vibration(frames, TIMING, tones=1, **options),
-    "model free": lambda frames, **options: rsv.detect_vibration(frames, TIMING, model="free", **options),
     "detect_motion": lambda frames, **options: rsv.detect_motion(frames, TIMING, **options),
     "detect_swept_tone": lambda frames, **options: rsv.detect_swept_tone(frames, TIMING, **options),
     "check_motion": lambda frames, **options: rsv.check_motion(frames, TIMING, VIBRATION, **options),
