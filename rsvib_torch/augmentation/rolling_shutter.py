@@ -180,10 +180,9 @@ def _axis_ranges(name: str, value: Range, *, at_least: float = -math.inf) -> tup
 class RollingShutterVibration(GeometricAugmentationBase2D):
     """Record images of a still scene with a vibrating rolling-shutter camera (Eq. 9 of Liu et al. 2023).
 
-    ``g(x, y) = 1/T_e int f[x - X(t), y - Y(t)] dt`` for every row over its own exposure, with random vibration, image
-    motion and exposure. Images are distorted and blurred; keypoints move by the mean displacement of the row that shows
-    them, masks likewise to the nearest pixel, and boxes become the smallest upright boxes around their distorted
-    content. Images and masks are mirrored at their boundaries.
+    Every row is exposed at its own time, with random vibration, image motion and exposure. Images are distorted and
+    blurred; keypoints move by the mean displacement of the row that shows them, masks likewise to the nearest pixel;
+    boxes become the smallest upright ones around their content. Images and masks are mirrored at their boundaries.
 
     An image is frame 0 of a recording. In ``VideoSequential`` the frames of a clip that share one draw
     (``same_on_frame=True``, Kornia's default) are consecutive frames of one recording, ``frame_rows`` apart.
@@ -197,8 +196,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         frequency: Range of f in Hz.
         phase: Range of phi in rad.
         image_motion: Range of v in px/s.
-        roll: Range of the amplitude of the rotation about the optical axis in rad, ``(low, high)`` or a number; None
-            for no roll. Frequency and phase are drawn from the ranges of x.
+        roll: Range of the amplitude of the rotation about the optical axis in rad, ``(low, high)`` or a number, with
+            frequency and phase from the ranges of x; None for no roll.
         zoom: The same for the relative change of scale.
         exposure_rows: Exposure in row times, a number or ``(low, high)``; by default that of the sensor.
         tones: Number of tones of each axis.
@@ -247,15 +246,12 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
                 raise TypeError(f"{name} must be a number or (low, high), got {quoted(of_turn)}")
             turns += _axis_ranges(name, of_turn or 0.0, at_least=0.0)[:1]
-        frequencies, phases = _axis_ranges("frequency", frequency, at_least=0.0), _axis_ranges("phase", phase)
-        self.flags = {
-            "amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns,
-            "frequency": frequencies + frequencies[:1] * len(turns),
-            "phase": phases + phases[:1] * len(turns),
-            "image_motion": _axis_ranges("image_motion", image_motion),
-            "exposure_rows": exposures,
-            "interpolation": interpolation,
-        }
+        self.flags = {"image_motion": _axis_ranges("image_motion", image_motion), "exposure_rows": exposures}
+        self.flags |= {"amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns}
+        for name, value, lowest in (("frequency", frequency, 0.0), ("phase", phase, -math.inf)):
+            ranges = _axis_ranges(name, value, at_least=lowest)
+            self.flags[name] = ranges + ranges[:1] * len(turns)
+        self.flags["interpolation"] = interpolation
 
     def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: Any) -> Tensor:
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""

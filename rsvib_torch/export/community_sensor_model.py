@@ -138,18 +138,13 @@ def write_isd(
 ) -> Literal["frame", "line-scan"]:
     """Write the ISD of one frame of a vibrating camera, for the Community Sensor Model.
 
-    The given ISD describes the camera at rest: without the motion, pixel and ray belong together as it states. The
-    pixel at p of the frame, whose row is displaced by D (mean over its exposure), has the ray of the camera at rest at
-    p - D. Two models are available:
+    The given ISD describes the camera at rest. The pixel at p of the frame, whose row is displaced by D (mean over its
+    exposure), has the ray of the camera at rest at p - D. Two models are available (docs/export.md):
 
-    * ``"frame"``: the ISD with polynomials ``jitter`` for lines (the displacement along y) and samples (along x), of
-      the lowest degree up to 12 that suffices. They hold for all columns, and the exposure times have a step at every
-      line, so that this model is for slow motion without roll. ``lineExposureTimes`` are seconds since one readout
-      duration before the exposure of the first row, since the polynomials are zero at time 0.
-    * ``"line-scan"``: a line scanner with one quaternion per row. All rows have the rays of one line of the sensor,
-      which a rotation takes to their place: a row at y px from the principal point is wider by the factor
-      ``sqrt(1 + y^2 / f^2)``, so that this model is for narrow fields of view, and for rows read from top to bottom.
-      The position is constant during the frame; uniform image motion is part of the quaternions.
+    * ``"frame"``: the ISD with polynomials ``jitter`` of the lowest degree up to 12 that suffices. They hold for all
+      columns, and the exposure times have a step at every line, so that this model is for slow motion without roll.
+    * ``"line-scan"``: a line scanner with one quaternion per row, whose rows have the rays of one line of the sensor:
+      for narrow fields of view, and for rows read from top to bottom.
 
     Args:
         path: The file to write; an existing file is replaced, but not that of ``isd``.

@@ -101,10 +101,8 @@ def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
     """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
 
-    One line per band (or row, in the direct method) and pair of frames. Before correction, its rows are displaced
-    between the frames by ``offset``; the vibration predicts ``fitted``; ``residual = offset - fitted`` remains after
-    correction. All are the displacement in the later frame minus that in the earlier one, in px along x and y, in rad
-    for roll. ``std`` is the standard deviation of the offset and of the residual, if it is known.
+    One line per band (or row, in the direct method) and pair of frames, see docs/export.md: ``offset`` before
+    correction, ``fitted`` by the vibration, ``residual = offset - fitted`` after it, and ``std`` of both.
     """
     check_single("result", result)
     curve = result.offsets

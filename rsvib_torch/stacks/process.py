@@ -79,10 +79,9 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
 def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessStackOptions) -> StackReport:
     """Restore a stack of any length from file to file.
 
-    The stack is cut into windows as in ``iterate_stack``. They depend only on the number of frames and ``window``, and
-    each is computed on one thread: results do not depend on memory, workers and scheduler. The output gets its name
-    when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from which an interrupted run
-    can be resumed. Memory does not grow with the number of frames.
+    The stack is cut into windows as in ``iterate_stack``; results do not depend on memory, workers and scheduler. The
+    output gets its name when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from
+    which an interrupted run can be resumed. Memory does not grow with the number of frames.
 
     Frames that cannot be read or used (constant, infinite, beyond full scale) are listed in the manifest; the other
     frames of their window are restored without them. A window in which the detection fails is written unchanged.
@@ -93,9 +92,6 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             kept as far as the format supports them.
         timing: As in ``iterate_stack``.
         options: Options.
-
-    Returns:
-        Summary of the run.
 
     Raises:
         FileExistsError: If there is an interrupted run and ``resume`` is False.
