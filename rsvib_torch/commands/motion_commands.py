@@ -146,12 +146,10 @@ def known(given: KnownOptions) -> Answer:
     input is written unchanged, unless --force is given.
     """
     manifest = given.restored.with_name(f"{given.restored.name}.manifest.json")
-    outputs = [*io.stack_files(given.restored), manifest]
-    shared.check_new(outputs, given.overwrite or "resume" in given.processing, [*given.inputs, given.motion])
-    recorded = _recorded(given)
-    camera = None
-    if given.unit is None and given.focal_length is not None:
-        camera = rsvib_torch.Camera(given.focal_length)
+    outputs, replaces = [*io.stack_files(given.restored), manifest], given.overwrite or "resume" in given.processing
+    shared.check_new(outputs, replaces, [*given.inputs, given.motion])
+    recorded, focal_length = _recorded(given), given.focal_length if given.unit is None else None
+    camera = None if focal_length is None else rsvib_torch.Camera(focal_length)
     info, scale, options = given.planned_restoration()
     info, timing = replace(info, full_scale=scale), given.settings.timing
     io.check_stack_target(
@@ -165,8 +163,7 @@ def known(given: KnownOptions) -> Answer:
         fitted: Table = {"camera": camera, "fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
         with working("aligning the recording"):
             found = stacks.align_stack(given.stack, info, timing, recorded, offsets=given.offsets, **fitted)
-        results["Recording on the clock of the frames"] = [found.summary()]
-        data["alignment"] = _without_curve(found)
+        results["Recording on the clock of the frames"], data["alignment"] = [found.summary()], _without_curve(found)
         _refuse(given, found.reasons)
         placed = found.motion
         if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
@@ -175,22 +172,27 @@ def known(given: KnownOptions) -> Answer:
             timing = replace(timing, row_time=found.row_time, **in_rows)
     else:
         placed = recorded.retimed(given.offset)
-        _check_covers(given, recorded, placed, io.timing_from_first_frame(timing, info), info.shape)
+        starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
+        last = (
+            float(starts[-1] - starts[0]) + info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+        )
+        if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
+            needed = f"the frames need {given.offset:.6g} to {given.offset + last:.6g} s"
+            raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
     # 2. Whether it explains the offsets of rows; rates were compared by the alignment.
     check = _check_motion(given, info, timing, placed) if isinstance(recorded, rsvib_torch.FreeMotion) else None
     if check is not None:
-        results["Motion of the frames"] = [check.summary()]
-        data["check"] = _without_curve(check)
+        results["Motion of the frames"], data["check"] = [check.summary()], _without_curve(check)
     # 3. Restoration in windows.
     counts = info.shape[0] > 8
     of_run = {"restoration": options, "full_scale": scale, "force": given.force, "device": str(given.torch_device)}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
+    of_run |= {"motion": placed, "manifest": manifest}
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
-        of_run |= {"manifest": manifest, "progress": progress if counts else None}
-        run = stacks.process_stack(given.stack, given.restored, timing, motion=placed, **of_run)
+        show = progress if counts else None
+        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=show)
     note_lost(given.restored, run.not_kept)
-    stored = stacks.read_manifest(manifest)
-    first = None if run.first is None else run.first.restoration
+    stored, first = stacks.read_manifest(manifest), None if run.first is None else run.first.restoration
     if run.windows == 1 and first is not None:
         warn_of_restoration(first)
         results["Restoration"] = restoration_lines(first, info.shape[0])
@@ -209,13 +211,9 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     if given.unit is not None:
         if given.fit_row_time:
             raise ValueError("--fit-row-time is for a gyroscope, without --unit")
-        return rsvib_torch.read_motion(
-            given.motion,
-            unit=given.unit,
-            focal_length=given.focal_length,
-            time_unit=given.time_unit,
-            signs=(-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0),
-        )
+        signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
+        units: Table = {"unit": given.unit, "focal_length": given.focal_length, "time_unit": given.time_unit}
+        return rsvib_torch.read_motion(given.motion, **units, signs=signs)
     if given.flip_x or given.flip_y or given.offset is not None or given.time_unit != "s":
         raise ValueError(
             "--flip-x, --flip-y, --offset and --time-unit are for a CSV file with the columns time, x and y, and need "
@@ -232,24 +230,6 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
         warn(reason)
 
 
-def _check_covers(
-    given: KnownOptions,
-    recorded: rsvib_torch.FreeMotion,
-    placed: rsvib_torch.FreeMotion,
-    timing: rsvib_torch.SensorTiming,
-    shape: tuple[int, ...],
-) -> None:
-    """Raise an error unless a recording at the stated offset covers the frames."""
-    starts = timing.frame_starts(shape[0])
-    readout = shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    first, last = 0.0, float(starts[-1] - starts[0]) + readout
-    if placed.start > first + 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
-        raise ValueError(
-            f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need "
-            f"{(given.offset or 0.0) + first:.6g} to {(given.offset or 0.0) + last:.6g} s"
-        )
-
-
 def _check_motion(
     given: KnownOptions, info: StackInfo, timing: rsvib_torch.SensorTiming, motion: rsvib_torch.FreeMotion
 ) -> gyroscope.MotionCheck | None:
@@ -257,9 +237,6 @@ def _check_motion(
 
     Of a long stack, frames in its middle are compared. If the clock is stated, an error is a warning.
     """
-    if info.shape[0] < 2:
-        warn("cannot determine whether the motion fits: the comparison needs two frames")
-        return None
     try:
         with working("comparing the motion"):
             check = stacks.check_stack_motion(given.stack, info, timing, motion)

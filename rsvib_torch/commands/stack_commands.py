@@ -293,16 +293,9 @@ def _restore_windows(given: RestoreOptions) -> Answer:
         timing = replace(timing, frame_start_times=stored.frame_start_times)
     reports.check_same_timing(str(vibration), stored, timing)
     window = manifest.settings.get("window")
-    if "video" in manifest.settings:
-        raise ValueError(
-            f"{vibration}: it describes a video that was followed frame by frame, and its parts are not windows; "
-            "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
-        )
-    if any(record.followed is not None for record in manifest.windows):
+    if not isinstance(window, int) or any(record.followed is not None for record in manifest.windows):
         followed = "its vibration was followed from frame to frame, and is not that of windows"
-        raise ValueError(f"{vibration}: {followed}; repeat rsvib run")
-    if not isinstance(window, int):
-        raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
+        raise ValueError(f"{vibration}: {followed}; repeat rsvib run, or detect the windows (rsvib detect --window 8)")
     info, scale, options = given.planned_restoration(given.restoration)
     print_notes(info, given.settings)
     common = {"restoration": options, "full_scale": scale, "force": given.force, "device": str(given.torch_device)}
