@@ -27,6 +27,8 @@ def open_npy(path: Path) -> BlockReader:
         read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
         shape, fortran_order, dtype = read(head)
         check_dtype(dtype)
+        if channels_appear_last(shape):
+            raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
         info = info_from_attributes({}, shape, dtype)
         reader = contiguous_reader(path, info, head.tell(), dtype)
         if not fortran_order:

@@ -31,8 +31,8 @@ class TimingWarning(UserWarning):
 class _Spacing:
     """Spacing of the frames of a file."""
 
-    # (T,) intervals from the first frame to each, several where frames were dropped; None if the rate is variable: times
-    # are not whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one
+    # (T,) intervals from the first frame to each, several where frames were dropped; None if the rate is variable:
+    # times are not whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one
     numbers: NDArray[np.float64] | None
     interval: float  # s, without dropped frames: of a straight line, or the median if the rate is variable
     limits: tuple[float, float]  # s, shortest and longest interval if the rate is variable, otherwise ``interval``

@@ -4,14 +4,12 @@ Pillow reads headers and metadata and verifies PNG files; OpenCV decodes them: P
 """
 
 import io
-import math
 import re
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -29,7 +27,7 @@ from rsvib_torch.numerics.tables import Array
 
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
 _LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032
-_CHANNELS = {"1": 1, "L": 1, "I;16": 1, "P": 3, "RGB": 3, "LA": 4, "RGBA": 4}  # of a decoded PNG file, by mode
+_CHANNELS = {"L": 1, "I;16": 1, "RGB": 3, "RGBA": 4}  # by mode
 _LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and previews have 64 KB each, colour profiles 3 MB
 _PNG_HEADER = 8 + 25  # bytes of the signature and the chunk with the size
 
@@ -41,35 +39,25 @@ def image_info(path: Path) -> StackInfo:
         head = file.read(_LONGEST_HEADER)  # Pillow would search a file of any size for it, at 20 MB/s
         file_size = file.seek(0, io.SEEK_END)
         image = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
-        if is_png:
-            info = _png_info(image, head, file_size)
-        elif image.mode in ("L", "RGB"):
-            channels = (3,) * (image.mode == "RGB")
-            shape = (1, *channels, image.height, image.width)
-            info = StackInfo(shape, "uint8", 255.0, channels_last=image.mode == "RGB")
-        else:
-            raise ValueError(f"pixels are {image.mode}; expected grey or RGB")
-        if file_size > 4 * np.dtype(info.dtype).itemsize * math.prod(info.shape) + _LONGEST_HEADER:
-            raise ValueError(f"{file_size} bytes are too many for {image.width} x {image.height} px")
+        if is_png and image.is_animated:
+            raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
+        if image.mode not in _CHANNELS:
+            raise ValueError(f"pixels are {image.mode}; expected grey, RGB or RGBA")
+        channels, dtype = _CHANNELS[image.mode], np.dtype(np.uint16 if is_png and head[24] == 16 else np.uint8)
+        if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
+            channels = 4
+        size, nbytes = f"{image.width} x {image.height} px", image.width * image.height * channels * dtype.itemsize
+        if is_png and nbytes > 8 * _LARGEST_RATIO * file_size:  # 1 bit is 1 byte
+            raise ValueError(f"its header states {size}, which {file_size} bytes cannot hold")
+        if file_size > 4 * nbytes + _LONGEST_HEADER:
+            raise ValueError(f"{file_size} bytes are too many for {size}")
+        shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
+        stated, dpi, resolution = image.info.get(_FULL_SCALE), image.info.get("dpi"), None
+        if is_png and dpi is not None and min(dpi) > 0:
+            resolution = (round(dpi[0] / 0.0254) / 100.0, round(dpi[1] / 0.0254) / 100.0, "centimeter")
+        full_scale = known_full_scale(dtype, None if stated is None else float(stated))
+        info = StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
         return replace(info, **exif_fields(image.info.get("exif", b"")))
-
-
-def _png_info(image: Any, head: bytes, file_size: int) -> StackInfo:
-    if image.is_animated:
-        raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
-    dtype = np.dtype(np.uint16 if head[24] == 16 else np.uint8)  # bits of a value
-    channels = _CHANNELS[image.mode]
-    if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
-        channels = 4
-    if image.width * image.height * channels * dtype.itemsize > 8 * _LARGEST_RATIO * file_size:  # 1 bit is 1 byte
-        raise ValueError(f"its header states {image.width} x {image.height} px, which {file_size} bytes cannot hold")
-    shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
-    stated = image.info.get(_FULL_SCALE)
-    full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-    dpi, resolution = image.info.get("dpi"), None
-    if dpi is not None and min(dpi) > 0:
-        resolution = (round(dpi[0] / 0.0254) / 100.0, round(dpi[1] / 0.0254) / 100.0, "centimeter")
-    return StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
 
 
 def decode_image(path: Path) -> Array:

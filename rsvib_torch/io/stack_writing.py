@@ -45,6 +45,8 @@ def check_info_target(
         check_choice("compression", compression, form.compressions)
     if form.check is not None:
         form.check(path, info)
+    if info.is_integer:
+        required_full_scale(info.full_scale, np.dtype(info.dtype), path)
     if form.kind == "tree":
         check_tree(path, form.marker, f"{form.name} stack")
     if check_folder:
@@ -52,20 +54,18 @@ def check_info_target(
     return form
 
 
-def _info_to_write(info: StackInfo, like: StackInfo | None) -> StackInfo:
-    """A stack with what is stated about the stack from which it was computed, except times that are not exact."""
+def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None, like: StackInfo | None) -> StackInfo:
+    """A stack to write, with what ``like`` states except times that are not exact."""
+    if len(shape) not in (3, 4) or min(shape) < 1:
+        raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
+    kind = np.dtype(dtype or np.float32)
+    full_scale = known_full_scale(kind) if kind.kind == "f" or full_scale is None else full_scale
+    info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:
         return info
-    kept = like.with_frames(info.shape[0])
-    return replace(
-        kept,
-        shape=info.shape,
-        dtype=info.dtype,
-        full_scale=info.full_scale,
-        frame_times=None if kept.time_error else kept.frame_times,
-        time_error=0.0,
-        metadata=like.metadata_for(info.shape, info.dtype),
-    )
+    kept, stated = like.with_frames(shape[0]), {"shape": info.shape, "dtype": info.dtype, "full_scale": full_scale}
+    times, metadata = None if kept.time_error else kept.frame_times, like.metadata_for(info.shape, info.dtype)
+    return replace(kept, **stated, frame_times=times, time_error=0.0, metadata=metadata)
 
 
 def check_stack_target(
@@ -75,17 +75,9 @@ def check_stack_target(
     dtype: str | None = None,
     full_scale: float | None = None,
     like: StackInfo | None = None,
-) -> float | None:
-    """Raise the error that ``write_stack`` would raise for frames of this shape, or return their full scale."""
-    if len(shape) not in (3, 4) or min(shape) < 1:
-        raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
-    kind = np.dtype(dtype or np.float32)
-    if kind.kind == "f":
-        full_scale = None
-    elif full_scale is None:
-        full_scale = known_full_scale(kind)
-    check_info_target(Path(path), _info_to_write(StackInfo(tuple(shape), kind.name, full_scale), like))
-    return None if kind.kind == "f" else required_full_scale(full_scale, kind, path)
+) -> None:
+    """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed."""
+    check_info_target(Path(path), _planned(shape, dtype, full_scale, like))
 
 
 def metadata_not_kept(
@@ -190,9 +182,8 @@ def write_stack(
         frames = frames.to(torch.float64) / full_scale  # exact for integers of 32 bits
     axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
-    full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
-    nodata = None if like is None or dtype != like.dtype else like.nodata
-    pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale, nodata)
-    info = _info_to_write(StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale), like)
+    info = _planned(tuple(frames.shape), dtype, full_scale, like)
     form = check_info_target(path, info, compression)
+    nodata = None if like is None or dtype != like.dtype else like.nodata
+    pixels = frames_to_counts(frames, np.dtype(info.dtype), info.full_scale, nodata)
     write_frames(form, path, info, _counted(pixels), compression)
