@@ -404,15 +404,14 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         for blind in blind_frequencies(timing, highest).tolist():
             panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
     labels: Table = {}
-    for axis, name in enumerate("xy"):
-        reliable = bool(result.reliable[axis])
+    for axis, tone in vibration.amplitude[:2].nonzero().tolist():
+        name, reliable = "xy"[axis], bool(result.reliable[axis])
         style = _marker(_AXIS_COLOURS[name], reliable) | {"markersize": 6}
-        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist():
-            at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
-            tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
-            labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
-            bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
-            lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
+        at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
+        tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
+        labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
+        bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
+        lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
     if labels:
         upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
     upper.set_ylim(0, 2.4)
@@ -444,13 +443,12 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Fig
     check_single("vibration", vibration)
     vibration = vibration.detached()
     starts = timing.row_starts(1, num_rows)[0]
-    figure, panels = _panels(5.6, 4.6, 2, sharex=True)
-    curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
-    for panel, values in zip(panels[:, 0], curves, strict=True):
-        _plot_axes(panel, np.arange(num_rows), values, legend=panel is panels[0, 0])
-    plain_axes(panels[0, 0], "", "displacement (px)")
-    plain_axes(panels[1, 0], "row (in readout order)", "motion blur (px)")
-    panels[1, 0].set_ylim(bottom=0)
+    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True)
+    _plot_axes(upper, np.arange(num_rows), vibration.mean_displacement(starts, timing.exposure_time))
+    _plot_axes(lower, np.arange(num_rows), motion_blur(vibration, starts, timing), legend=False)
+    plain_axes(upper, "", "displacement (px)")
+    plain_axes(lower, "row (in readout order)", "motion blur (px)")
+    lower.set_ylim(bottom=0)
     return figure
 
 
@@ -478,16 +476,14 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
     height, width = psf.weights.shape[-2:]
     last = first + torch.tensor([width - 1, height - 1], device="cpu")
     reach = max(2, int(torch.maximum(first.abs(), last.abs()).max()))  # px around the centre
-    cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
-    for index, (left, top) in enumerate((first.long() + reach).tolist()):
-        cells[index, top : top + height, left : left + width] = psf.weights[index].numpy()
     figure, panels = _panels(11.4, 4.9, down, across)
-    extent = (-reach - 0.5, reach + 0.5, reach + 0.5, -reach - 0.5)
-    for index, panel in enumerate(panels.flat):
-        panel.imshow(cells[index], cmap="Greys", vmin=0, vmax=cells.max(), interpolation="nearest", extent=extent)
+    grey: Table = {"cmap": "Greys", "vmin": 0, "vmax": psf.weights.max(), "interpolation": "nearest"}
+    for index, (panel, (left, top)) in enumerate(zip(panels.flat, first.tolist(), strict=True)):
+        extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
+        panel.imshow(psf.weights[index].numpy(), **grey, extent=extent)
         panel.plot(*path[index].T, color=_Y_COLOUR, linewidth=1.6)
         panel.set_title(f"row {int(rows[index])}", fontsize=9, loc="left", pad=3)
-        panel.set(xticks=[], yticks=[])
+        panel.set(xticks=[], yticks=[], xlim=(-reach - 0.5, reach + 0.5), ylim=(reach + 0.5, -reach - 0.5))
         panel.spines[:].set_color(_GRID)
     panels[-1, 0].set_xlabel(f"{2 * reach + 1} px", fontsize=9)
     return figure
