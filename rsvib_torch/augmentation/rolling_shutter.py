@@ -248,8 +248,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             turns += _axis_ranges(name, of_turn or 0.0, at_least=0.0)[:1]
         self.flags = {"image_motion": _axis_ranges("image_motion", image_motion), "exposure_rows": exposures}
         self.flags |= {"amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns}
-        for name, value, lowest in (("frequency", frequency, 0.0), ("phase", phase, -math.inf)):
-            ranges = _axis_ranges(name, value, at_least=lowest)
+        for name, drawn, lowest in (("frequency", frequency, 0.0), ("phase", phase, -math.inf)):
+            ranges = _axis_ranges(name, drawn, at_least=lowest)
             self.flags[name] = ranges + ranges[:1] * len(turns)
         self.flags["interpolation"] = interpolation
 

@@ -168,7 +168,7 @@ def known(given: KnownOptions) -> Answer:
         placed = found.motion
         if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
             rows = timing.row_time / found.row_time
-            in_rows = {"exposure_rows": rows * timing.exposure_rows, "frame_rows": rows * timing.frame_rows}
+            in_rows: Table = {"exposure_rows": rows * timing.exposure_rows, "frame_rows": rows * timing.frame_rows}
             timing = replace(timing, row_time=found.row_time, **in_rows)
     else:
         placed = recorded.retimed(given.offset)
@@ -185,7 +185,12 @@ def known(given: KnownOptions) -> Answer:
         results["Motion of the frames"], data["check"] = [check.summary()], _without_curve(check)
     # 3. Restoration in windows.
     counts = info.shape[0] > 8
-    of_run = {"restoration": options, "full_scale": scale, "force": given.force, "device": str(given.torch_device)}
+    of_run: Table = {
+        "restoration": options,
+        "full_scale": scale,
+        "force": given.force,
+        "device": str(given.torch_device),
+    }
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     of_run |= {"motion": placed, "manifest": manifest}
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
@@ -293,7 +298,7 @@ def compare(given: CompareOptions) -> Answer:
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
     record = read_acceleration(given.record, given.unit, given.time_unit, signs)
     found = detection.DetectionResult.load(given.vibration)
-    stated = {"pixel_size": given.pixel_size, "offset": given.offset, "offsets": given.offsets}
+    stated: Table = {"pixel_size": given.pixel_size, "offset": given.offset, "offsets": given.offsets}
     with working("comparing"):
         result = gyroscope.compare_accelerometer(found, *record, **stated)
         if given.out is not None:

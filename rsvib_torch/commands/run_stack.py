@@ -142,8 +142,8 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
                 names = written.draw_safely(picture, lambda: _comparison(given, common, first)) + names
         # one vibration of all frames, which was not followed
         if result.windows == 1 and restoration is not None and isinstance(found, detection.DetectionResult):
-            of_run = (common["restoration"], result.not_kept)
-            reports.write_restoration(folder / "restoration.json", restoration, *of_run)
+            target, chosen_options = folder / "restoration.json", common["restoration"]
+            reports.write_restoration(target, restoration, chosen_options, result.not_kept)
             timing = io.timing_from_first_frame(settings.timing, info)
             names += [*written.write_detection(folder, found, timing, given.pixel_size), "restoration.json"]
             answers.warn_of_restoration(restoration)

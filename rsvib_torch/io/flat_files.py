@@ -24,8 +24,8 @@ def open_npy(path: Path) -> BlockReader:
         with path.open("rb") as file:
             head = BytesIO(file.read(1 << 14))  # bytes; NumPy accepts headers of up to 10,000
         first = np.lib.format.read_magic(head) == (1, 0)
-        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        shape, fortran_order, dtype = read(head)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read_header(head)
         check_dtype(dtype)
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
@@ -37,7 +37,8 @@ def open_npy(path: Path) -> BlockReader:
         # all frames together: the pixels of a frame lie everywhere in the file
 
         def read(*_: int) -> Array:
-            return np.load(path, allow_pickle=False).reshape(info.shape)
+            frames: Array = np.load(path, allow_pickle=False).reshape(info.shape)
+            return frames
 
         return BlockReader(path, info, read, info.shape[0], info.frame_bytes)
 

@@ -165,7 +165,7 @@ class StackInfo(Summarised):
         if count == self.shape[0]:
             return self
         shape = (count, *self.shape[1:])
-        unknown = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
+        unknown: dict[str, Any] = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
         return replace(self, shape=shape, metadata=self.metadata_for(shape), **unknown)
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":

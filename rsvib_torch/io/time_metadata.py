@@ -120,8 +120,8 @@ def exif_fields(data: bytes) -> Table:
     tags = ExifTags.Base
     taken = _seconds_of_date(details.get(tags.DateTimeOriginal), details.get(tags.SubsecTimeOriginal, ""))
     changed = _seconds_of_date(exif.get(tags.DateTime), details.get(tags.SubsecTime, ""))
-    fields = {"orientation": orientation_of(exif.get(tags.Orientation))}
-    fields |= {"camera": camera_name(exif.get(tags.Make), exif.get(tags.Model))}
+    camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
+    fields = {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}
     return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 

@@ -618,8 +618,8 @@ def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     figure = _axes_figure(times, [(("measured",) * 2, offsets, None)], labels, marker=".", linestyle="none")
     for axis, panel in enumerate(figure.axes if curve.std is not None else ()):
         assert curve.std is not None
-        bars = (values.cpu() for values in (1e3 * times, offsets[:, axis], curve.std[curve.good][:, axis]))
-        panel.errorbar(*bars, fmt="none", ecolor=_GRID, zorder=1)
+        x, y, std = (values.cpu() for values in (1e3 * times, offsets[:, axis], curve.std[curve.good][:, axis]))
+        panel.errorbar(x, y, std, fmt="none", ecolor=_GRID, zorder=1)
     return figure
 
 
@@ -686,8 +686,8 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
 def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
     before, after = ([measured_text(rms, digits=3) for rms in of_axes] for of_axes in (result.before, result.after))
-    curves = [([f"offsets {rms} px rms" for rms in before], result.offsets, _GREY)]
-    curves += [([f"without the motion {rms} px rms" for rms in after], result.residual, None)]
+    before, after = [f"offsets {rms} px rms" for rms in before], [f"without the motion {rms} px rms" for rms in after]
+    curves = ((before, result.offsets, _GREY), (after, result.residual, None))
     labels = (_OFFSET_TIME, "offset (px)", "Offset along")
     return _axes_figure(result.times, curves, labels, marker=".", linestyle="none")
 

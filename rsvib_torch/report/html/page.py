@@ -99,8 +99,8 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
     points = after.shape[-1] // columns
     for top, left, height, width in boxes or ():
         if min(top, left) < 0 or min(height, width) < 1 or top + height > rows or left + width > columns:
-            box = f"{top},{left},{height},{width} (top, left, height, width)"
-            raise ValueError(f"edge {box} must be inside the frame of {rows} x {columns} px")
+            place = f"{top},{left},{height},{width} (top, left, height, width)"
+            raise ValueError(f"edge {place} must be inside the frame of {rows} x {columns} px")
     edges, notes = [], []
 
     def measured(frame: Tensor, box: Box, scale: int, where: str) -> MtfCurve | None:
