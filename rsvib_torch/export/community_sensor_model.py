@@ -325,10 +325,8 @@ def _with_jitter(
     for degree in range(1, min(_MAX_DEGREE, rows) + 1):
         # the time times a Chebyshev series, which is zero at time 0, as powers of the time from the highest on
         fitted = [np.polynomial.Chebyshev.fit(shown, values / shown, degree - 1) for values in target.T]
-        power = np.zeros((degree, 2))
-        for axis, series in enumerate(fitted):
-            coefficients = series.convert(kind=np.polynomial.Polynomial).coef[::-1]
-            power[degree - len(coefficients) :, axis] = coefficients
+        powers = (series.convert(kind=np.polynomial.Polynomial).coef[::-1] for series in fitted)
+        power = np.stack([np.pad(values, (degree - len(values), 0)) for values in powers], -1)
         value = (shown[:, None] ** np.arange(degree, 0, -1)) @ power
         rest = float(np.maximum(np.abs(value - low), np.abs(value - high)).max())
         if rest - columns <= 0.1 * tolerance:

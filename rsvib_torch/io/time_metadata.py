@@ -4,6 +4,7 @@ Functions return the fields of ``StackInfo`` that the metadata state, and none i
 frames can be read without them.
 """
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -71,15 +72,14 @@ def times_of_attributes(attributes: Mapping[str, Any], count: int) -> Table:
     otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second. Other attributes are ignored.
     """
     fields: Table = {}
-    for name, value in attributes.items():
-        if _RATE_NAME.fullmatch(name) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
-            rate = float(np.asarray(value).item())
-            if np.isfinite(rate) and rate > 0.0:
-                fields |= {"frame_rate": rate, "time_source": f"attribute {name}"}
-    for name, value in attributes.items():
+    numbers = {name: np.asarray(value).ravel() for name, value in attributes.items()}
+    numbers = {name: stored for name, stored in numbers.items() if stored.dtype.kind in "iuf"}
+    for name, stored in numbers.items():
+        if _RATE_NAME.fullmatch(name) and len(stored) == 1 and 0.0 < float(stored[0]) < math.inf:
+            fields |= {"frame_rate": float(stored[0]), "time_source": f"attribute {name}"}
+    for name, stored in numbers.items():
         match = _TIME_NAME.fullmatch(name)
-        stored = np.asarray(value).ravel()
-        if match is None or stored.dtype.kind not in "iuf" or len(stored) != count or count < 2:
+        if match is None or len(stored) != count or count < 2:
             continue
         # integers of 64 bits, e.g. nanoseconds since 1970, are subtracted before they are rounded to floats
         relative = (stored - stored[0]).astype(np.float64) if stored[0] <= stored.min() else np.zeros(count)

@@ -19,14 +19,9 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
+from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
-from rsvib_torch.io.full_scale import (
-    check_dtype,
-    counts_to_frames,
-    frames_to_counts,
-    known_full_scale,
-    required_full_scale,
-)
+from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
@@ -268,7 +263,7 @@ class StackJob:
         dtype = np.dtype(self.info.dtype)
 
         def counts(images: Tensor) -> NDArray[Any]:
-            return frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
+            return scales.frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
 
         if result.restored and not result.indices:
             frames = list(counts(result.frames))
@@ -371,7 +366,7 @@ def plan_job(
     full_scale = None
     if info.is_integer:
         stated = info.full_scale if options.full_scale is None else options.full_scale
-        full_scale = required_full_scale(stated, np.dtype(info.dtype), source)
+        full_scale = scales.required_full_scale(stated, np.dtype(info.dtype), source)
     timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
@@ -450,12 +445,12 @@ def restore_block(
     for name in ("scale", "mosaic"):
         if options.get(name) not in (None, 1):
             raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
-    check_dtype(frames.dtype)
+    scales.check_dtype(frames.dtype)
     axis = channel_axis("frames", frames.shape, channels)
     stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
-    scale = known_full_scale(frames.dtype, full_scale)
+    scale = scales.known_full_scale(frames.dtype, full_scale)
     if frames.dtype.kind != "f":
-        scale = required_full_scale(scale, frames.dtype, "frames")
+        scale = scales.required_full_scale(scale, frames.dtype, "frames")
     info = StackInfo(stored.shape, stored.dtype.name, scale)
     job = StackJob(Path("frames"), info, timing, scale, detection or {}, options, force=force, device=device)
     window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)

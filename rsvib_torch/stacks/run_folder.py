@@ -30,15 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.checks.arguments import check_fields
-from rsvib_torch.files.atomic import (
-    PART,
-    error_of_full_disk,
-    make_folder,
-    nearest_folder,
-    remove_abandoned,
-    sync,
-    whole_file,
-)
+from rsvib_torch.files import atomic
+from rsvib_torch.files.atomic import nearest_folder, sync
 from rsvib_torch.files.free_memory import size_text
 from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.io.stack_writing import stack_files
@@ -90,7 +83,7 @@ class RunFolder:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
         self._windows: dict[int, tuple[int, int, int]] = {}  # finished: place and size of the line; frames
         self._digest = b""  # of the last line of the journal
-        make_folder(self.path.parent)
+        atomic.make_folder(self.path.parent)
         while not self._open():
             pass
         with ExitStack() as opened:
@@ -268,7 +261,7 @@ class RunFolder:
 
         It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
         """
-        hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{PART}")
+        hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{atomic.PART}")
         self._windows.clear()
         if self._has_its_name():
             self.path.rename(hidden)
@@ -298,7 +291,7 @@ def disk_errors_named(folder: RunFolder) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        number = error_of_full_disk(error) or getattr(error, "errno", None)
+        number = atomic.error_of_full_disk(error) or getattr(error, "errno", None)
         if number is None and not isinstance(error, OSError):
             raise
         kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
@@ -393,15 +386,15 @@ def run_to_file(
         if difference:
             raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
         for path in (sink, manifest):
-            remove_abandoned(path)
+            atomic.remove_abandoned(path)
         return report(map(vars, complete.windows), windows, complete.not_kept)
     folder = RunFolder(sink, header, resume=options.resume)
     try:
         resumed = folder.count
         results = compute(folder)
         with disk_errors_named(folder):
-            make_folder(manifest.parent)
-            with whole_file(manifest) as part:
+            atomic.make_folder(manifest.parent)
+            with atomic.whole_file(manifest) as part:
                 part.write_text(manifest_text(header, folder.records(), **results), encoding="utf-8")
                 write(folder)
             sync(manifest.absolute().parent)  # the temporary folder is gone as well
