@@ -28,7 +28,6 @@ from .detection import diagnose_timing as diagnose_timing
 from .evaluation import MtfCurve as MtfCurve
 from .evaluation import SlantedEdge as SlantedEdge
 from .evaluation import find_slanted_edges as find_slanted_edges
-from .evaluation import offset_endpoint_error as offset_endpoint_error
 from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim
@@ -90,7 +89,6 @@ from .restoration import RestorationVerdict as RestorationVerdict
 from .restoration import RestorationWarning as RestorationWarning
 from .restoration import VibrationRestorer as VibrationRestorer
 from .restoration import judge_restoration as judge_restoration
-from .restoration import predict_noise_gain as predict_noise_gain
 from .restoration import restoration_mtf as restoration_mtf
 from .restoration import restore as restore
 from .restoration import trusted_vibration as trusted_vibration

@@ -344,14 +344,6 @@ class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
 
 
 @options
-class NoiseGainOptions(RestorationOptions, InputOptions):
-    """Options of ``predict_noise_gain``."""
-
-    columns: Columns = 256
-    """Width of the strip across the scan, from the middle of the frames."""
-
-
-@options
 class TrackerOptions(RestorationOptions, InputOptions):
     """Options of ``VibrationTracker``."""
 

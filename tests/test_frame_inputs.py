@@ -46,7 +46,6 @@ FUNCTIONS = {
     "VibrationDetector": lambda frames, **options: rsv.VibrationDetector(TIMING, tones=1, **options)(frames),
     "register_bands": lambda frames, **options: rsv.register_bands(frames, TIMING, **options),
     "judge_restoration": lambda frames, **options: rsv.judge_restoration(frames, frames, TIMING, VIBRATION, **options),
-    "predict_noise_gain": lambda frames, **options: rsv.predict_noise_gain(frames, TIMING, VIBRATION, **options),
     "restore": lambda frames, **options: rsv.restore(frames, TIMING, VIBRATION, **options),
     "VibrationRestorer": lambda frames, **options: rsv.VibrationRestorer(TIMING, **options)(frames, VIBRATION),
 }
