@@ -252,12 +252,8 @@ def windows_figure(
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 
-    Points of axes that are not reliable are hollow and do not determine the range of the axis.
-
-    Args:
-        times: Position of each window on the horizontal axis.
-        detections: The detection of each window (not a batch); None where it failed.
-        time_label: Label of the horizontal axis.
+    Points of axes that are not reliable are hollow and do not determine the range of the axis. There is a detection for
+    each of the ``times``, None where it failed.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -310,12 +306,9 @@ def _batch_figure(results: DetectionResult) -> Figure:
 
 @checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
-    """Draw the displacement of a motion along both axes over time.
+    """Draw the displacement of a motion (not a batch) over time, from ``first`` to ``last`` in seconds.
 
-    Args:
-        motion: The motion (not a batch).
-        first: Start of the drawing in seconds.
-        last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
+    By default, all of a free motion is drawn, and four periods of the tone of lower frequency of others.
 
     Example:
         >>> motion_figure(Vibration([3.1, 5.2], [50.0, 30.0])).axes[0].get_xlabel()
@@ -558,12 +551,7 @@ def comparison_figure(
 ) -> Figure:
     """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
-    Args:
-        raw: (H, W) or (C, H, W), full scale 1.
-        restored: The same shape.
-        count: Number of crops.
-        size: Side of the crops in px.
-        names: Titles of the two rows of panels.
+    Both frames are (H, W) or (C, H, W) with full scale 1; there are ``count`` crops with a side of ``size`` px.
 
     Example:
         >>> frame = torch.rand(96, 128, generator=torch.Generator().manual_seed(0))

@@ -127,10 +127,8 @@ class StackManifest(Result, file_format="rsvib stack"):
 
     def times(self) -> list[float]:
         """Time of each of the ``detections`` in s: start of the window, or middle of the frame."""
-        return [
-            record.start_time if frame is None or middle is None else middle
-            for record, frame, _, middle in self._results()
-        ]
+        found = ((record.start_time, frame, middle) for record, frame, _, middle in self._results())
+        return [start if frame is None or middle is None else middle for start, frame, middle in found]
 
     @property
     def shaking(self) -> dict[str, tuple[float, ...]] | None:
@@ -234,8 +232,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         return vibration, restoration
 
     @property
-    def _unit(self) -> str:
-        """What has a detection."""
+    def _unit(self) -> str:  # what has a detection
         followed = [record.followed is not None for record in self.windows]
         return "frames" if all(followed) else "windows or frames" if any(followed) else "windows"
 
