@@ -76,7 +76,13 @@ def export(given: ExportOptions) -> Answer:
     detected = reports.load_detection(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)
-        return Answer({"Offsets before and after correction": _residuals(detected)}, {"format": chosen}, [out])
+        lines = []  # for each axis, root mean square of the offsets and of the residuals
+        for axis, name in enumerate(AXES[: detected.vibration.num_axes]):
+            before = detected.offsets.offsets[..., axis][detected.offsets.good]
+            after, unit = before - detected.fitted[..., axis][detected.offsets.good], ("px", "px", "rad", "")[axis]
+            size = [f"{float(values.square().mean().sqrt()):.3g} {unit}" for values in (before, after)]
+            lines.append(f"{name}: {size[0]} before, {size[1]} after (root mean square)")
+        return Answer({"Offsets before and after correction": lines}, {"format": chosen}, [out])
     timing = detected.timing
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
@@ -138,16 +144,3 @@ def _trusted(
         known = f"focal_length={motion.camera.focal_length:g} px"
         raise ValueError(f"the vibration was detected with {known}; omit --focal-length")
     return motion.with_camera(rsvib_torch.Camera(given.focal_length))
-
-
-def _residuals(detected: rsvib_torch.DetectionResult) -> list[str]:
-    """A line for each axis: root mean square of the offsets and of the residuals."""
-    curve = detected.offsets
-    lines = []
-    for axis, name in enumerate(AXES[: detected.vibration.num_axes]):
-        before = curve.offsets[..., axis][curve.good]
-        after = before - detected.fitted[..., axis][curve.good]
-        unit = ("px", "px", "rad", "")[axis]
-        size = [f"{float(values.square().mean().sqrt()):.3g}" for values in (before, after)]
-        lines.append(f"{name}: {size[0]} {unit} before, {size[1]} {unit} after (root mean square)")
-    return lines

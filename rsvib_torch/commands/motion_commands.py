@@ -373,10 +373,9 @@ def calibrate(given: CalibrateOptions) -> Answer:
     for path, info in zip(paths, infos, strict=True):
         for sentence in io.describe_stack(info, None):
             note(sentence)
-        if info.shape[1:] != infos[0].shape[1:]:
-            raise ValueError(
-                f"{path}: frames of shape {info.shape[1:]}, expected {infos[0].shape[1:]} as in {paths[0]}"
-            )
+        expected = infos[0].shape[1:]
+        if info.shape[1:] != expected:
+            raise ValueError(f"{path}: frames of shape {info.shape[1:]}, expected {expected} as in {paths[0]}")
     with working("reading the frames"):
         stack = torch.cat([io.read_stack(path, full_scale=given.full_scale) for path in paths])
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
@@ -397,7 +396,10 @@ def calibrate(given: CalibrateOptions) -> Answer:
             )
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
-    table = _calibrated_toml(result, given.scan_axis)
+    period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
+    values = {"row_time": result.row_time, "exposure_time": result.exposure_time, **period}
+    values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
+    table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[axis]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
     steps = ["enter the values that are left open"] * (" = \n" in table)
@@ -436,16 +438,3 @@ def _check_given(given: CalibrateOptions) -> None:
         raise ValueError("--by-motion takes one --exposure, that of all frames")
     if given.row_time and len(given.row_time) != 2:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
-
-
-def _calibrated_toml(result: row_time.RowTimeCalibration, scan_axis: str) -> str:
-    """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
-    period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
-    values = {
-        "row_time": result.row_time,
-        "exposure_time": result.exposure_time,
-        **period,
-        "scan_axis": scan_axis,
-        "readout_direction": result.readout_direction,
-    }
-    return sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])

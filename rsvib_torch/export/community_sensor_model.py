@@ -100,16 +100,12 @@ def camera_isd(
     centre = [0.5 * side + offset for side, offset in zip((width, height), camera.principal_point, strict=True)]
     return {
         "name_model": _FRAME,
-        "name_platform": "unknown",
-        "name_sensor": "unknown",
+        **dict.fromkeys(("name_platform", "name_sensor"), "unknown"),
         "image_lines": height,
         "image_samples": width,
-        "center_ephemeris_time": ephemeris_time,
-        "starting_ephemeris_time": ephemeris_time,
-        "detector_sample_summing": 1,
-        "detector_line_summing": 1,
-        "starting_detector_line": 0,
-        "starting_detector_sample": 0,
+        **dict.fromkeys(("center_ephemeris_time", "starting_ephemeris_time"), ephemeris_time),
+        **dict.fromkeys(("detector_sample_summing", "detector_line_summing"), 1),
+        **dict.fromkeys(("starting_detector_line", "starting_detector_sample"), 0),
         "focal2pixel_lines": [0.0, 0.0, 1.0],
         "focal2pixel_samples": [0.0, 1.0, 0.0],
         "focal_length_model": {"focal_length": f},
@@ -395,14 +391,12 @@ def _as_line_scan(
         new = {key: np.broadcast_to(value, (len(times), value.shape[-1])).tolist() for key, value in values.items()}
         return kept | new | {"ephemeris_times": times.tolist()}
 
+    found |= dict.fromkeys(("t0_ephemeris", "t0_quaternion"), float(first - centre))
+    found |= dict.fromkeys(("dt_ephemeris", "dt_quaternion"), float(duration))
     found |= {
         "name_model": _LINE_SCAN,
         "starting_ephemeris_time": float(times[_PADDING] - 0.5 * duration),
         "line_scan_rate": [[0.5, float(times[_PADDING] - centre - 0.5 * duration), float(duration)]],
-        "t0_ephemeris": float(first - centre),
-        "dt_ephemeris": float(duration),
-        "t0_quaternion": float(first - centre),
-        "dt_quaternion": float(duration),
         "starting_detector_line": 0,
         "detector_center": {"line": float(-camera.offset[0]), "sample": float(camera.centre[1])},
         "instrument_pointing": states("instrument_pointing", times, quaternions=pointing),
