@@ -291,7 +291,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         step = self._recording_length(params)
         return Vibration(**{name: value[::step] for name, value in drawn.items()}, camera=None)
 
-    def compute_transformation(self, input: Tensor, params: Parameters, flags: Table) -> Tensor:
+    def compute_transformation(self, input: Tensor, *_: Any, **__: Any) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
         return self.identity_matrix(input)
 
@@ -308,26 +308,20 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         moved = self._motion(params, images).move_images(images, flags["interpolation"])
         return frames_from_row_order(moved, self.timing)
 
-    def apply_transform_mask(
-        self, input: Tensor, params: Parameters, flags: Table, transform: Tensor | None = None
-    ) -> Tensor:
+    def apply_transform_mask(self, input: Tensor, params: Parameters, *_: Any, **__: Any) -> Tensor:
         """Move masks (B, C, H, W) to the nearest pixel."""
         if input.numel() == 0:
             return input
         masks = frames_to_row_order(input, self.timing)
         return frames_from_row_order(self._motion(params, masks).move_masks(masks), self.timing)
 
-    def apply_transform_keypoint(
-        self, input: Keypoints, params: Parameters, flags: Table, transform: Tensor | None = None
-    ) -> Keypoints:
+    def apply_transform_keypoint(self, input: Keypoints, params: Parameters, *_: Any, **__: Any) -> Keypoints:
         """Move keypoints to their positions in the frame."""
         output = input.clone()
         output._data = self._moved(input.data, params, (2,), ImageMotion.move)
         return output
 
-    def apply_transform_box(
-        self, input: Boxes, params: Parameters, flags: Table, transform: Tensor | None = None
-    ) -> Boxes:
+    def apply_transform_box(self, input: Boxes, params: Parameters, *_: Any, **__: Any) -> Boxes:
         """Return the smallest upright boxes around the moved content of the boxes."""
         output = input.clone()
         output._data = self._moved(input.data, params, (4, 2), ImageMotion.move_boxes)

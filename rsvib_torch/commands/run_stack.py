@@ -150,9 +150,8 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
             answer = answers.stack_answer(frames, found, given.pixel_size, restoration, info.shape[0])
             more, steps = [], answers.steps_after_detection(found, frames, settings)
         else:
-            names += written.write_windows(folder, out / "manifest.json", given.pixel_size)
             stored = stacks.read_manifest(out / "manifest.json")
-            written.warn_of_failures(stored)
+            names += written.write_windows(folder, stored, given.pixel_size)
             answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     if result.restored:
         steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
@@ -213,7 +212,7 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
 
     drawn = written.draw_safely(out / "before_after.png", comparison)
     with whole_folder(out) as folder:
-        names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, manifest, given.pixel_size)]
+        names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, stored, given.pixel_size)]
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         warn(f"{bad} could not be used and repeat the frame before: see manifest.json")

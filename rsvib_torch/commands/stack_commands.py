@@ -181,32 +181,28 @@ def detect(given: DetectOptions) -> Answer:
             result = _detect(stack, settings)
             may_change = windows.get("follow") is not False and stacks.may_change(result, count)
         if many or may_change:
-            manifest = _detect_windows(given, info, folder, windows)
-            found = stacks.read_manifest(manifest).detections()
+            stored = _detect_windows(given, info, folder / "manifest.json", windows)
+            found = stored.detections()
             reliable = sum(0.0 if one is None else float(one.reliable.sum()) for one in found) / len(found)
             if result is not None and not reliable > float(result.reliable.sum()):
-                manifest.unlink()  # a steady vibration of all frames is known as well
+                (folder / "manifest.json").unlink()  # a steady vibration of all frames is known as well
             else:
                 result = None
         if result is not None:
             names = written.write_detection(folder, result, stack.timing, given.pixel_size)
+            answer = answers.stack_answer(frames, result, given.pixel_size)
+            answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
         else:
-            names = [*written.write_windows(folder, manifest, given.pixel_size), "manifest.json"]
+            names = [*written.write_windows(folder, stored, given.pixel_size), "manifest.json"]
+            title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
+            answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
+            if any(record.followed is not None for record in stored.windows):
+                run = ("run", frames, out / "restored", *settings.arguments)
+                follow = ["--follow"] * (windows.get("follow") is True)
+                answer.next_steps.append(answers.next_step("restore the frames", *run, *follow))
+            else:
+                answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     written.remove_old(out, (*written.OF_DETECTION, *written.OF_WINDOWS), names)
-    if result is not None:
-        answer = answers.stack_answer(frames, result, given.pixel_size)
-        answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
-    else:
-        stored = stacks.read_manifest(out / "manifest.json")
-        written.warn_of_failures(stored)
-        title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
-        answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
-        if any(record.followed is not None for record in stored.windows):
-            run = ("run", frames, out / "restored", *settings.arguments)
-            follow = ["--follow"] * (windows.get("follow") is True)
-            answer.next_steps.append(answers.next_step("restore the frames", *run, *follow))
-        else:
-            answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     answer.files += [out / name for name in names]
     return answer
 
@@ -215,21 +211,15 @@ def detect(given: DetectOptions) -> Answer:
 _LONG = 256
 
 
-def _detect_windows(given: DetectOptions, info: io.StackInfo, folder: Path, windows: Table) -> Path:
-    """Detect the vibration in the windows of a stack; the ``manifest.json`` in a folder."""
-    settings, frames, manifest = given.settings, given.stack, folder / "manifest.json"
+def _detect_windows(given: DetectOptions, info: io.StackInfo, manifest: Path, windows: Table) -> stacks.StackManifest:
+    """Detect the vibration in the windows of a stack, and write the manifest."""
+    settings, frames = given.settings, given.stack
+    scale = shared.full_scale_of(frames, info, settings, given.full_scale)
+    common: Table = {"full_scale": scale, "device": str(given.torch_device)}
+    common["detection"] = None if windows.get("follow") is True else settings.detection
     with working(f"detecting in {frames.name}", counts=True) as progress:
-        stacks.detect_stack(
-            frames,
-            manifest,
-            settings.timing,
-            **windows,
-            detection=None if windows.get("follow") is True else settings.detection,
-            full_scale=shared.full_scale_of(frames, info, settings, given.full_scale),
-            device=str(given.torch_device),
-            progress=progress,
-        )
-    return manifest
+        stacks.detect_stack(frames, manifest, settings.timing, **windows, **common, progress=progress)
+    return stacks.read_manifest(manifest)
 
 
 @options

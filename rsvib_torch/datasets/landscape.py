@@ -52,13 +52,8 @@ def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6
     """Draw towns and fields from above, with Gaussian optics: float32 (height, width) with values in 0 ... 1.
 
     Fractal ground in districts of different direction: fields with furrows and hedges, streets with rows of small
-    gabled buildings and their shadows, larger works, woods, country roads and a river.
-
-    Args:
-        height: Rows, at least 64.
-        width: Columns, at least 64.
-        seed: Seed of everything random.
-        sigma: Blur of the optics in px (Gaussian, pixel area included).
+    gabled buildings and their shadows, larger works, woods, country roads and a river. The optics blur by ``sigma`` px
+    (Gaussian, pixel area included).
 
     Example:
         >>> scene = city_and_fields(128, 96, seed=3)

@@ -53,7 +53,7 @@ def write_gcsv(
 
     Args:
         path: The file to write; an existing file is replaced.
-        motion: One motion with a camera, in image axes.
+        motion: One motion with a camera, in image axes, without zoom.
         timing: The sensor.
         size: (height, width) of the frames.
         num_frames: Number of frames; the samples cover their exposures.

@@ -86,16 +86,8 @@ def write_stmap(
     ``((x + 0.5) / width, (height - 0.5 - y) / height)``, for ``"opencv"`` in px from the centre of the first pixel, as
     ``cv2.remap`` uses it (docs/export.md). The third channel is 1 where it lies in the recorded frame, else 0.
 
-    Args:
-        folder: Folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ...; it is created, files of these names are replaced.
-        motion: One motion, in image axes.
-        timing: The sensor.
-        size: (height, width) of the frames.
-        num_frames: Number of frames.
-        convention: ``"nuke"`` or ``"opencv"``.
-
-    Returns:
-        The files.
+    The folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ... is created, and files of these names are replaced; their
+    paths are returned. Other arguments are those of ``sampling_map``.
 
     Example:
         >>> import tempfile

@@ -32,16 +32,8 @@ _MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a min
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
-    Damage of single frames is detected when they are read.
-
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        An object with ``info``, ``frame(index)`` and ``close()``.
-
-    Raises:
-        ValueError: If it is not a readable stack.
+    The path is as in ``read_stack``. The result has ``info``, ``frame(index)`` and ``close()``; damage of single frames
+    is detected when they are read.
 
     Example:
         >>> reader = open_stack("frames.tif")  # doctest: +SKIP

@@ -365,23 +365,18 @@ class Sound:
 
     def __init__(self, output: Any, source: Any) -> None:
         streams = source.streams.audio if source is not None else ()
-        added = {stream: output.add_stream_from_template(stream) for stream in streams}
-        self._output, self._packets = output, _packets(source, added)
+        self._output, self._added = output, {stream: output.add_stream_from_template(stream) for stream in streams}
+        packets = source.demux(*self._added) if self._added else ()
+        # the last packet of a stream is empty
+        self._packets = (packet for packet in packets if packet.dts is not None and packet.pts is not None)
         self._next = next(self._packets, None)
 
     def write(self, until: Fraction | None = None) -> None:
         """Write the packets up to a time in s, because players read sound and frames together; None for all."""
         while self._next is not None and (until is None or self._next.pts * self._next.time_base <= until):
+            self._next.stream = self._added[self._next.stream]
             self._output.mux(self._next)
             self._next = next(self._packets, None)
-
-
-def _packets(source: Any, streams: dict[Any, Any]) -> Iterator[Any]:
-    """Packets of the streams of ``source``, for the streams of the output that belong to them."""
-    for packet in source.demux(*streams) if streams else ():
-        if packet.dts is not None and packet.pts is not None:  # the last packet of a stream is empty
-            packet.stream = streams[packet.stream]
-            yield packet
 
 
 def open_source(info: StackInfo, opened: ExitStack) -> Any:

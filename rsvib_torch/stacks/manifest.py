@@ -108,8 +108,8 @@ class StackManifest(Result, file_format="rsvib stack"):
             if record.followed is not None and record.detection is not None:
                 found = [(frame, record.detection[number]) for number, frame in enumerate(record.followed)]
             for frame, detection in found:
-                ends = (record.first, record.last) if record.middle is None else (record.middle, record.middle)
-                ends = ends if frame is None else (frame, frame)
+                one = record.middle if frame is None else frame
+                ends = (record.first, record.last) if one is None else (one, one)
                 middle = None if starts is None else 0.5 * (starts[ends[0]] + starts[ends[1]]) + half_frame
                 yield record, frame, detection, middle
 
