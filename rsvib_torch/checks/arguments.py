@@ -69,12 +69,6 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
     Stated are the axes: a size; a name for a size of at least 1 that is the same in all tensors, with its limits if
     there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
     or none. ``...`` alone, for values that are not tensors, is not checked; None is omitted.
-
-    Example:
-        >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
-        Traceback (most recent call last):
-        ...
-        ValueError: scene must have shape (..., H, W), got (3,)
     """
     known: dict[str, Any] = {}
     for name, stated in shapes.items():

@@ -22,12 +22,6 @@ def as_tensor(name: str, value: object) -> Tensor:
 
     The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays and arrays with negative
     strides or foreign byte order (FITS and TIFF files) are copied.
-
-    Example:
-        >>> as_tensor("frames", np.arange(3, dtype=">u2")[::-1]).tolist()
-        [2, 1, 0]
-        >>> as_tensor("frames", [torch.zeros(4, 5), torch.ones(4, 5)]).shape
-        torch.Size([2, 4, 5])
     """
     if isinstance(value, Tensor):
         return check_tensor(name, value)

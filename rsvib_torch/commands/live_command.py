@@ -113,8 +113,7 @@ def live_session(given: LiveOptions) -> Answer:
     method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
-    drops = given.file is None or given.realtime
-    source = _source(given, settings)
+    drops, source = given.file is None or given.realtime, _source(given, settings)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs = _outputs(given, settings, stream)
         shown = [output for output in outputs if isinstance(output, video.PageOutput)]

@@ -46,12 +46,7 @@ def _with_unit(text: str, units: Mapping[str, int], expected: str) -> float:
 
 
 def seconds(text: str) -> float:
-    """A time in seconds: a number or a fraction, with or without a unit.
-
-    Example:
-        >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
-        (1.45e-05, 0.002, 2e-05)
-    """
+    """A time in seconds: a number or a fraction, with or without a unit."""
     return _with_unit(text, _TIME_UNITS, "a time such as 14.5us, 1/500 or 2e-5 (in s)")
 
 

@@ -26,12 +26,8 @@ def resolution_chart(
     rings, stars and textured grey steps between them, on paper with a fine grain. Edges are error functions of the
     distance, without aliasing at any size. The result is float32 (height, width) with values in 0 ... 1.
 
-    Args:
-        height: Rows, at least 64.
-        width: Columns, at least 64.
-        sigma: Blur of the optics in px (Gaussian, pixel area included).
-        seed: Seed of the grain and texture.
-        field: px, approximate size of a field of the chart, at least 32.
+    The optics blur by ``sigma`` px (Gaussian, pixel area included); ``seed`` is that of grain and texture, and ``field``
+    the approximate size of a field of the chart in px.
 
     Example:
         >>> chart = resolution_chart(256, 320)

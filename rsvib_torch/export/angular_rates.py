@@ -51,13 +51,8 @@ def write_gcsv(
     sample lies at or before time 0. Gyroflow dates a frame at the middle of its readout, so that its synchronisation
     finds an offset of half of ``frame_readout_time`` plus half of the exposure time.
 
-    Args:
-        path: The file to write; an existing file is replaced.
-        motion: One motion with a camera, in image axes, without zoom.
-        timing: The sensor.
-        size: (height, width) of the frames.
-        num_frames: Number of frames; the samples cover their exposures.
-        sample_rate: Samples per second; by default as stated above.
+    The motion, in image axes, needs a camera and must not zoom. The samples cover the exposures of ``num_frames`` frames
+    of a ``size`` (height, width).
 
     Example:
         >>> import tempfile

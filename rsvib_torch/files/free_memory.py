@@ -9,12 +9,7 @@ import psutil
 
 
 def size_text(count: int) -> str:
-    """A number of bytes with its unit.
-
-    Example:
-        >>> size_text(6_300_000_000), size_text(96_000)
-        ('6.3 GB', '96 KB')
-    """
+    """A number of bytes with its unit."""
     for unit, factor in (("GB", 10**9), ("MB", 10**6)):
         if count >= factor:
             return f"{count / factor:.3g} {unit}"

@@ -214,14 +214,7 @@ _RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
 
 def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
-    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them.
-
-    Example:
-        >>> split_range(Path("clip.mp4[100:200]"))
-        (PosixPath('clip.mp4'), (100, 200))
-        >>> split_range(Path("clip.mp4"))
-        (PosixPath('clip.mp4'), None)
-    """
+    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them."""
     found = _RANGE.fullmatch(path.name)
     if found is None or path.exists():
         return path, None
