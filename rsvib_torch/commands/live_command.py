@@ -126,32 +126,19 @@ def live_session(given: LiveOptions) -> Answer:
                 check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
                 video.save_spectrogram(given.spectrogram, spectrogram)
 
-        tracker = tracking.VibrationTracker(
-            settings.timing,
-            **restoration | given.tracker | {"method": method},
-            steady=given.steady,
-            wobble=given.steady > 0,
-            full_scale=source.full_scale if given.full_scale is None or given.file else given.full_scale,
-            channels="first",
-        )
-        report = video.run_live(
-            source,
-            tracker,
-            outputs,
-            border=video.VideoBorder(given.border),
-            drops=drops,
-            waiting=given.waiting,
-            max_frames=given.num_frames,
-            spectrogram=spectrogram,
-            progress=_state_text(shown[0]) if shown else None,
-            save=save,
-        )
+        chosen: Table = restoration | given.tracker | {"method": method, "channels": "first"}
+        scale = source.full_scale if given.full_scale is None or given.file else given.full_scale
+        steadied: Table = {"steady": given.steady, "wobble": given.steady > 0}
+        tracker = tracking.VibrationTracker(settings.timing, **chosen, **steadied, full_scale=scale)
+        limits: Table = {"drops": drops, "waiting": given.waiting, "max_frames": given.num_frames}
+        progress = _state_text(shown[0]) if shown else None
+        sinks: Table = {"spectrogram": spectrogram, "progress": progress, "save": save}
+        border = video.VideoBorder(given.border)
+        report = video.run_live(source, tracker, outputs, border=border, **limits, **sinks)
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
-    missing = {
-        "dropped, because processing was too slow (fewer --columns)": report.dropped,
-        "not delivered by the source": report.lost,
-    }
+    slow = "dropped, because processing was too slow (fewer --columns)"
+    missing = {slow: report.dropped, "not delivered by the source": report.lost}
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
@@ -173,8 +160,6 @@ def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
 
 def _check_options(given: LiveOptions) -> None:
     """Refuse options that do not go with the source."""
-    if given.source == "-" and given.size is None:
-        raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
     if given.source != "-" and given.size is not None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
     if given.realtime and given.file is None:
@@ -240,9 +225,8 @@ def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: 
     if report.predicted:
         lines.append(f"{number_of(report.predicted, 'late frame')} predicted instead of measured")
     if drops:
-        lines.append(
-            f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames"
-        )
+        delay = f"delay: {report.latency(0.5)} frame periods in the median"
+        lines.append(f"{delay}, {report.latency(0.99)} in 99 % of the frames")
     found = report.detection
     names = ("frames", "tracked", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
     delays = {"delay_median": 0.5, "delay_99": 0.99}

@@ -116,15 +116,10 @@ def simulate(given: SimulateOptions) -> Answer:
     dtype = "float32" if scale is None else "uint8" if scale <= 255 else "uint16"
     io.check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
     with working("simulating the frames"):
-        simulated = imaging.simulate_frames(
-            image[0].to(target),
-            settings.timing,
-            vibration,
-            simulation.num_frames,
-            frame_size=simulation.frame_size,
-            noise=simulation.noise,
-            generator=torch.Generator(target).manual_seed(simulation.seed if given.seed is None else given.seed),
-        )
+        generator = torch.Generator(target).manual_seed(simulation.seed if given.seed is None else given.seed)
+        form: Table = {"frame_size": simulation.frame_size, "noise": simulation.noise, "generator": generator}
+        still, count = image[0].to(target), simulation.num_frames
+        simulated = imaging.simulate_frames(still, settings.timing, vibration, count, **form)
     with working(f"writing {frames}"):
         stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)

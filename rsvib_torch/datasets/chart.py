@@ -26,7 +26,7 @@ def resolution_chart(
     rings, stars and textured grey steps between them, on paper with a fine grain. Edges are error functions of the
     distance, without aliasing at any size. The result is float32 (height, width) with values in 0 ... 1.
 
-    The optics blur by ``sigma`` px (Gaussian, pixel area included); ``seed`` is that of grain and texture, and ``field``
+    The optics blur by ``sigma`` px (Gaussian, pixel area included); ``seed`` is that of grain and texture; ``field`` is
     the approximate size of a field of the chart in px.
 
     Example:

@@ -51,8 +51,8 @@ def write_gcsv(
     sample lies at or before time 0. Gyroflow dates a frame at the middle of its readout, so that its synchronisation
     finds an offset of half of ``frame_readout_time`` plus half of the exposure time.
 
-    The motion, in image axes, needs a camera and must not zoom. The samples cover the exposures of ``num_frames`` frames
-    of a ``size`` (height, width).
+    The motion, in image axes, needs a camera and must not zoom. The samples cover the exposures of ``num_frames``
+    frames of a ``size`` (height, width).
 
     Example:
         >>> import tempfile
