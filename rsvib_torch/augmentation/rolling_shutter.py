@@ -59,8 +59,7 @@ class ImageMotion:
     def trajectory(self) -> tuple[Tensor, Tensor]:
         """Components (B, R, N, A) at the Gauss-Legendre nodes of the exposures of rows, and weights (N,)."""
         rows = torch.arange(self.size[0], dtype=torch.float64, device=self.starts.device)
-        starts = self.starts[:, None] + rows * self.timing.row_time
-        motion = self.vibration
+        starts, motion = self.starts[:, None] + rows * self.timing.row_time, self.vibration
         if self.turns:  # the last column moves farthest
             last = torch.full((1,), 0.5 * self.size[1], dtype=torch.float64, device=starts.device)
             motion = ColumnMotion.of_columns(motion, last, self.timing, 1, self.size[0])
@@ -81,10 +80,8 @@ class ImageMotion:
         for _ in range(8):
             residual = points[..., 1] + displacement_at(self.mean_displacement(rows), x, y)[..., 1] - rows
             starts = self.starts[:, None] + rows * self.timing.row_time
-            begin, end = (
-                displacement_at(_with_turns(self.vibration.displacement(times)), x, y)[..., 1].detach()
-                for times in (starts, starts + exposure)
-            )
+            components = (_with_turns(self.vibration.displacement(times)) for times in (starts, starts + exposure))
+            begin, end = (displacement_at(at_time, x, y)[..., 1].detach() for at_time in components)
             slope = (end - begin) * self.timing.row_time / exposure
             rows = rows + residual / (1.0 - slope).clamp(min=0.1)
         return torch.stack([points[..., 0] + displacement_at(self.mean_displacement(rows), x, y)[..., 0], rows], -1)
@@ -132,9 +129,8 @@ class ImageMotion:
         right, down = columns - x - middle_x, rows[:, None] - y - middle_y
         size = scale.square() + roll.square()
         right, down = (scale * right + roll * down) / size + middle_x, (scale * down - roll * right) / size + middle_y
-        source_rows, source_columns = (
-            mirrored(place.round().to(torch.int64), length) for place, length in ((down, R), (right, W))
-        )
+        places = (mirrored(place.round().to(torch.int64), length) for place, length in ((down, R), (right, W)))
+        source_rows, source_columns = places
         index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, masks.shape[1], -1)
         return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
 
@@ -148,9 +144,8 @@ class ImageMotion:
         count = int((high - low)[..., 1].amax().ceil()) + 2
         steps = torch.linspace(0.0, 1.0, count, dtype=boxes.dtype, device=boxes.device)
         side_rows = low[..., 1, None] + (high - low)[..., 1, None] * steps  # (B, N, S), at most one row apart
-        sides = torch.stack(
-            [torch.stack([x[..., None].expand_as(side_rows), side_rows], -1) for x in (low[..., 0], high[..., 0])], -3
-        )
+        columns = (x[..., None].expand_as(side_rows) for x in (low[..., 0], high[..., 0]))
+        sides = torch.stack([torch.stack([of_side, side_rows], -1) for of_side in columns], -3)
         moved = self.move(sides.flatten(1, -2)).reshape(sides.shape).flatten(2, 3)
         lowest, highest = moved.amin(-2)[..., None, :], moved.amax(-2)[..., None, :]
         is_high = boxes == high[..., None, :]  # per corner and coordinate

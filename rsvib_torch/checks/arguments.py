@@ -128,9 +128,8 @@ def check_pixels(name: str, pixels: Tensor) -> None:
         raise ValueError(f"{name} must be finite, but pixel {pixel} is {pixels[pixel].item()}")
     largest = float(ends.abs().max())
     if largest > MAX_NUMBER:
-        raise ValueError(
-            f"{name} reach {largest:.3g}, at most {MAX_NUMBER:g} is possible: divide them by their full scale"
-        )
+        problem = f"reach {largest:.3g}, at most {MAX_NUMBER:g} is possible"
+        raise ValueError(f"{name} {problem}: divide them by their full scale")
 
 
 def check_broadcast(**tensors: object) -> None:

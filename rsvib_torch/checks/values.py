@@ -90,6 +90,5 @@ def needed_package(name: str, purpose: str, extra: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
             raise
-        raise ModuleNotFoundError(
-            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
-        ) from error
+        needed = f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]"
+        raise ModuleNotFoundError(needed, name=error.name) from error

@@ -89,9 +89,7 @@ def export(given: ExportOptions) -> Answer:
     data: Table = {"format": chosen}
     if chosen == "isd":
         if given.camera_isd is None:
-            raise ValueError(
-                "isd needs the ISD of the camera at rest: give --isd FILE; camera_isd of Python builds one"
-            )
+            raise ValueError("isd needs the ISD of the camera at rest: give --isd FILE; camera_isd builds one")
         found = read_json(given.camera_isd, "ISD")
         rows = found.get("image_lines")
         motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)

@@ -299,10 +299,8 @@ def check_new(
     check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
-        found = f"{existing[0].parent}: {', '.join(path.name for path in existing)}"
-        raise FileExistsError(
-            f"results exist already in {found}; choose another name, or replace them with --overwrite"
-        )
+        found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
+        raise FileExistsError(f"{found}; choose another name, or replace them with --overwrite")
 
 
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:

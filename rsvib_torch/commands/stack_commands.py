@@ -104,9 +104,7 @@ def simulate(given: SimulateOptions) -> Answer:
     settings, frames, scene = given.settings_for(None), given.frames, given.scene
     shared.check_new(io.stack_files(frames), given.overwrite, [*io.stack_files(scene), settings.path])
     if settings.simulation is None:
-        raise ValueError(
-            f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
-        )
+        raise ValueError(f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames")
     simulation, target = settings.simulation, given.torch_device
     vibration = simulation.vibration.to_vibration()
     image = io.read_stack(scene, full_scale=given.full_scale)

@@ -142,17 +142,11 @@ def write_isd(
     * ``"line-scan"``: a line scanner with one quaternion per row, whose rows have the rays of one line of the sensor:
       for narrow fields of view, and for rows read from top to bottom.
 
-    Args:
-        path: The file to write; an existing file is replaced, but not that of ``isd``.
-        motion: One motion, in image axes. A camera is not required; if it has one, its focal length must be that of
-            the ISD.
-        timing: The sensor, with image rows as rows.
-        isd: The ISD of the camera as a mapping or JSON file, or that of ``camera_isd``. Fields that do not concern the
-            motion are kept. Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used,
-            which becomes the middle of the frame.
-        frame: Number of the frame.
-        model: ``"frame"``, ``"line-scan"``, or ``"auto"`` for the first of them that is accurate enough.
-        tolerance: Largest error of a position in px, in both directions between image and ground.
+    The motion, in image axes, needs no camera; if it has one, its focal length must be that of the ISD. ``isd`` is that
+    of the camera as a mapping or JSON file, or that of ``camera_isd``; fields that do not concern the motion are kept.
+    Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used, which becomes the middle
+    of the frame. ``model="auto"`` is the first that is accurate enough; ``tolerance`` is the largest error of a
+    position in px, in both directions between image and ground.
 
     Returns:
         The model that was written. An error states why no permitted model is accurate enough.
@@ -257,9 +251,7 @@ class _Camera:
         value: Any = self.isd
         for name in names:
             if not isinstance(value, Mapping) or name not in value:
-                raise ValueError(
-                    f"{self.source}: {'.'.join(names)}: missing key of an ISD; camera_isd builds a complete one"
-                )
+                raise ValueError(f"{self.source}: {'.'.join(names)}: missing key of an ISD; camera_isd builds one")
             value = value[name]
         return validated(f"{self.source}: {'.'.join(names)}", value, TypeAdapter(kind, config={"strict": True}), kind)
 

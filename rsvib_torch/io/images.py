@@ -178,9 +178,8 @@ def open_images(path: Path) -> BlockReader:
         if first is None:
             first = (info, file)
         if replace(info, resolution=first[0].resolution, frame_times=first[0].frame_times) != first[0]:
-            raise ValueError(
-                f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
-            )
+            kinds = f"{first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
+            raise ValueError(f"frames of different size or kind: {kinds}")
     if first is None or len(damaged) > len(files) // 2:
         raise next(iter(damaged.values()))
     of_files = [info.metadata for info in infos if info is not None]
@@ -264,6 +263,5 @@ def check_folder(path: Path, info: StackInfo) -> None:
         others = images - set(_frame_names(info))
         if others:
             kind = next(kind for kind, endings in _KINDS.items() if Path(min(others)).suffix.lower() in endings)
-            raise ValueError(
-                f"{path}: the folder contains other {kind} files, e.g. {min(others)}; choose another folder"
-            )
+            found = f"other {kind} files, e.g. {min(others)}"
+            raise ValueError(f"{path}: the folder contains {found}; choose another folder")

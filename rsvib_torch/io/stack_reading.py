@@ -85,7 +85,6 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
 
     Raises:
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
         ValueError: If it is damaged, its frames differ in size, the full scale is unknown or exceeded, or the frames do
             not fit into the free memory.
 

@@ -260,19 +260,15 @@ class Result(Summarised):
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
         """The result as columns by name, with the unit in each name; None for unknown values.
 
-        ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file.
-
-        Args:
-            pixel_size: Size of a pixel in m, in the plane in which the motion is wanted (sensor or object); columns in
-                um, um/s and m/s^2 are added then.
+        ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file. With the size of a pixel in m, in the plane
+        in which the motion is wanted (sensor or object), columns in um, um/s and m/s^2 are added.
         """
         raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
 
     def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
         """``table`` as a ``pandas.DataFrame``; missing values are NaN."""
-        frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
-            self.table(pixel_size=pixel_size)
-        )
+        package = needed_package("pandas", "to_pandas", "tables")
+        frame: pandas.DataFrame = package.DataFrame(self.table(pixel_size=pixel_size))
         return frame
 
     def to_xarray(self) -> "xarray.Dataset":

@@ -54,9 +54,7 @@ class Reason:
         try:
             str(self)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"value, limit or details of the reason {quoted(self.code)} do not fit its text"
-            ) from error
+            raise ValueError(f"value, limit or details of {quoted(self.code)} do not fit its text") from error
 
     @property
     def kind(self) -> ReasonKind:

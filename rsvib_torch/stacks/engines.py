@@ -89,9 +89,8 @@ def _wait(client: Any, future: Any, window: Window) -> Any:
             if client.scheduler_info(n_workers=-1)["workers"]:
                 last_seen = time.monotonic()
             elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
-                raise OSError(
-                    f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
-                ) from None
+                gone = f"no Dask workers for {NO_WORKERS_SECONDS:g} s"
+                raise OSError(f"{gone}; start workers, and resume the run") from None
         except distributed.KilledWorker as error:
             raise OSError(
                 f"Dask workers died {error.allowed_failures + 1} times while they computed window {window.index} "
