@@ -185,14 +185,8 @@ def known(given: KnownOptions) -> Answer:
         results["Motion of the frames"], data["check"] = [check.summary()], _without_curve(check)
     # 3. Restoration in windows.
     counts = info.shape[0] > 8
-    of_run: Table = {
-        "restoration": options,
-        "full_scale": scale,
-        "force": given.force,
-        "device": str(given.torch_device),
-    }
+    of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed, "manifest": manifest}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
-    of_run |= {"motion": placed, "manifest": manifest}
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
         show = progress if counts else None
         run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=show)

@@ -105,7 +105,7 @@ def run(given: RunOptions) -> Answer:
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
-    common = {"full_scale": scale, "restoration": restoration, "device": str(given.torch_device)}
+    common = given.of_stack(scale, restoration)
     # videos of more than one window are followed from frame to frame
     if given.moved or (is_video and info.shape[0] > chosen.window):
         answer = _run_followed(given, out / output, common)

@@ -206,6 +206,10 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
         """Files that are read."""
         return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
 
+    def of_stack(self, scale: float | None, restoration: Table) -> Table:
+        """Options that the functions for stacks have in common."""
+        return {"full_scale": scale, "restoration": restoration, "device": str(self.torch_device)}
+
     def planned_restoration(self, given: Mapping[str, Any] | None = None) -> "tuple[StackInfo, float | None, Table]":
         """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
         info = io.read_stack_info(self.stack)

@@ -281,13 +281,8 @@ def _restore_windows(given: RestoreOptions) -> Answer:
         raise ValueError(f"{vibration}: {followed}; repeat rsvib run, or detect the windows (rsvib detect --window 8)")
     info, scale, options = given.planned_restoration(given.restoration)
     print_notes(info, given.settings)
-    common: Table = {
-        "restoration": options,
-        "full_scale": scale,
-        "force": given.force,
-        "device": str(given.torch_device),
-    }
-    common |= {"window": window, "given": manifest.detections()}
+    common = given.of_stack(scale, options) | {"force": given.force, "window": window}
+    common["given"] = manifest.detections()
     with working(f"restoring {given.stack.name}", counts=True) as progress:
         result = stacks.process_stack(given.stack, given.restored, given.settings.timing, **common, progress=progress)
     written.note_lost(given.restored, result.not_kept)
