@@ -56,30 +56,19 @@ WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cann
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WindowResult(Summarised):
-    """One window of a stack, restored.
-
-    Attributes:
-        window: Its position in the stack.
-        indices: Indices of ``frames`` in the stack; empty if all frames were restored jointly as one image.
-        frames: Frames whose full scale is 1, (T, H, W) or (T, C, H, W): restored, or as taken.
-        restored: Whether they are restored.
-        detection: The detection, with the time origin at the window's first frame; a ``FollowedVibration`` of the
-            frames ``indices`` if it was followed from frame to frame; None if it failed.
-        restoration: Details of the restoration; None without a detection.
-        error: Why detection or restoration failed.
-        bad_frames: Frames of ``window.written`` that could not be used, with the reason; they are not in ``frames``.
-        unchanged: Indices of ``frames`` of a restored window that are as taken, because their motion is not known.
-    """
+    """One window of a stack, restored."""
 
     window: Window
-    indices: tuple[int, ...]
-    frames: Tensor
+    indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
+    frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
     restored: bool
+    # with the time origin at the window's first frame; a ``FollowedVibration`` of the frames ``indices`` if it was
+    # followed from frame to frame; None if it failed
     detection: DetectionResult | DetectedVibration | None
-    restoration: RestoredFrames | None
-    error: str | None
-    bad_frames: Mapping[int, str]
-    unchanged: tuple[int, ...] = ()
+    restoration: RestoredFrames | None  # None without a detection
+    error: str | None  # why detection or restoration failed
+    bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
+    unchanged: tuple[int, ...] = ()  # indices of frames of a restored window that are as taken: unknown motion
 
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""

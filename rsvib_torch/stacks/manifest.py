@@ -41,29 +41,17 @@ def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[st
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StackManifest(Result, file_format="rsvib stack"):
-    """Content of ``manifest.json``.
+    """Content of ``manifest.json``."""
 
-    Attributes:
-        input: Name, size and hash of the stack.
-        settings: Sensor and options.
-        versions: Versions of the packages that computed it.
-        output: Name of the output; None for detection only.
-        bad_frames: Index of each frame that could not be used, with the reason.
-        windows: Result of every window.
-        not_kept: Metadata of the input that the output does not contain.
-        margins: px that were cut off the sides of the frames of a video.
-        gyroscope: Of a video whose path is that of a gyroscope: its axes, clock and bias (rad/s), and the focal length
-            (px), as in ``RotationAlignment``.
-    """
-
-    input: dict[str, Any]
-    settings: dict[str, Any]
-    versions: dict[str, Any]
-    output: dict[str, Any] | None
-    bad_frames: dict[str, str]
+    input: dict[str, Any]  # name, size and hash of the stack
+    settings: dict[str, Any]  # sensor and options
+    versions: dict[str, Any]  # of the packages that computed it
+    output: dict[str, Any] | None  # name of the output; None for detection only
+    bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
     windows: tuple[WindowRecord, ...]
-    not_kept: tuple[str, ...] = ()
-    margins: dict[str, int] | None = None
+    not_kept: tuple[str, ...] = ()  # metadata of the input that the output does not contain
+    margins: dict[str, int] | None = None  # px that were cut off the sides of the frames of a video
+    # of a video with the path of a gyroscope: its axes, clock and bias (rad/s), and the focal length (px)
     gyroscope: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
