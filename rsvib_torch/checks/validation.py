@@ -100,17 +100,7 @@ class Extensible:
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
 def options(group: type[_Group]) -> type[_Group]:
-    """Make a class a group of options: a frozen dataclass whose values are checked.
-
-    Example:
-        >>> @options
-        ... class Bands:
-        ...     band_rows: int = Field(default=32, ge=4)
-        >>> Bands(band_rows=2)
-        Traceback (most recent call last):
-        ...
-        ValueError: band_rows must be at least 4, got 2 (int)
-    """
+    """Make a class a group of options: a frozen dataclass whose values are checked."""
 
     def accept_tables(_: type, source: object, handler: Callable[[object], Table]) -> Table:
         schema = handler(source)  # the group can be a table, whose values are not converted nevertheless

@@ -95,8 +95,8 @@ def export(given: ExportOptions) -> Answer:
         motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)
         of_isd: Table = {"frame": given.frame, "model": given.model, "tolerance": given.tolerance}
         written = exports.write_isd(out, motion, timing, found, **of_isd)
-        forms = {"frame": "frame camera with jitter polynomials"}
-        form = forms.get(written, "line scanner with one quaternion per row")
+        frame = "frame camera with jitter polynomials"
+        form = frame if written == "frame" else "line scanner with one quaternion per row"
         data |= {"model": written, "frame": given.frame}
         return Answer({"Sensor model": [f"frame {given.frame} as a {form}"]}, data, [out])
     shape, count = _extent(given)

@@ -148,15 +148,12 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
         caption += ", and one image restored jointly from all frames"
     if pair.scale < 1:
         caption += f", reduced to {100 * pair.scale:.2g} %"
-    if pair.full is not None:
-        part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
-        caption += f". The magnifier shows {part}"
+    if (full := pair.full) is not None:
+        caption += f". The magnifier shows {_region(full.top, full.left, full.height, full.width)}"
     (black, white), (low, high) = pair.levels, PERCENTILES
-    caption += (
-        f". Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles "
-    )
-    caption += f"{low:g} and {high:g}{' of both images' if len(frames) > 1 else ''}."
-    return replace(pair, caption=caption)
+    levels = f"black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} and {high:g}"
+    both = " of both images" if len(frames) > 1 else ""
+    return replace(pair, caption=f"{caption}. Grey levels are stretched: {levels}{both}.")
 
 
 def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
@@ -193,8 +190,8 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
         shift = f"{-moved[0]} px along x and {-moved[1]} px along y"
         caption += f" Frame {first + 1} is moved by {shift}, the uniform motion."
     if len(frames) > 1:
-        caption += " The motion between the input frames is the vibration; it is absent from the restored frames where"
-        caption += " restoration is right."
+        caption += " The motion between the input frames is the vibration"
+        caption += "; it is absent from the restored frames where restoration is right."
     return blink(pairs, names=names, frames=(first, first + 1), caption=caption)
 
 
