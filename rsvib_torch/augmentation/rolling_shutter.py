@@ -65,8 +65,7 @@ class ImageMotion:
             motion = ColumnMotion.of_columns(motion, last, self.timing, 1, self.size[0])
         count = gauss_node_count(motion, float(self.exposure_time.amax()))
         nodes, weights = (tensor.to(starts.device) for tensor in gauss_legendre(count))
-        times = starts[..., None] + nodes * self.exposure_time[:, None, None]
-        return self.vibration.displacement(times), weights
+        return self.vibration.displacement(starts[..., None] + nodes * self.exposure_time[:, None, None]), weights
 
     def mean_displacement(self, rows: Tensor) -> Tensor:
         """Mean components (B, S, 4) over the exposures of frame rows (B, S) (Eq. 2); missing ones are 0."""

@@ -113,8 +113,7 @@ def steps_after_detection(
     """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
     steps = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
-        target = frames.with_name("restored.tif")
-        restore = ("restore", frames, target, *settings.arguments, "--vibration", vibration)
+        restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
     reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):

@@ -188,8 +188,7 @@ def known(given: KnownOptions) -> Answer:
     of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed, "manifest": manifest}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
-        show = progress if counts else None
-        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=show)
+        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=progress if counts else None)
     note_lost(given.restored, run.not_kept)
     stored, first = stacks.read_manifest(manifest), None if run.first is None else run.first.restoration
     if run.windows == 1 and first is not None:

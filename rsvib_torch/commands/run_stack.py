@@ -100,8 +100,7 @@ def run(given: RunOptions) -> Answer:
         output = f"restored{ending if ending in H264 else '.mkv'}"
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    replaces = given.overwrite or "resume" in given.processing
-    written.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
+    written.check_folder(out, _RESULTS, given.overwrite or "resume" in given.processing, given.inputs, out / output)
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})

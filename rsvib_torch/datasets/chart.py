@@ -137,9 +137,8 @@ def _draw_bar_groups(canvas: Canvas, relief: Tensor, centre: _Centre, size: floa
             (canvas, (centre[0] - 0.23 * size, down), reach),
             (canvas.transposed(), (down, centre[0] + 0.23 * size), length * share),
         ):
-            frequency = 0.5 * (count - 0.5) / half
 
-            def coverage(x: Tensor, y: Tensor, f: float = frequency) -> Tensor:
+            def coverage(x: Tensor, y: Tensor, f: float = 0.5 * (count - 0.5) / half) -> Tensor:
                 return bars(x * f + 0.5 * (count - 0.5), f, count, sigma) * _between(y, length, sigma)
 
             board.paint(middle, (reach, length), _INK, coverage)

@@ -92,10 +92,9 @@ def write_gcsv(
         "gscale": repr(_RATE_STEP),
     }
     lines = ["GYROFLOW IMU LOG", *(f"{name},{value}" for name, value in header.items()), "t,gx,gy,gz"]
-    table = np.column_stack([index, counts])
     with whole_file(path) as part, part.open("w", encoding="ascii", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
-        np.savetxt(file, table, fmt="%d", delimiter=",")
+        np.savetxt(file, np.column_stack([index, counts]), fmt="%d", delimiter=",")
 
 
 def _sampled(motion: Motion, first: float, last: float, rate: float) -> tuple[Array, Array, float]:

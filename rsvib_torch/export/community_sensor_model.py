@@ -307,8 +307,7 @@ def _with_jitter(
     rows, target = len(times), 0.5 * (low + high)
     columns = 0.5 * float((high - low).max())  # error of one value for all columns
     step = float(np.abs(np.diff(target, axis=0)).max()) if rows > 1 else 0.0
-    duration = rows * timing.row_time
-    shown = times - 0.5 * timing.exposure_time + duration
+    shown = times - 0.5 * timing.exposure_time + rows * timing.row_time
     power, rest = np.zeros((1, 2)), np.inf
     for degree in range(1, min(_MAX_DEGREE, rows) + 1):
         # the time times a Chebyshev series, which is zero at time 0, as powers of the time from the highest on
@@ -357,8 +356,7 @@ def _as_line_scan(
         return None, reason
     still = Rotation.from_quat(camera.state("instrument_pointing", "quaternions", 4), scalar_first=True)
     if "constant_rotation" in camera.isd["instrument_pointing"]:
-        constant = camera.state("instrument_pointing", "constant_rotation", 9)
-        still = Rotation.from_matrix(constant.reshape(3, 3)) * still
+        still = Rotation.from_matrix(camera.state("instrument_pointing", "constant_rotation", 9).reshape(3, 3)) * still
     # a ray e of row r has the direction still^-1 turned e in the reference frame, and pointing^-1 e in the file
     pointing = (turned.inv() * still).as_quat(scalar_first=True)
     same_side = np.sign((pointing[1:] * pointing[:-1]).sum(1))

@@ -232,8 +232,7 @@ def offset_figure(result: DetectionResult) -> Figure:
     axes = result.vibration.num_axes
     figure, panels = offset_panels(result, range(axes), 6.5 * axes, 6.4)
     for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
-        heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
-        upper.set_title(heading, **_HEADING, pad=36)
+        upper.set_title(f"Offset along {name}" if axis < 2 else f"Offset of {name}", **_HEADING, pad=36)
         text = ",  ".join(tones_text(result, axis))
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
@@ -498,8 +497,7 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str,
     points = points or {}
     highest = 0.5 * max([1, *points.values()])
     frequency = torch.linspace(0, highest, 101, dtype=torch.float64, device="cpu")
-    colours = (_GREY, _X_COLOUR)[-len(curves) :]
-    for colour, (name, edges) in zip(colours, curves.items(), strict=True):
+    for colour, (name, edges) in zip((_GREY, _X_COLOUR)[-len(curves) :], curves.items(), strict=True):
         values = [edge.at(frequency.to(edge.lsf.device) / points.get(name, 1)).cpu() for edge in edges]
         for value in values:
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)

@@ -277,7 +277,6 @@ class StackJob:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
-        restored_frames = None if followed is None else result.restored * len({*followed} - {*result.unchanged})
         return window_record(
             None if restoration is None else restoration.verdict,
             result.bad_frames,
@@ -291,7 +290,7 @@ class StackJob:
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
             followed=followed,
-            restored_frames=restored_frames,
+            restored_frames=None if followed is None else result.restored * len({*followed} - {*result.unchanged}),
         )
 
 
@@ -443,5 +442,4 @@ def restore_block(
     info = StackInfo(stored.shape, stored.dtype.name, scale)
     job = StackJob(Path("frames"), info, timing, scale, detection or {}, options, force=force, device=device)
     window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
-    restored = job.stored(job.compute(window, pixels), pixels).frames
-    return np.moveaxis(np.stack(restored), -3, axis)
+    return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels).frames), -3, axis)

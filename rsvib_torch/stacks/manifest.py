@@ -88,8 +88,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         starts, half_frame = None, 0.0
         if self.settings.get("sensor") is not None:
             timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
-            rows = self.input["shape"][timing.scan_axis]
-            half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+            half_frame = 0.5 * ((self.input["shape"][timing.scan_axis] - 1) * timing.row_time + timing.exposure_time)
             starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
         for record in self.windows:
             found: list[tuple[int | None, DetectedVibration | None]] = [(None, record.detection)]
@@ -332,8 +331,7 @@ def manifest_text(
     windows = list(records)
     bad = {index: reason for record in windows for index, reason in record["bad_frames"].items()}
     stated = {"format": "rsvib stack", "version": 1, **header, "units": _UNITS}
-    content = {**stated, "windows": windows, "bad_frames": bad, "not_kept": list(not_kept), **results}
-    return json_text(content) + "\n"
+    return json_text({**stated, "windows": windows, "bad_frames": bad, "not_kept": list(not_kept), **results}) + "\n"
 
 
 @checks_arguments
