@@ -114,8 +114,7 @@ class ImageMotion:
         x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
         rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]
         across, roll, zoom = components[..., 1:].unbind(-1)
-        y = (rows - 0.5 * (self.size[0] - 1) - across - roll * x) / (1.0 + zoom)
-        return displacement_at(components, x, y)
+        return displacement_at(components, x, (rows - 0.5 * (self.size[0] - 1) - across - roll * x) / (1.0 + zoom))
 
     def move_masks(self, masks: Tensor) -> Tensor:
         """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""

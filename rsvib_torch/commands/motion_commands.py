@@ -173,9 +173,8 @@ def known(given: KnownOptions) -> Answer:
     else:
         placed = recorded.retimed(given.offset)
         starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
-        last = (
-            float(starts[-1] - starts[0]) + info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-        )
+        readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+        last = float(starts[-1] - starts[0]) + readout
         if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
             needed = f"the frames need {given.offset:.6g} to {given.offset + last:.6g} s"
             raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")

@@ -59,8 +59,7 @@ def resolution_chart(
             _draw_wedge(board, centre, side, begin=0.55 * step, length=(min(2, count // 2) - 0.1) * step)
     _draw_border(canvas, rim)
     # grain and texture are proportional to the tone
-    image = canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)
-    return image.clamp(0.0, 1.0)
+    return (canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)).clamp(0.0, 1.0)
 
 
 def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, steps: tuple[int, int]) -> None:

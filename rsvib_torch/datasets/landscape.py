@@ -214,8 +214,7 @@ def _plan_buildings(
     kinds = enumerate(districts.kind.view(-1).tolist())
     plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]
     plan = torch.cat([torch.zeros(0, 8, **FLOAT), *plans])
-    inside = (plan[:, :2] > -40).all(-1) & (plan[:, 0] < width + 40) & (plan[:, 1] < height + 40)
-    return plan[inside]
+    return plan[(plan[:, :2] > -40).all(-1) & (plan[:, 0] < width + 40) & (plan[:, 1] < height + 40)]
 
 
 def _plan_district(

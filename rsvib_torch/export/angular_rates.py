@@ -114,8 +114,7 @@ def _sampled(motion: Motion, first: float, last: float, rate: float) -> tuple[Ar
     # attitude by composition: the errors of the single steps, turned into the first axes, add up
     attitude, step = Rotation.from_rotvec(vector), (counts[1:] + counts[:-1]) * (0.5 * _RATE_STEP / rate)
     wrong = (attitude[:-1].inv() * attitude[1:]).inv() * Rotation.from_rotvec(step)
-    error = np.linalg.norm(np.cumsum(attitude[1:].apply(wrong.as_rotvec()), 0), axis=1).max()
-    return index, counts, float(error)
+    return index, counts, float(np.linalg.norm(np.cumsum(attitude[1:].apply(wrong.as_rotvec()), 0), axis=1).max())
 
 
 def _body_rates(vector: Array, slope: Array) -> Array:

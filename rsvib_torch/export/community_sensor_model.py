@@ -214,8 +214,7 @@ def _displacements(motion: Motion, timing: SensorTiming, size: tuple[int, int], 
     moved = torch.zeros(len(line), _COLUMNS, 2, dtype=torch.float64, device=motion.device)
     for _ in range(_FIXED_POINT_STEPS):  # D belongs to the position at rest, p - D
         moved = displacement_at(components, x - moved[..., 0], y - moved[..., 1], motion.camera).expand_as(moved)
-    times = row * timing.row_time + 0.5 * timing.exposure_time
-    return times.cpu().numpy(), moved.detach().cpu().numpy()
+    return (row * timing.row_time + 0.5 * timing.exposure_time).cpu().numpy(), moved.detach().cpu().numpy()
 
 
 class _Camera:
@@ -228,9 +227,8 @@ class _Camera:
         matrix = np.array([self.value(_Row, f"focal2pixel_{name}") for name in ("lines", "samples")])
         self.offset, self.matrix = matrix[:, 0], matrix[:, 1:]
         if abs(np.linalg.det(self.matrix)) < 1e-12 * np.abs(self.matrix).max() ** 2 or not self.focal_length > 0:
-            raise ValueError(
-                f"{source}: focal2pixel_lines and focal2pixel_samples must be independent, and focal_length positive"
-            )
+            problem = "focal2pixel_lines and focal2pixel_samples must be independent, and focal_length positive"
+            raise ValueError(f"{source}: {problem}")
         self.summing = np.array([self.value(Number, f"detector_{n}_summing") for n in ("line", "sample")])
         self.start = np.array([self.value(Number, f"starting_detector_{n}") for n in ("line", "sample")])
         self.centre = np.array([self.value(Number, "detector_center", n) for n in ("line", "sample")])

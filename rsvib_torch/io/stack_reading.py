@@ -124,11 +124,9 @@ def _read_pixels(
             joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
             frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
             pixel_bytes = (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
-            check_fits(
-                f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
-                pixel_bytes + frame_bytes + info.decoding_bytes,
-                "process the stack in windows (iterate_stack, process_stack, rsvib run)",
-            )
+            what = f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px"
+            remedy = "process the stack in windows (iterate_stack, process_stack, rsvib run)"
+            check_fits(what, pixel_bytes + frame_bytes + info.decoding_bytes, remedy)
             pixels = np.empty(info.shape, dtype)
             advance = steps(len(pixels), "frames")
             for index in range(len(pixels)):

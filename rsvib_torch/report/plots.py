@@ -281,8 +281,7 @@ def windows_figure(
                 margin = max(0.15 * (high - low), 0.002 * abs(high))
                 panel.set_ylim(low - margin, high + margin)
             panel.ticklabel_format(axis="y", useOffset=False)
-            first = quantity == "amplitude"
-            label, heading = ("", f"Tones along {name}") if first else (time_label, "")
+            label, heading = ("", f"Tones along {name}") if quantity == "amplitude" else (time_label, "")
             plain_axes(panel, label, f"{quantity} ({unit})", heading=heading)
     _legend_below(
         figure,
@@ -406,9 +405,8 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
     if labels:
         upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
-    upper.set_ylim(0, 2.4)
+    upper.set(xlim=(0, highest), ylim=(0, 2.4))
     lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
-    upper.set_xlim(0, highest)
     plain_axes(upper, y="offset gain (px per px)")
     plain_axes(lower, "frequency (Hz)", "amplitude (px)")
     return figure

@@ -160,15 +160,15 @@ _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2
 _px = partial(ReasonKind, unit="px")
 _of_result = partial(ReasonKind, refuses="the result")
 _px_of_result = partial(_px, refuses="the result")
+_of_all_axes = partial(ReasonKind, refuses="all axes")
 
 _TONES = {
-    "rows_not_registered": ReasonKind(
+    "rows_not_registered": _of_all_axes(
         "only {value:.0%} of {what} can be registered, {limit:.0%} are needed: the motion is beyond the search range, "
         "or the frames lack detail or show different scenes",
         "increase search",
         "fraction of the visible rows or bands that were registered and of the registered bands that correlate more "
         "than independent noise, below 0.5",
-        refuses="all axes",
     ),
     "no_tone": ReasonKind(
         "no significant tone: the offsets are those of a uniform motion, or below their noise",
@@ -254,13 +254,12 @@ _TONES = {
         "select a part of the frame with one distance",
         "with roll or zoom: rms difference between strips of columns, above 0.035 px and 0.9 % of the rms offsets",
     ),
-    "blur_contradicts_exposure": ReasonKind(
+    "blur_contradicts_exposure": _of_all_axes(
         "the difference of the blur between frames is {value:.2g} times the value expected for an exposure of "
         "{exposure_rows:g} rows, the limit is {limit:g}",
         "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
         "determine the motion",
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
-        refuses="all axes",
     ),
     "bands_unexplained": _px(
         "the fit does not explain the offset curve: mean residual {value:.3g} px, {limit:.3g} px are allowed for "
@@ -275,27 +274,23 @@ _TONES = {
         "check row_time",
         "method='bands': motion within a row time, above 0.1 px, condition (24) of the paper",
     ),
-    "other_frame_rows": ReasonKind(
+    "other_frame_rows": _of_all_axes(
         "the frames agree with frame_rows={limit:.5g}, not with {value:g}: frame_rows counts the blanking rows and is "
         "not the image height",
         "if the frame rate is known, row_time is 1 / (frame rate x frame_rows), with {frame_rate:.5g} frames/s "
         "{row_time:.5g} s",
         "the stated frame_rows (value), and the one with which detection is reliable (limit)",
         "row times",
-        "all axes",
     ),
-    "other_row_time": ReasonKind(
+    "other_row_time": _of_all_axes(
         "the frames agree with row_time={limit:.5g} s, not with {value:g} s, if the start times of frames are right",
         compares="the stated row time (value), and the one with which detection is reliable (limit)",
         unit="s",
-        refuses="all axes",
     ),
-    "other_readout_direction": ReasonKind(
-        "the frames agree with readout_direction='{agreeing}', not with '{stated}'", refuses="all axes"
+    "other_readout_direction": _of_all_axes(
+        "the frames agree with readout_direction='{agreeing}', not with '{stated}'"
     ),
-    "other_scan_axis": ReasonKind(
-        "the frames agree with scan_axis='{agreeing}', not with '{stated}'", refuses="all axes"
-    ),
+    "other_scan_axis": _of_all_axes("the frames agree with scan_axis='{agreeing}', not with '{stated}'"),
 }
 _FOLLOWED = {
     "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),

@@ -146,8 +146,7 @@ class StackJob:
         frames = self._images(inside)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        taken = self._unchanged(frames[: len(kept)])
-        as_taken = WindowResult(window, kept, taken, False, None, None, None, bad)
+        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), False, None, None, None, bad)
         if faults and len(inside) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
         if self.follow is True:

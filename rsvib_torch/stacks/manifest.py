@@ -79,8 +79,7 @@ class StackManifest(Result, file_format="rsvib stack"):
             last["bad_frames"] = len(record.bad_frames)
             last["note"] = record.error or "; ".join(map(str, record.left_alone))
             last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
-            tones = [{}] if found is None else found.tone_lines(pixel_size)
-            lines += [{**first, **tone, **last} for tone in tones]
+            lines += [{**first, **tone, **last} for tone in ([{}] if found is None else found.tone_lines(pixel_size))]
         return joined_columns(lines)
 
     def _results(self) -> Iterator[tuple[WindowRecord, int | None, DetectedVibration | None, float | None]]:
