@@ -86,9 +86,8 @@ def run(given: RunOptions) -> Answer:
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
     if given.require_reliable and "gyroscope" in given.moved:
-        raise ValueError(
-            "--require-reliable does not go with --gyroscope, which searches for no tones; leave one of them out"
-        )
+        problem = "does not go with --gyroscope, which searches for no tones; leave one of them out"
+        raise ValueError(f"--require-reliable {problem}")
     is_video = False
     if given.video:
         from rsvib_torch.io.stack_info import H264, VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
@@ -191,10 +190,8 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     changed = [name for name in of_windows if stated.get(name) is True or stated.get(name) not in _USUAL]
     refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
     if refused:
-        raise ValueError(
-            f"{refused} cannot be used with --video, which follows the frames one by one; give --output restored.mp4 "
-            "instead of --video, which processes windows"
-        )
+        remedy = "give --output restored.mp4 instead of --video, which processes windows"
+        raise ValueError(f"{refused} cannot be used with --video, which follows the frames one by one; {remedy}")
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = out / "manifest.json"

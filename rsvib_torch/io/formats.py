@@ -161,6 +161,5 @@ def target_format(path: Path) -> StackFormat:
     if path.suffix.lower() in FORMATS:
         return FORMATS[path.suffix.lower()]
     known = ", ".join(ending for ending in FORMATS if ending)
-    raise ValueError(
-        f"{path}: unknown file ending {quoted(path.suffix)}; expected {known} or a folder of PNG, TIFF or JPEG files"
-    )
+    known += " or a folder of PNG, TIFF or JPEG files"
+    raise ValueError(f"{path}: unknown file ending {quoted(path.suffix)}; expected {known}")

@@ -35,9 +35,8 @@ def check_info_target(
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
     if form.write is None:
-        raise ValueError(
-            f"{path}: {form.name} files can only be read; write .tif, .png, .npy, .mkv or a folder of PNG files"
-        )
+        remedy = "write .tif, .png, .npy, .mkv or a folder of PNG files"
+        raise ValueError(f"{path}: {form.name} files can only be read; {remedy}")
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if compression is not None:

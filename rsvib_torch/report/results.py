@@ -82,9 +82,8 @@ def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -
     different = [name for name in ours if not equal(theirs[name], ours[name])]
     if different:
         values = ", ".join(f"{name}={theirs[name]!r} (here {ours[name]!r})" for name in different)
-        raise ValueError(
-            f"{source}: the vibration was detected with another timing: {values}; detect it again, or correct [sensor]"
-        )
+        remedy = "detect it again, or correct [sensor]"
+        raise ValueError(f"{source}: the vibration was detected with another timing: {values}; {remedy}")
 
 
 @checks_arguments
