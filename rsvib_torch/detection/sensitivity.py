@@ -88,7 +88,7 @@ def assumptions(
     sentences = []
     if timing.frame_start_times is None:
         # two frames show frequencies relative to the row time, more frames relative to the frame rate
-        row, rate = f"row_time={timing.row_time:g} s", f"{timing.frame_rate:.6g}"
+        row, rate = f"row_time={timing.row_time:g} s", f"{timing.frame_rate:.4g}"
         sentences.append(
             f"{row}; frequencies scale inversely with it, or differ by multiples of {rate} Hz"
             if num_frames == 2
