@@ -87,14 +87,12 @@ def run(given: RunOptions) -> Answer:
         raise ValueError(
             "--require-reliable does not go with --gyroscope, which searches for no tones; leave one of them out"
         )
-    is_video = False
     if given.video:
-        from rsvib_torch.io.stack_info import H264, VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
+        from rsvib_torch.io.stack_info import H264, split_range  # noqa: PLC0415 - loads PyTorch
 
         if output != "restored.tif":
             raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
         ending = split_range(frames)[0].suffix.lower()
-        is_video = ending in VIDEO
         output = f"restored{ending if ending in H264 else '.mkv'}"
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
@@ -105,7 +103,7 @@ def run(given: RunOptions) -> Answer:
     chosen = WindowOptions(**{**settings.stack, **given.windows})
     common = {"full_scale": scale, "restoration": restoration, "device": str(given.torch_device)}
     # videos of more than one window are followed from frame to frame
-    if given.moved or (is_video and info.shape[0] > chosen.window):
+    if given.moved or (given.video and io.is_video(frames) and info.shape[0] > chosen.window):
         answer = _run_followed(given, out / output, common)
     else:
         answer = _run_windows(given, out / output, info, common, chosen)
@@ -174,6 +172,8 @@ def _answer_of_windows(
         more, steps = ["--manifest", str(out / "manifest.json")], []
     if result.restored:
         steps.insert(0, answers.page_step(frames, out / "report", given.settings, *more))
+    elif not given.video and io.is_video(frames):
+        steps.insert(0, answers.run_step(frames, out / "followed", given.settings.arguments))
     answer.next_steps += steps
     return answer
 

@@ -153,12 +153,11 @@ def simulate(given: SimulateOptions) -> Answer:
         stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
     line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
-    run = ("run", frames, frames.with_name("results"), *settings.arguments)
     return Answer(
         {"Simulated frames": [line, f"vibration:\n{vibration}"]},
         {"shape": list(simulated.shape), "dtype": dtype, "vibration": vibration.to_dict()},
         [frames],
-        [answers.next_step("detect the vibration and restore the frames", *run)],
+        [answers.run_step(frames, frames.with_name("results"), settings.arguments)],
     )
 
 

@@ -1,6 +1,6 @@
 from .formats import StackFormat, register_format
 from .frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
-from .stack_info import FrameError, FrameReader, StackInfo
+from .stack_info import FrameError, FrameReader, StackInfo, is_video
 from .stack_reading import open_stack, read_stack, read_stack_info
 from .stack_writing import check_stack_target, metadata_not_kept, stack_files, write_stack
 
@@ -13,6 +13,7 @@ __all__ = [
     "check_stack_target",
     "describe_stack",
     "exposure_times",
+    "is_video",
     "metadata_not_kept",
     "open_stack",
     "read_stack",

@@ -261,10 +261,10 @@ _TONES = {
         "px",
     ),
     "blur_contradicts_exposure": ReasonKind(
-        "the difference of the blur between frames is {value:.2g} times the value expected for an exposure of "
+        "the difference of the blur between frames is {value:.3g} times the value expected for an exposure of "
         "{exposure_rows:g} rows, the limit is {limit:g}",
         "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
-        "determine the motion",
+        "determine the motion[; the compression of a {compressed}, which makes frames alike, is another cause]",
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
         refuses="all axes",
     ),

@@ -175,7 +175,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         for name, of_axis in self.totals()["tones"].items():
             for tone in of_axis["tones"] or [{"windows": 0}]:
                 texts = [
-                    measured_text(tone[quantity], tone[f"{quantity}_spread"]) if tone["windows"] else ""
+                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None) if tone["windows"] else ""
                     for quantity in ("amplitude", "frequency")
                 ]
                 if unit != "windows" and tone["windows"]:
