@@ -221,8 +221,8 @@ class StackManifest(Result, file_format="rsvib stack"):
             which = "" if len(followed) == len(self.windows) else " of the windows that were followed"
             restoration.append(f"{count} of {sum(record.written for record in followed)} frames{which} restored")
         if data["predicted_gain_db"] is not None:
-            low, high = data["predicted_gain_db"].values()
-            restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
+            gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
+            restoration.append(f"estimated improvement {' … '.join(gains)} dB")
         still = self._has_no_tone()
         if still:
             text = "the camera stands still, or moves uniformly or by less than the noise"
