@@ -12,7 +12,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes
+from rsvib_torch.commands.stack_commands import print_notes, read_frame
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
@@ -21,7 +21,6 @@ from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from torch import Tensor
 
 
 _RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
@@ -184,24 +183,13 @@ def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) ->
     from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
 
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
-    raw = _frame(given.stack, index, common["full_scale"])
+    raw = read_frame(given.stack, index, common["full_scale"])
     pattern = common["restoration"].get("mosaic")
     if pattern is not None:
         raw = colour_frames(raw[None], pattern)[0]
     raw = enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
     names = ("input", "restored" if first.restored else "unchanged")
     return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
-
-
-def _frame(path: Path, index: int, full_scale: float | None) -> Tensor:
-    """A frame of a stack, with 0 for missing pixels."""
-    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
-
-    reader = io.open_stack(path)
-    scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
-    frame: Tensor = counts_to_frames(reader.frame(index)[None], scale, str(path), nodata)[0].nan_to_num(0.0)
-    reader.close()
-    return frame
 
 
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
@@ -270,7 +258,7 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
 def _followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
     """Draw one of the first frames of a video beside the restored one."""
     index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
-    raw = _frame(frames, index, manifest.settings["full_scale"])
+    raw = read_frame(frames, index, manifest.settings["full_scale"])
     if manifest.margins is not None:
         raw = video.Margins(**manifest.margins).cut(raw)
-    return reports.comparison_figure(raw, _frame(restored, index, None))
+    return reports.comparison_figure(raw, read_frame(restored, index, None))

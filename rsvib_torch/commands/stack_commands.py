@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
@@ -58,6 +58,17 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     times = io.exposure_times(info, config.timing)
     info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
     return Stack(frames.to(given.torch_device), info, scale, timing)
+
+
+def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
+    """A frame of a stack, with 0 for missing pixels."""
+    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
+
+    reader = io.open_stack(path)
+    scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
+    frame: Tensor = counts_to_frames(reader.frame(index)[None], scale, str(path), nodata)[0].nan_to_num(0.0)
+    reader.close()
+    return frame
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -372,14 +383,13 @@ def report(given: ReportOptions) -> Answer:
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     written.check_folder(out, ["report.html"], given.overwrite, inputs)
     _, _, options = given.planned_restoration(given.restoration)
+    if given.manifest is not None and windows is not None and windows.output is not None and windows.is_followed:
+        made = given.manifest.with_name(windows.output["name"])
+        if windows.totals()["restored"] and made.exists():
+            return _report_of_run(given, windows, made, boxes)
     stack = load(given, options)
     detection = _detect(stack, settings)
-    followed = None if windows is None else windows.followed()
-    if followed is not None and len(followed.times) == len(stack.frames):
-        with working("restoring and judging"):
-            result = stacks.restore_followed(stack.frames, stack.timing, followed, options, force=given.force)[0]
-    else:
-        result = _restore(stack, detection, options, given.force, "page")
+    result = _restore(stack, detection, options, given.force, "page")
     pattern = options.get("mosaic")
     steps = []
     if result.restored:
@@ -387,12 +397,12 @@ def report(given: ReportOptions) -> Answer:
     elif result.moves:
         forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
         steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
-    steps += [] if followed is not None else answers.steps_after_detection(detection, frames, settings)
+    steps += answers.steps_after_detection(detection, frames, settings)
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
 
-    content = reports.Report(
-        title=printable(f"Vibration in {frames.name}"),
-        subtitle=printable(f"{frames}, camera of {settings.source}"),
+    content = _page(
+        given,
+        windows,
         frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
         restored=result.frames,
         was_restored=result.restored,
@@ -401,27 +411,61 @@ def report(given: ReportOptions) -> Answer:
         verdict=result.verdict,
         left_alone=result.left_alone,
         options=options,
-        version=rsvib_torch.__version__,
         next_steps=tuple(answers.step_parts(step) for step in steps),
+    )
+    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and windows.output is not None:  # restored by windows, here as a whole
+        title = "Restoration of the page, of one vibration in all frames"
+        answer.results[title] = answer.results.pop("Restoration")
+        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
+    answer.next_steps += steps
+    return _write_page(given, content, answer, boxes)
+
+
+def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path, boxes: list[reports.Box]) -> Answer:
+    """The page of a run that followed the vibration: two frames in the middle, before and after it."""
+    import torch  # noqa: PLC0415
+
+    from rsvib_torch.video import Margins  # noqa: PLC0415
+
+    first, scale = max(windows.input["shape"][0] // 2 - 1, 0), windows.settings["full_scale"]
+    of_both = ((given.stack, scale), (made, None if io.is_video(made) else scale))
+    before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
+    followed = windows.followed()
+    content = _page(
+        given,
+        windows,
+        frames=before if windows.margins is None else Margins(**windows.margins).cut(before),
+        restored=after,
+        was_restored=True,
+        timing=given.settings.timing,
+        first=first,
+        image_motion=None if followed is None else followed.vibration.image_motion[first],
+    )
+    answer = answers.windows_answer(f"Vibration in {given.stack.name}", windows)
+    answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
+    return _write_page(given, content, answer, boxes)
+
+
+def _page(given: ReportOptions, windows: stacks.StackManifest | None, **content: Any) -> reports.Report:
+    """Content of a page, with its head."""
+    return reports.Report(
+        title=printable(f"Vibration in {given.stack.name}"),
+        subtitle=printable(f"{given.stack}, camera of {given.settings.source}"),
+        version=rsvib_torch.__version__,
         command=current_output().command,
         windows=windows,
+        **content,
     )
-    with whole_folder(out) as folder, working("writing the page"):
+
+
+def _write_page(given: ReportOptions, content: reports.Report, answer: Answer, boxes: list[reports.Box]) -> Answer:
+    """Write the page, and add its files to the answer."""
+    inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
+    with whole_folder(given.out) as folder, working("writing the page"):
         files = reports.write_report_page(folder, content, boxes or None)
-        shared.check_new([out / name for name in files], overwrite=True, inputs=inputs)
-    if windows is not None and followed is not None:
-        answer = answers.windows_answer(f"Vibration in {frames.name}", windows)
-        answer.results["Restoration of the page"] = answers.restoration_lines(result, len(stack.frames))
-        answer.data["restoration"] = reports.restoration_data(result)
-    else:
-        answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
-    if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
-        if followed is None:
-            title = "Restoration of the page, of one vibration in all frames"
-            answer.results[title] = answer.results.pop("Restoration")
-        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    answer.files += [out / name for name in files]
-    answer.next_steps += steps
+        shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
+    answer.files += [given.out / name for name in files]
     return answer
 
 

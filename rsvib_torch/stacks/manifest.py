@@ -242,6 +242,11 @@ class StackManifest(Result, file_format="rsvib stack"):
         return vibration, restoration
 
     @property
+    def is_followed(self) -> bool:
+        """Whether the vibration was followed from frame to frame in all windows, or in a video."""
+        return "video" in self.settings or self._unit == "frames"
+
+    @property
     def _unit(self) -> str:
         """What has a detection."""
         followed = [record.followed is not None for record in self.windows]
