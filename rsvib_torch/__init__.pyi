@@ -27,7 +27,7 @@ from .detection import (
     detect_vibration,
     diagnose_timing,
 )
-from .evaluation import MtfCurve, SlantedEdge, find_slanted_edges, offset_endpoint_error, psnr, slanted_edge_mtf, ssim
+from .evaluation import MtfCurve, SlantedEdge, find_slanted_edges, psnr, slanted_edge_mtf, ssim
 from .export import camera_isd, sampling_map, write_gcsv, write_isd, write_stmap
 from .gyroscope import (
     AccelerometerComparison,
@@ -72,7 +72,6 @@ from .restoration import (
     RestorationWarning,
     VibrationRestorer,
     judge_restoration,
-    predict_noise_gain,
     restoration_mtf,
     restore,
     trusted_vibration,
@@ -85,7 +84,7 @@ from .row_time import (
     calibrate_row_time_by_motion,
 )
 from .stacks import StackReport, VibrationCorrector, iterate_stack, process_stack, read_manifest, restore_block
-from .tracking import TrackedFrame, VibrationTracker
+from .tracking import TrackedFrame, VibrationTracker, follow_vibration
 from .video import Margins, VideoBorder, process_video
 
 __all__ = [
@@ -144,15 +143,14 @@ __all__ = [
     "diagnose_timing",
     "find_cameras",
     "find_slanted_edges",
+    "follow_vibration",
     "gain_figure",
     "iterate_stack",
     "judge_restoration",
     "motion_figure",
     "mtf_figure",
-    "offset_endpoint_error",
     "offset_figure",
     "open_stack",
-    "predict_noise_gain",
     "process_stack",
     "process_video",
     "psf_figure",

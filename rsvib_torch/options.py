@@ -142,28 +142,13 @@ class ToneOptions(ProjectionOptions, RegistrationOptions):
 
 @options
 class VibrationOptions(ToneOptions, MaskedInputOptions):
-    """Options of ``detect_vibration`` for tones."""
-
-    model: Literal["tones"] = "tones"
-    """``"tones"``: sinusoids and a uniform motion; ``"free"``: a motion of any shape, with the options of
-    ``detect_motion``; ``"swept"``: one tone per axis whose amplitude decays or grows and whose frequency sweeps, with
-    the options of ``detect_swept_tone``."""
-    follow: Literal[False] = False
-    """True: follow a vibration that changes, e.g. decays, from frame to frame. The result is a batch with one entry per
-    frame; the only other options are ``columns``, ``full_scale``, ``channels`` and ``ignore``."""
-    window: int | None = None
-    """Number of frames of one result, in which the vibration is steady: the result is a batch with one entry per window
-    (a leading dimension behind B). None for one result from all frames."""
-    window_step: int | None = None
-    """Frames from one window to the next; half a window by default."""
+    """Options of ``detect_vibration``."""
 
 
 @options
 class FollowOptions(MaskedInputOptions):
-    """Options of ``detect_vibration(follow=True)``."""
+    """Options of ``follow_vibration``."""
 
-    follow: Literal[True]
-    """Follow the vibration from frame to frame."""
     columns: Columns | None = 384
     """Columns that are measured, those with the most detail; None for all."""
 
@@ -356,14 +341,6 @@ class RestoreOptions(RestorerOptions, MaskedInputOptions):
 @options
 class RestorationMtfOptions(RestorationOptions, MaskedInputOptions):
     """Options of ``restoration_mtf``."""
-
-
-@options
-class NoiseGainOptions(RestorationOptions, InputOptions):
-    """Options of ``predict_noise_gain``."""
-
-    columns: Columns = 256
-    """Width of the strip across the scan, from the middle of the frames."""
 
 
 @options

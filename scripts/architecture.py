@@ -65,7 +65,7 @@ INNER_LAYERS: dict[str, tuple[set[str], ...]] = {
         {"exact", "banded", "dewarp", "verdict"},
         {"richardson_lucy"},
         {"restore"},
-        {"noise_gain", "restoration_mtf"},
+        {"restoration_mtf"},
     ),
 }
 

@@ -40,14 +40,12 @@ def rms(values):
 # Every public function of frames: the call, and the axes of the frames in its result, if it returns frames.
 FUNCTIONS = {
     "detect_vibration": lambda frames, **options: rsv.detect_vibration(frames, TIMING, tones=1, **options),
-    "model free": lambda frames, **options: rsv.detect_vibration(frames, TIMING, model="free", **options),
     "detect_motion": lambda frames, **options: rsv.detect_motion(frames, TIMING, **options),
     "detect_swept_tone": lambda frames, **options: rsv.detect_swept_tone(frames, TIMING, **options),
     "check_motion": lambda frames, **options: rsv.check_motion(frames, TIMING, VIBRATION, **options),
     "VibrationDetector": lambda frames, **options: rsv.VibrationDetector(TIMING, tones=1, **options)(frames),
     "register_bands": lambda frames, **options: rsv.register_bands(frames, TIMING, **options),
     "judge_restoration": lambda frames, **options: rsv.judge_restoration(frames, frames, TIMING, VIBRATION, **options),
-    "predict_noise_gain": lambda frames, **options: rsv.predict_noise_gain(frames, TIMING, VIBRATION, **options),
     "restore": lambda frames, **options: rsv.restore(frames, TIMING, VIBRATION, **options),
     "VibrationRestorer": lambda frames, **options: rsv.VibrationRestorer(TIMING, **options)(frames, VIBRATION),
 }

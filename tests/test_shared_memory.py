@@ -104,10 +104,8 @@ CASES = {
         FRAMES,
         FRAMES,
     ),
-    "offset_endpoint_error": (rsv.offset_endpoint_error, PAIR[None], PAIR[None]),
     "psnr": (lambda *images: rsv.psnr(*images, 1.0), FRAMES, FRAMES.flip(0)),
     "ssim": (lambda *images: rsv.ssim(*images, 1.0), FRAMES, FRAMES.flip(0)),
-    "predict_noise_gain": (lambda frames: rsv.predict_noise_gain(frames, TIMING, VIBRATION), FRAMES),
     "register_bands": (lambda frames: rsv.register_bands(frames, TIMING), FRAMES),
     "row_psf": (lambda starts: rsv.row_psf(STILL, starts, TIMING), TIMES[:8]),
     "blur_rows": (lambda image: blur_rows(image, PSF), FRAMES[0, :8]),
@@ -133,7 +131,7 @@ ONLY_TENSORS = (
     "AngularRates", "FixedDewarp", "FreeMotion.displacement", "OffsetCurve",
     "RollingShutterVibration", "RollingShutterVibration, p=0", "RollingShutterVibration, still",
     "Vibration.displacement", "Vibration.mean_displacement", "Vibration.scaled", "VibrationStd",
-    "offset_endpoint_error", "row_psf", "blur_rows", "blur_rows_adjoint", "RowVaryingBlur",
+    "row_psf", "blur_rows", "blur_rows_adjoint", "RowVaryingBlur",
 )  # fmt: skip
 
 

@@ -41,7 +41,6 @@ def results():
     holes[1, 20:24, 30:34] = float("nan")
     found["filled"] = rsv.restore(holes, TIMING, VIBRATION, joint=True, prior="edges", saturation=0.9)
     found["verdict"] = rsv.judge_restoration(frames, found["restore exact"], TIMING, VIBRATION).to_dict()
-    found["gain"] = rsv.predict_noise_gain(frames, TIMING, VIBRATION)
     found["mtf"] = rsv.restoration_mtf(frames, TIMING, VIBRATION, joint=True, scale=2).to_dict()
     found["visible"] = rsv.visible_pixels(TIMING, VIBRATION, (96, 64), 3)
     found["trusted"] = rsv.trusted_vibration(detected, TIMING, 3, 96)[0].to_dict()

@@ -11,8 +11,7 @@ Only ``diagnosis``, which it calls, makes further attempts, with other timings.
    against the axes. The vibration is that of the stated timing.
 
 The findings of an attempt (``pipeline``) decide whether the next hypothesis is tried, and its status whether it is
-accepted. Windows of a long stack are detected one after the other, with the same components of the motion, and without
-the fourth hypothesis: windows are short, and the timing is that of the stack.
+accepted.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +19,6 @@ from typing import Literal
 
 import numpy as np
 
-from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.detection.assemble import assembled
 from rsvib_torch.detection.diagnosis import other_timings
 from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
@@ -57,17 +55,9 @@ class FieldOptions:
 
 
 def detect_tones(
-    stacks: GreyFrames,
-    timing: SensorTiming,
-    options: DetectionOptions,
-    field: FieldOptions,
-    *,
-    diagnose: bool = True,
+    stacks: GreyFrames, timing: SensorTiming, options: DetectionOptions, field: FieldOptions
 ) -> DetectionResult:
-    """Detect the tones of B stacks, with as many components as were requested or as the frames require.
-
-    ``diagnose`` tries another timing for stacks whose rows the tones do not explain.
-    """
+    """Detect the tones of B stacks, with as many components as were requested or as the frames require."""
     height, width = stacks.images.shape[-2:]
     row_timing, num_frames = timing.in_row_order(), stacks.images.shape[1]
 
@@ -94,11 +84,9 @@ def detect_tones(
     # 3. The same vibration of both halves.
     translation = _without_parallax(stacks, row_timing, options, translation)
 
-    # 4. Another timing.
+    # 4. Another timing, for stacks whose rows the tones do not explain. The axes of a stack have one timing: of 9
+    # reliable axes beside a contradicted one, 3 were wrong.
     result = assembled_attempt(translation, timing, num_frames)
-    if not diagnose:
-        return result
-    # The axes of a stack have one timing: of 9 reliable axes beside a contradicted one, 3 were wrong.
     reliable, findings = result.reliable.clone(), list(result.findings)
     for index, diagnosis in other_timings(stacks, timing, translation).items():
         reliable[index] = False
@@ -176,56 +164,3 @@ def _moving_axes(found: Attempt, least: int) -> int:
     significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std_if_hidden_tone.amplitude
     moving = significant.any(0).any(-1).tolist()
     return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])
-
-
-# Windows
-
-
-def windows_of(
-    num_frames: int, window: int, step: int | None, timing: SensorTiming
-) -> list[tuple[slice, SensorTiming]]:
-    """Windows of frames, the last one flush with the end, each with the start times of its frames."""
-    check_whole_number("window", window, at_least=2)
-    if window > num_frames:
-        raise ValueError(f"window of {window} frames is longer than the stack of {num_frames}")
-    step = max(1, window // 2) if step is None else step
-    check_whole_number("window_step", step, at_least=1)
-    firsts = list(range(0, num_frames - window + 1, step))
-    if firsts[-1] + window < num_frames:
-        firsts.append(num_frames - window)
-    starts = timing.frame_starts(num_frames)
-    return [
-        (slice(first, first + window), replace(timing, frame_start_times=starts[first : first + window]))
-        for first in firsts
-    ]
-
-
-def detect_windows(
-    stacks: GreyFrames,
-    windows: list[tuple[slice, SensorTiming]],
-    options: DetectionOptions,
-    field: FieldOptions,
-) -> DetectionResult:
-    """Results of all windows, with the same components."""
-
-    def of_window(number: int, field: FieldOptions) -> DetectionResult:
-        part, timing = windows[number]
-        valid = None if stacks.valid is None else stacks.valid[:, part]
-        frames = replace(stacks, images=stacks.images[:, part], valid=valid)
-        return detect_tones(frames, timing, options, field, diagnose=False)
-
-    # 1. Each window by itself.
-    results = [of_window(number, field) for number in range(len(windows))]
-    # 2. Windows with fewer components are detected again with those of the others.
-    axes = max(result.vibration.num_axes for result in results)
-    if axes > 2:
-        same = replace(field, roll=True, zoom=axes > 3)
-        results = [
-            result if result.vibration.num_axes == axes else of_window(number, same)
-            for number, result in enumerate(results)
-        ]
-    # 3. Tones that are missing in some windows have amplitude 0 there; the windows follow the stacks of the batch.
-    count = max(result.gain.shape[-1] for result in results)
-    results = [result.with_tones(count) for result in results]
-    of_stacks = [DetectionResult.stacked([result[i] for result in results]) for i in range(len(stacks.images))]
-    return DetectionResult.stacked(of_stacks)

@@ -3,106 +3,26 @@
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Literal, ParamSpec, Protocol, overload
-
-from rsvib_torch.checks.validation import fields_of
-from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.detection.attempts import FieldOptions, detect_tones, detect_windows, windows_of
+from rsvib_torch.detection.attempts import FieldOptions, detect_tones
 from rsvib_torch.detection.pipeline import METHODS, DetectionOptions
 from rsvib_torch.detection.result import DetectionResult
-from rsvib_torch.detection.shapes.free import MotionDetection, detect_motion
-from rsvib_torch.detection.shapes.swept import SweptTone, detect_swept_tone
 from rsvib_torch.detection.strips import camera_in_row_order
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
-from rsvib_torch.frames.entry_points import TimedModule, entry_point, module_options
+from rsvib_torch.frames.entry_points import TimedModule, frames_options, module_options
 from rsvib_torch.frames.grey import grey_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.camera import Camera
-from rsvib_torch.motion.detected_vibration import FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.options import FollowOptions, FreeMotionOptions, SweptToneOptions, VibrationOptions
-from rsvib_torch.results.higher_packages import imported
-
-VibrationModel = Literal["tones", "free", "swept"]
-T = ParamSpec("T")
-W = ParamSpec("W")
-F = ParamSpec("F")
-S = ParamSpec("S")
+from rsvib_torch.options import VibrationOptions
 
 
-@option_group
-class _FreeModel(FreeMotionOptions):
-    model: Literal["free"]
-
-
-@option_group
-class _SweptModel(SweptToneOptions):
-    model: Literal["swept"]
-
-
-# Models: what is fitted. A model is a group of options, and a function ``model(frames, timing, **options)`` of the
-# user's frames and timing. The result is in image axes and has ``reliable`` (..., 2) bool, ``reasons`` for each axis,
-# and a motion that ``restore`` accepts. "tones" is implemented by ``detect_vibration``.
-_OTHER_MODELS: dict[str, tuple[type, Callable[..., MotionDetection | SweptTone]]] = {
-    "free": (_FreeModel, detect_motion),
-    "swept": (_SweptModel, detect_swept_tone),
-}
-
-
-class _DetectsVibration(Protocol[T, W, F, S]):
-    """Type of ``detect_vibration``: the model determines the options and the result."""
-
-    @overload
-    def __call__(
-        self, frames: FramesOrFiles, timing: SensorTiming, *args: T.args, **kwargs: T.kwargs
-    ) -> DetectionResult: ...
-    @overload
-    def __call__(
-        self, frames: FramesOrFiles, timing: SensorTiming, *args: W.args, **kwargs: W.kwargs
-    ) -> FollowedVibration: ...
-    @overload
-    def __call__(
-        self, frames: FramesOrFiles, timing: SensorTiming, *args: F.args, **kwargs: F.kwargs
-    ) -> MotionDetection: ...
-    @overload
-    def __call__(self, frames: FramesOrFiles, timing: SensorTiming, *args: S.args, **kwargs: S.kwargs) -> SweptTone: ...
-
-
-def _options_of_models(
-    tones: Callable[T, VibrationOptions],
-    followed: Callable[W, FollowOptions],
-    free: Callable[F, _FreeModel],
-    swept: Callable[S, _SweptModel],
-) -> Callable[[Callable[..., Any]], _DetectsVibration[T, W, F, S]]:
-    def of_model(model: object = "tones", follow: object = False, **given: Any) -> Any:
-        check_choice("model", model, ("tones", *_OTHER_MODELS))
-        check_choice("follow", follow, (False, True))
-        chosen = {"follow": True} if follow and model == "tones" else {"model": model}
-        group: Any = (
-            FollowOptions if "follow" in chosen else tones if model == "tones" else _OTHER_MODELS[str(model)][0]
-        )
-        given |= {"follow": True} if follow and model != "tones" else {}
-        for name in given:
-            if name not in fields_of(group):
-                ((stated, value),) = chosen.items()
-                names = ", ".join(fields_of(group))
-                raise TypeError(f"{stated}={value!r} has no option {name!r}; its options are {names}")
-        return group(**chosen, **given)
-
-    return lambda function: entry_point(tones, function, of_model)
-
-
-@_options_of_models(VibrationOptions, FollowOptions, _FreeModel, _SweptModel)
+@frames_options(VibrationOptions)
 @full_precision
 @without_gradients
-def detect_vibration(
-    frames: FramesOrFiles, timing: SensorTiming, options: VibrationOptions | FollowOptions | _FreeModel | _SweptModel
-) -> DetectionResult | FollowedVibration | MotionDetection | SweptTone:
+def detect_vibration(frames: FramesOrFiles, timing: SensorTiming, options: VibrationOptions) -> DetectionResult:
     """Detect the vibration of the camera from consecutive frames (Sec. 2 of Liu et al. 2023).
 
     Row bands are registered between frames, and sinusoids and a uniform motion (Eq. 5) are fitted to the offset curve.
@@ -119,9 +39,7 @@ def detect_vibration(
         options: Options.
 
     Returns:
-        The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve: a
-        ``DetectionResult``. With ``follow=True``, a ``FollowedVibration`` with one entry per frame, which ``restore``
-        accepts as well. Of the free model a ``MotionDetection``, of the swept one a ``SweptTone``.
+        The vibration in image axes (x, y) with standard deviations, a verdict for each axis, and the offset curve.
 
     Warns:
         TimingWarning: If frames is a path, and the file states another frame rate than the sensor has.
@@ -152,23 +70,7 @@ def detect_vibration(
         >>> detection = rsv.detect_vibration(frames, timing)
         >>> detection.reliable.tolist()
         [True, False]
-
-        A vibration that decays with 0.3 s is followed from frame to frame:
-
-        >>> times = torch.arange(-0.01, 0.3, 2e-4, dtype=torch.float64)
-        >>> tone = 3.0 * torch.exp(-times / 0.3) * torch.sin(2 * torch.pi * 110 * times)  # px
-        >>> decaying = rsv.FreeMotion.through(times, torch.stack([tone, 0.5 * tone], -1))
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, decaying, num_frames=20)
-        >>> followed = rsv.detect_vibration(frames, timing, follow=True)
-        >>> followed.vibration.amplitude[::10, 0, 0].round(decimals=1).tolist()  # px along x, of frames 0 and 10
-        [2.9, 2.0]
     """
-    if isinstance(options, FollowOptions):
-        followed: FollowedVibration = imported("follow")(frames, timing, options)
-        return followed
-    if not isinstance(options, VibrationOptions):
-        given = {name: value for name, value in vars(options).items() if name != "model"}
-        return _OTHER_MODELS[options.model][1](frames, timing, **given)
     check_choice("method", options.method, tuple(METHODS))
 
     # 1. The user's frames become grey frames in row order.
@@ -182,14 +84,9 @@ def detect_vibration(
     if options.columns is not None:
         stacks = stacks.narrowed(options.columns)
 
-    # 2. One result from all frames, or one from each window.
+    # 2. One result from all frames.
     with threads_for(stacks.images):
-        if options.window is None:
-            result = detect_tones(stacks, timing, chosen, field)
-        else:
-            windows = windows_of(stacks.images.shape[1], options.window, options.window_step, timing)
-            result = detect_windows(stacks, windows, chosen, field)
-    result = replace(result, timing=timing)  # of the stack, not of a window
+        result = detect_tones(stacks, timing, chosen, field)
     return result if stacks.batched else result[0]
 
 
@@ -207,14 +104,11 @@ def _checked_field(options: VibrationOptions, camera: Camera | None) -> FieldOpt
 class VibrationDetector(TimedModule):
     """``detect_vibration`` with fixed timing and options as a module, for one stack or a batch of stacks.
 
-    The options are those of ``detect_vibration`` for tones. It has no weights. Autocast does not affect it, and
+    The options are those of ``detect_vibration``. It has no weights. Autocast does not affect it, and
     ``torch.compile`` calls it uncompiled, at one graph break.
 
     Args:
         timing: The sensor.
-
-    Raises:
-        ValueError: If another model is given.
 
     Example:
         >>> import rsvib_torch as rsv

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from rsvib_torch.detection.spectrum import DisplacementSpectrum, displacement_spectrum
 from rsvib_torch.motion.detected_vibration import DetectedVibration
@@ -228,21 +227,4 @@ class DetectionResult(
             ),
             fitted=self.fitted[..., :count],
             sensitivity=self.sensitivity.mapped(first),
-        )
-
-    def with_tones(self, count: int) -> "DetectionResult":
-        """The result with ``count`` tones on each axis; those that it does not have are 0."""
-
-        def padded(values: Tensor) -> Tensor:
-            missing = count - self.gain.shape[-1]
-            return functional.pad(values, (0, missing)) if values.shape == self.gain.shape else values
-
-        hidden = self.std_if_hidden_tone
-        return replace(
-            self,
-            vibration=self.vibration.mapped(padded),
-            std=self.std.mapped(padded),
-            std_if_hidden_tone=None if hidden is None else hidden.mapped(padded),
-            gain=padded(self.gain),
-            sensitivity=self.sensitivity.mapped(padded),
         )

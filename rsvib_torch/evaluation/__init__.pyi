@@ -1,13 +1,12 @@
 from .bound import cramer_rao_bound
 from .mtf import MtfCurve, SlantedEdge, find_slanted_edges, slanted_edge_mtf
-from .quality import offset_endpoint_error, psnr, ssim
+from .quality import psnr, ssim
 
 __all__ = [
     "MtfCurve",
     "SlantedEdge",
     "cramer_rao_bound",
     "find_slanted_edges",
-    "offset_endpoint_error",
     "psnr",
     "slanted_edge_mtf",
     "ssim",

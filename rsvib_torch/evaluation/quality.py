@@ -1,13 +1,13 @@
 """Quality of restored images and of measured offset curves."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 from kornia.metrics import ssim as kornia_ssim
 from pydantic import Field
 from torch import Tensor
 
-from rsvib_torch.checks.arguments import check_broadcast, checks_arguments
+from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import FramesLike, as_tensor
 from rsvib_torch.checks.validation import Positive
 
@@ -88,34 +88,3 @@ def ssim(image: FramesLike, reference: FramesLike, data_range: Positive, *, rim:
     similarity = kornia_ssim(folded[0], folded[1], window, max_val=float(data_range), eps=0.0, padding="valid")
     means: Tensor = similarity[0].unflatten(0, first.shape[:2]).flatten(1).mean(1, dtype=torch.float64)
     return means.reshape(shape)
-
-
-@checks_arguments
-def offset_endpoint_error(
-    measured: Tensor, truth: Tensor, *, reduction: Literal["mean", "rms", "none"] = "mean"
-) -> Tensor:
-    """Distance between measured and true offsets in px.
-
-    ``|measured - truth|`` as vectors (x, y). Bands where registration failed (NaN) are left out of the
-    mean; ``isfinite(measured)`` counts the others.
-
-    Args:
-        measured: (..., N, 2) px, axes (x, y); NaN where registration failed.
-        truth: True offsets at the same bands, broadcastable to the same shape.
-        reduction: ``"mean"`` or ``"rms"`` over the bands of each curve, or ``"none"``.
-
-    Returns:
-        float64 tensor: (...) per curve (NaN where all bands failed), or (..., N) without reduction.
-
-    Example:
-        >>> offset_endpoint_error(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.zeros(2, 2))
-        tensor(2.5000, dtype=torch.float64)
-    """
-    for name, value in (("measured", measured), ("truth", truth)):
-        if value.ndim < 2 or value.shape[-1] != 2:
-            raise ValueError(f"{name} must have shape (..., N, 2), got {tuple(value.shape)}")
-    check_broadcast(measured=measured, truth=truth)
-    distance: Tensor = torch.linalg.vector_norm(measured.double() - truth.double(), dim=-1)
-    if reduction == "none":
-        return distance
-    return distance.nanmean(-1) if reduction == "mean" else distance.square().nanmean(-1).sqrt()

@@ -147,7 +147,7 @@ class DetectedVibration(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FollowedVibration(DetectedVibration, shapes={**DetectedVibration.shapes, "times": "..."}):
-    """The vibration at each frame of a stack, from ``detect_vibration(follow=True)``: a batch with one entry per frame.
+    """The vibration at each frame of a stack, from ``follow_vibration``: a batch with one entry per frame.
 
     Amplitude and frequency may change from frame to frame. A frame whose vibration is not known has amplitude 0, and is
     not reliable. Phases and the image motion refer to the time origin of the stack, as those of all detections; their

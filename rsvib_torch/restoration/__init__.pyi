@@ -1,7 +1,6 @@
 from .dewarp import FixedDewarp
 from .frame_motion import visible_pixels
 from .noise import estimate_noise
-from .noise_gain import predict_noise_gain
 from .restoration_mtf import RestorationMtf, restoration_mtf
 from .restoration_warning import RestorationWarning
 from .restore import VibrationRestorer, restore
@@ -19,7 +18,6 @@ __all__ = [
     "displacement_uncertainty",
     "estimate_noise",
     "judge_restoration",
-    "predict_noise_gain",
     "restoration_mtf",
     "restore",
     "trusted_vibration",

@@ -107,8 +107,8 @@ class Reason:
 _COMPARED = ("value", "limit")
 # What texts of Python name, and the same for users of the program
 _OPTIONS = {
-    "follow=True": "--follow",
-    "model='free'": "rsvib motion",
+    "follow_vibration": "--follow",
+    "detect_motion": "rsvib motion",
     "check frame_rows, row_time": "check --frame-rate, --row-time",
     "check exposure_rows": "check --exposure",
     "frame_rows and row_time, which": "--frame-rate and --row-time, which",
@@ -154,8 +154,8 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
-_FOLLOW = "use follow=True if the vibration changes"
-_TONES_OR_FREE = f"{_FOLLOW}, try more tones or model='free'"
+_FOLLOW = "use follow_vibration if the vibration changes"
+_TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
@@ -175,7 +175,7 @@ _TONES = {
     "too_many_tones": ReasonKind(
         "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
         "is wrong",
-        "try model='free'",
+        "try detect_motion",
         "number of tones, if it is the largest that is tried (4)",
         free_model=True,
     ),
@@ -486,7 +486,7 @@ _RESTORATION = {
 # The codes by what they refuse; a code belongs to one group.
 GROUPS = {
     "Tones (`detect_vibration`)": _TONES,
-    "A vibration that is followed (`follow=True`)": _FOLLOWED,
+    "A vibration that is followed (`follow_vibration`)": _FOLLOWED,
     "Other motions (`detect_motion`, `detect_swept_tone`)": _SHAPES,
     "Recorded motions (`align_motion`, `check_motion`)": _RECORDED,
     "Row time (`calibrate_row_time_by_motion`)": _ROW_TIME,

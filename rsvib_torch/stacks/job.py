@@ -38,6 +38,7 @@ from rsvib_torch.options import (
     RestorationOptions,
     StackDetectionOptions,
     StackOptions,
+    VibrationOptions,
 )
 from rsvib_torch.restoration.restore import check_optics
 from rsvib_torch.results.presentation import Summarised
@@ -52,6 +53,7 @@ from rsvib_torch.stacks.window_restoration import (
     without_data,
 )
 from rsvib_torch.stacks.windows import Window, cut_windows, window_record, window_timing
+from rsvib_torch.tracking.following import follow_vibration
 
 WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
 
@@ -263,7 +265,7 @@ class StackJob:
             return as_taken
         try:
             timing = window_timing(self.timing, window, list(usable))
-            found = detect_vibration(self._images(usable), timing, follow=True, channels="first")
+            found = follow_vibration(self._images(usable), timing, channels="first")
             followed = FollowedVibration.stacked([found[number] for number, i in enumerate(usable) if i in kept])
             if self.restoration is None:
                 return replace(as_taken, detection=followed)
@@ -404,11 +406,7 @@ def plan_job(
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
     detection = dict(options.detection or {})
-    for name in ("window", "window_step"):
-        if name in detection:
-            raise TypeError(f"{name!r} is not an option of detection here: a stack is cut into windows by window=")
-    if detection.get("model", "tones") != "tones":
-        raise ValueError(f"model={detection['model']!r}: in windows only tones are detected; see detect_vibration")
+    VibrationOptions(**detection)  # raises an error for wrong ones
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device

@@ -1,4 +1,5 @@
+from .following import follow_vibration
 from .tracked_frame import TrackedFrame
 from .tracker import VibrationTracker
 
-__all__ = ["TrackedFrame", "VibrationTracker"]
+__all__ = ["TrackedFrame", "VibrationTracker", "follow_vibration"]

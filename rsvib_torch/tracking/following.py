@@ -18,7 +18,9 @@ from torch.nn import functional
 
 from rsvib_torch.detection.tones.fit import displacement_std, residual_of, vibration_of_fit
 from rsvib_torch.execution.parallel import threads_for
+from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.execution.progress import steps
+from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
@@ -90,8 +92,35 @@ class _AxisAtFrame:
 _Judged = tuple[_AxisAtFrame | None, tuple[Reason, ...]]
 
 
+@frames_options(FollowOptions)
+@full_precision
+@without_gradients
 def follow_vibration(frames: FramesOrFiles, timing: SensorTiming, options: FollowOptions) -> FollowedVibration:
-    """Follow the vibration through B stacks: ``detect_vibration(follow=True)``."""
+    """Follow a vibration that changes, e.g. decays, from frame to frame.
+
+    Args:
+        frames: Stack (T, H, W), (T, C, H, W) or (B, T, C, H, W), as for ``detect_vibration``.
+        timing: The sensor.
+        options: Options.
+
+    Returns:
+        The vibration at each frame: a batch with one entry per frame, which ``restore`` accepts.
+
+    Raises:
+        ValueError: As by ``detect_vibration``.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import city_and_fields
+        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300)
+        >>> times = torch.arange(-0.01, 0.3, 2e-4, dtype=torch.float64)
+        >>> tone = 3.0 * torch.exp(-times / 0.3) * torch.sin(2 * torch.pi * 110 * times)  # px
+        >>> decaying = rsv.FreeMotion.through(times, torch.stack([tone, 0.5 * tone], -1))
+        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, decaying, num_frames=20)
+        >>> followed = rsv.follow_vibration(frames, timing)
+        >>> followed.vibration.amplitude[::10, 0, 0].round(decimals=1).tolist()  # px along x, of frames 0 and 10
+        [2.9, 2.0]
+    """
     stacks = grey_frames(frames, timing, options)
     with threads_for(stacks.images):
         followed = [_followed(stacks.one(index), options) for index in range(len(stacks.images))]

@@ -368,32 +368,6 @@ def test_accelerated_image_motion(paper_camera):
     assert (error.square().mean((0, 1)).sqrt() < 5 * slow.std.displacement + 0.05).all()
 
 
-def test_windows_measure_a_changing_vibration(paper_camera):
-    """The amplitude increases and the frequency decreases during the stack."""
-
-    def displacement(times):
-        x = (1.0 + 2.0 * times) * np.sin(2 * np.pi * (84.0 * times - 3.0 * times**2) + 0.3)
-        return np.stack([x, 0.8 * np.sin(2 * np.pi * 64.0 * times)], axis=-1)
-
-    frames = recorded((2048, 192), paper_camera, Curve(displacement), 7, 0.003, seed=57)
-    result = detect_vibration(frames, paper_camera, window=3, window_step=2, tones=1)
-    assert result.vibration.amplitude.shape == (3, 2, 1)
-    assert len(result.findings) == 3
-    assert result.offsets.times.shape[0] == 3
-    for index in range(3):
-        middle = (2 * index + 1.5) * paper_camera.frame_period
-        found = result[index].vibration
-        assert found.frequency[0, 0].item() == pytest.approx(84.0 - 6.0 * middle, abs=0.15)
-        assert found.amplitude[0, 0].item() == pytest.approx(1.0 + 2.0 * middle, rel=0.02)
-        assert found.frequency[1, 0].item() == pytest.approx(64.0, rel=2e-3)
-    # phases count from the time origin of the whole stack
-    late = result[2].vibration
-    times = torch.linspace(4, 6.5, 50).double() * paper_camera.frame_period
-    torch.testing.assert_close(
-        late.displacement(times)[:, 1], 0.8 * torch.sin(2 * math.pi * 64.0 * times), rtol=0, atol=0.02
-    )
-
-
 def test_narrow_frames_of_a_rotating_camera_are_refused():
     """The halves of 128 columns are too narrow to measure roll, and tones do not explain these frames."""
     generator = np.random.default_rng(0)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from motion_truth import common_warp, offset_error, rms
-from refusals import refuses
 from truth import MARGIN, Curve, Motion, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
@@ -137,7 +136,7 @@ def test_missing_pixels_do_not_change_the_result(frames, first_found):
 def test_batches_and_arrays_equal_single_tensors(frames, first_found):
     other = frames[:3].flip(-1).contiguous()
     both = rsv.detect_motion(torch.stack([frames[:3], other])[:, :, None].numpy(), TIMING)
-    for index, single in enumerate((first_found, rsv.detect_vibration(other, TIMING, model="free"))):
+    for index, single in enumerate((first_found, rsv.detect_motion(other, TIMING))):
         one = both[index]
         for name in ("times", "displacement", "std", "std_seen", "unseen", "unexplained", "reliable"):
             assert torch.equal(getattr(one, name), getattr(single, name)), name
@@ -146,13 +145,6 @@ def test_batches_and_arrays_equal_single_tensors(frames, first_found):
         assert one.findings == single.findings
     assert torch.allclose(both.displacement[1, ..., 0], -first_found.displacement[..., 0], atol=0.05)
     assert both.motion.displacement(both.times[None]).shape == (2, 3, 32, 2)
-
-
-def test_options_of_tones_are_refused_by_other_models(frames):
-    with pytest.raises(TypeError, match="model='free' has no option 'tones'; its options are"):
-        rsv.detect_vibration(frames[:3], TIMING, model="free", tones=2)
-    refuses(lambda: rsv.detect_vibration(frames[:3], TIMING, model="spline"), "model must be one of")
-    refuses(lambda: rsv.VibrationDetector(TIMING, model="free"), "model must be one of 'tones'; got 'free'")
 
 
 def test_motion_beyond_the_search_range_is_reported(scene):

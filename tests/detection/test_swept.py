@@ -180,7 +180,7 @@ def test_missing_pixels_do_not_change_the_result(frames):
 
 def test_batch_equals_single_stacks(frames, found):
     other = frames.flip(-1).contiguous()
-    both = rsv.detect_vibration(torch.stack([frames, other])[:, :, None], TIMING, model="swept")
+    both = rsv.detect_swept_tone(torch.stack([frames, other])[:, :, None], TIMING)
     times = TIMING.row_starts(FRAMES, HEIGHT)
     for index, single in enumerate((found, rsv.detect_swept_tone(other, TIMING))):
         one = both[index]

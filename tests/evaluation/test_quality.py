@@ -8,7 +8,7 @@ import torch
 from refusals import refuses
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from rsvib_torch.evaluation import offset_endpoint_error, psnr, ssim
+from rsvib_torch.evaluation import psnr, ssim
 
 
 def smooth_pair(shape, seed, noise=0.05):
@@ -124,20 +124,3 @@ def test_wrong_types_and_tiny_images_are_refused():
         psnr("image", torch.zeros(20, 20), 1.0)
     refuses(lambda: psnr(torch.zeros(20, 20, dtype=torch.complex64), torch.zeros(20, 20), 1.0), "complex", TypeError)
     refuses(lambda: ssim(torch.zeros(14, 24), torch.zeros(14, 24), 1.0, rim=2), "10 x 20")
-
-
-def test_offset_endpoint_error_is_a_distance_and_skips_failed_bands():
-    truth = torch.tensor([[1.0, 2.0], [1.0, 2.0], [0.0, 0.0]], dtype=torch.float64)
-    measured = torch.tensor([[4.0, 6.0], [1.0, 1.0], [math.nan, math.nan]])
-    assert offset_endpoint_error(measured, truth).item() == pytest.approx(3.0)
-    assert offset_endpoint_error(measured, truth, reduction="rms").item() == pytest.approx(math.sqrt(13.0))
-    distances = offset_endpoint_error(torch.stack([measured, measured]), truth, reduction="none")
-    assert distances.shape == (2, 3)
-    assert distances[1].nan_to_num(-1.0).tolist() == [5.0, 1.0, -1.0]
-    assert offset_endpoint_error(torch.full((4, 2), math.nan), torch.zeros(4, 2)).isnan().item()
-
-
-def test_offset_endpoint_error_refuses_other_shapes():
-    refuses(lambda: offset_endpoint_error(torch.zeros(4, 3), torch.zeros(4, 3)), r"\(4, 3\)")
-    refuses(lambda: offset_endpoint_error(torch.zeros(4, 2), torch.zeros(5, 2)), r"\(5, 2\)")
-    refuses(lambda: offset_endpoint_error(torch.zeros(4, 2), torch.zeros(4, 2), reduction="sum"), "reduction")

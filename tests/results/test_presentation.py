@@ -44,7 +44,10 @@ def make_detection(frames):
 
 @pytest.fixture(scope="module", name="windows")
 def make_windows(frames):
-    return rsv.detect_vibration(frames, TIMING, window=2, window_step=1)
+    starts = TIMING.frame_starts(4).tolist()
+    timings = [replace(TIMING, frame_start_times=tuple(starts[first : first + 2])) for first in range(3)]
+    found = [rsv.detect_vibration(frames[first : first + 2], timing) for first, timing in enumerate(timings)]
+    return rsv.DetectionResult.stacked(found)
 
 
 @pytest.fixture(scope="module", name="results")

@@ -68,7 +68,7 @@ def errors_of(found, start, first=0):
 
 def test_each_frame_has_the_vibration_at_its_time(place):
     frames = np.load(place / "frames.npy")
-    found = rsv.detect_vibration(frames, TIMING, follow=True)
+    found = rsv.follow_vibration(frames, TIMING)
     assert found.vibration.amplitude.shape == (FRAMES, 2, 1)
     errors, reliable = errors_of(found, 0.0), found.reliable.numpy()
     assert (reliable & (errors < 0.01)).all(1).sum() >= 36
@@ -88,7 +88,7 @@ def test_a_batch_of_stacks_read_from_below_is_followed(place):
         row_time=1e-4, exposure_rows=12, frame_rows=500, scan_axis="x", readout_direction="reverse"
     )
     batch = np.stack([frames[:, ::-1].transpose(0, 2, 1)[:, None]] * 2)
-    found = rsv.detect_vibration(batch, turned, follow=True)
+    found = rsv.follow_vibration(batch, turned)
     assert tuple(found.reliable.shape) == (2, 16, 2)
     assert found.reliable.all()
     amplitude = found.vibration.amplitude[1, 0].numpy().ravel()  # x across the rows
@@ -105,7 +105,7 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
         return (sizes * np.sin(2 * np.pi * hertz * times[..., None, None])).sum(-1)
 
     frames = take_frames(SCENE, TIMING, Curve(moved), 24, noise=0.003)
-    found = rsv.detect_vibration(frames, TIMING, follow=True)
+    found = rsv.follow_vibration(frames, TIMING)
     rows = np.arange(128) * TIMING.row_time + 0.5 * TIMING.exposure_time
     for number, axis in np.argwhere(found.reliable.numpy()):
         error = (
@@ -199,7 +199,7 @@ def test_following_is_refused_where_it_is_switched_off(place, tmp_path, capsys):
     shown = " ".join(capsys.readouterr().out.split())
     assert "0 restored" in shown
     assert "--follow" in shown
-    assert "follow=True" not in shown
+    assert "follow_vibration" not in shown
 
 
 @pytest.mark.parametrize(
