@@ -366,7 +366,8 @@ class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
     edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
     """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
     manifest: Path | None = None
-    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."""
+    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows. The page of
+    a run that followed the vibration shows the frames of that run, and detects nothing anew."""
     force: bool = False
     """Show the restored frames even if they are judged no better than the input."""
 
@@ -400,9 +401,17 @@ def report(given: ReportOptions) -> Answer:
     steps += answers.steps_after_detection(detection, frames, settings)
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
 
-    content = _page(
+    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and windows.output is not None:  # restored by windows, here as a whole
+        title = "Restoration of the page, of one vibration in all frames"
+        answer.results[title] = answer.results.pop("Restoration")
+        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
+    answer.next_steps += steps
+    return _write_page(
         given,
         windows,
+        answer,
+        boxes,
         frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
         restored=result.frames,
         was_restored=result.restored,
@@ -413,13 +422,6 @@ def report(given: ReportOptions) -> Answer:
         options=options,
         next_steps=tuple(answers.step_parts(step) for step in steps),
     )
-    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
-    if windows is not None and windows.output is not None:  # restored by windows, here as a whole
-        title = "Restoration of the page, of one vibration in all frames"
-        answer.results[title] = answer.results.pop("Restoration")
-        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    answer.next_steps += steps
-    return _write_page(given, content, answer, boxes)
 
 
 def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path, boxes: list[reports.Box]) -> Answer:
@@ -431,25 +433,27 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
     first, scale = max(windows.input["shape"][0] // 2 - 1, 0), windows.settings["full_scale"]
     of_both = ((given.stack, scale), (made, None if io.is_video(made) else scale))
     before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
-    followed = windows.followed()
-    content = _page(
+    answer = answers.windows_answer(f"Vibration in {given.stack.name}", windows)
+    answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
+    return _write_page(
         given,
         windows,
+        answer,
+        boxes,
         frames=before if windows.margins is None else Margins(**windows.margins).cut(before),
         restored=after,
         was_restored=True,
         timing=given.settings.timing,
         first=first,
-        image_motion=None if followed is None else followed.vibration.image_motion[first],
     )
-    answer = answers.windows_answer(f"Vibration in {given.stack.name}", windows)
-    answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    return _write_page(given, content, answer, boxes)
 
 
-def _page(given: ReportOptions, windows: stacks.StackManifest | None, **content: Any) -> reports.Report:
-    """Content of a page, with its head."""
-    return reports.Report(
+def _write_page(
+    given: ReportOptions, windows: stacks.StackManifest | None, answer: Answer, boxes: list[reports.Box], **content: Any
+) -> Answer:
+    """Write the page of this content, and add its files to the answer."""
+    inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
+    page = reports.Report(
         title=printable(f"Vibration in {given.stack.name}"),
         subtitle=printable(f"{given.stack}, camera of {given.settings.source}"),
         version=rsvib_torch.__version__,
@@ -457,13 +461,8 @@ def _page(given: ReportOptions, windows: stacks.StackManifest | None, **content:
         windows=windows,
         **content,
     )
-
-
-def _write_page(given: ReportOptions, content: reports.Report, answer: Answer, boxes: list[reports.Box]) -> Answer:
-    """Write the page, and add its files to the answer."""
-    inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     with whole_folder(given.out) as folder, working("writing the page"):
-        files = reports.write_report_page(folder, content, boxes or None)
+        files = reports.write_report_page(folder, page, boxes or None)
         shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
     answer.files += [given.out / name for name in files]
     return answer

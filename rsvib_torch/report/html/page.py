@@ -56,7 +56,6 @@ class Report:
     left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
     options: Table = field(default_factory=dict)  # options of ``restore``
     first: int = 0  # number of the first of the frames
-    image_motion: Tensor | None = None  # (2,) px/s, if there is no detection
     next_steps: tuple[tuple[str, str], ...] = ()  # what to do next, and the command that does it, or an empty text
     command: str | None = None  # the command line that wrote the page; None for a page written from Python
     windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
@@ -263,12 +262,13 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     figures = _mtf_drawings(measured, names)
     detected: dict[str, Any] = {"tried": [], "residuals": []}
     restored = report.was_restored
-    motion = torch.zeros(2) if report.image_motion is None else report.image_motion
+    shape = report.frames.shape
     if result is None:
         assert report.windows is not None
-        totals = report.windows.totals()
+        totals, followed = report.windows.totals(), report.windows.followed()
         mark = "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt"
-        sentences = [words.FOLLOWED]
+        sentences, shape = [words.FOLLOWED], report.windows.input["shape"]
+        motion = torch.zeros(2) if followed is None else followed.vibration.image_motion[report.first]
     else:
         removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
         motion = removed.image_motion
@@ -310,10 +310,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "mtf_head": mtf_head,
         "mtf_rows": [_edge_row(edge, restored) for edge in measured],
         "mtf_notes": notes,
-        "camera": words.camera_rows(
-            timing,
-            report.frames.shape if result is not None or report.windows is None else report.windows.input["shape"],
-        ),
+        "camera": words.camera_rows(timing, shape),
         "about": words.about_rows(report.created, report.version, report.command, report.options if restored else {}),
         "terms": words.TERMS,
     }
