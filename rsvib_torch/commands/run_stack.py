@@ -171,7 +171,7 @@ def _answer_of_windows(
         more, steps = ["--manifest", str(out / "manifest.json")], []
     if result.restored:
         steps.insert(0, answers.page_step(frames, out / "report", given.settings, *more))
-    elif not given.video and io.is_video(frames):
+    if not given.video and io.is_video(frames) and result.restored < result.windows:
         steps.insert(0, answers.run_step(frames, out / "followed", given.settings.arguments))
     answer.next_steps += steps
     return answer

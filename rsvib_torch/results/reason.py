@@ -154,6 +154,7 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
+_MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
 _FOLLOW = "use follow_vibration if the vibration changes"
 _TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
@@ -170,7 +171,7 @@ _TONES = {
     ),
     "no_tone": ReasonKind(
         "no significant tone: the offsets are those of a uniform motion, or below their noise",
-        "use more frames if a vibration is expected",
+        _MAY_BE_STILL,
     ),
     "too_many_tones": ReasonKind(
         "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
@@ -185,7 +186,7 @@ _TONES = {
     "tone_not_significant": ReasonKind(
         "tone of {frequency:.4g} Hz is not significant: its amplitude is {value:.3g} ± {std:.2g} px, and 4 standard "
         "deviations, {limit:.3g} px, are needed",
-        _MORE_FRAMES,
+        _MAY_BE_STILL,
         "amplitude of the only tone, below 4 standard deviations",
         "px",
     ),
