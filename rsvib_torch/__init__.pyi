@@ -14,174 +14,100 @@ from . import row_time as row_time
 from . import stacks as stacks
 from . import tracking as tracking
 from . import video as video
-from .augmentation import RollingShutterVibration
-from .detection import (
-    DetectionResult,
-    DisplacementSpectrum,
-    MotionDetection,
-    SweptTone,
-    TimingDiagnosis,
-    VibrationDetector,
-    detect_motion,
-    detect_swept_tone,
-    detect_vibration,
-    diagnose_timing,
-)
-from .evaluation import MtfCurve, SlantedEdge, find_slanted_edges, psnr, slanted_edge_mtf, ssim
-from .export import camera_isd, sampling_map, write_gcsv, write_isd, write_stmap
-from .gyroscope import (
-    AccelerometerComparison,
-    AngularRates,
-    ClockAlignment,
-    MotionCheck,
-    RotationAlignment,
-    align_motion,
-    check_motion,
-    compare_accelerometer,
-    read_gyroscope,
-)
-from .imaging import Optics, RowVaryingBlur, SensorNoise, row_psf, simulate_frames
-from .io import StackInfo, TimingWarning, open_stack, read_stack, read_stack_info, timing_from_first_frame, write_stack
-from .motion.camera import Camera
-from .motion.cameras import CameraMode, camera_mode, find_cameras
-from .motion.detected_vibration import FollowedVibration
-from .motion.recorded import read_motion
-from .motion.spline import FreeMotion
-from .motion.timing import SensorTiming
-from .motion.vibration import Vibration, VibrationStd, blind_frequencies
-from .registration import OffsetCurve, register_bands
-from .report import (
-    comparison_figure,
-    gain_figure,
-    motion_figure,
-    mtf_figure,
-    offset_figure,
-    psf_figure,
-    read_vibration,
-    rows_figure,
-    save_figure,
-    windows_figure,
-    write_offsets,
-    write_table,
-    write_vibration,
-)
-from .restoration import (
-    FixedDewarp,
-    RestorationMtf,
-    RestorationVerdict,
-    RestorationWarning,
-    VibrationRestorer,
-    judge_restoration,
-    restoration_mtf,
-    restore,
-    trusted_vibration,
-    visible_pixels,
-)
-from .row_time import (
-    RowTimeCalibration,
-    calibrate_row_time,
-    calibrate_row_time_by_exposure,
-    calibrate_row_time_by_motion,
-)
-from .stacks import StackReport, VibrationCorrector, iterate_stack, process_stack, read_manifest, restore_block
-from .tracking import TrackedFrame, VibrationTracker, follow_vibration
-from .video import Margins, VideoBorder, process_video
+from .augmentation import RollingShutterVibration as RollingShutterVibration
+from .detection import DetectionResult as DetectionResult
+from .detection import DisplacementSpectrum as DisplacementSpectrum
+from .detection import MotionDetection as MotionDetection
+from .detection import SweptTone as SweptTone
+from .detection import TimingDiagnosis as TimingDiagnosis
+from .detection import VibrationDetector as VibrationDetector
+from .detection import detect_motion as detect_motion
+from .detection import detect_swept_tone as detect_swept_tone
+from .detection import detect_vibration as detect_vibration
+from .detection import diagnose_timing as diagnose_timing
+from .evaluation import MtfCurve as MtfCurve
+from .evaluation import SlantedEdge as SlantedEdge
+from .evaluation import find_slanted_edges as find_slanted_edges
+from .evaluation import psnr as psnr
+from .evaluation import slanted_edge_mtf as slanted_edge_mtf
+from .evaluation import ssim as ssim
+from .export import camera_isd as camera_isd
+from .export import sampling_map as sampling_map
+from .export import write_gcsv as write_gcsv
+from .export import write_isd as write_isd
+from .export import write_stmap as write_stmap
+from .gyroscope import AccelerometerComparison as AccelerometerComparison
+from .gyroscope import AngularRates as AngularRates
+from .gyroscope import ClockAlignment as ClockAlignment
+from .gyroscope import MotionCheck as MotionCheck
+from .gyroscope import RotationAlignment as RotationAlignment
+from .gyroscope import align_motion as align_motion
+from .gyroscope import check_motion as check_motion
+from .gyroscope import compare_accelerometer as compare_accelerometer
+from .gyroscope import read_gyroscope as read_gyroscope
+from .imaging import Optics as Optics
+from .imaging import RowVaryingBlur as RowVaryingBlur
+from .imaging import SensorNoise as SensorNoise
+from .imaging import row_psf as row_psf
+from .imaging import simulate_frames as simulate_frames
+from .io import StackInfo as StackInfo
+from .io import TimingWarning as TimingWarning
+from .io import open_stack as open_stack
+from .io import read_stack as read_stack
+from .io import read_stack_info as read_stack_info
+from .io import timing_from_first_frame as timing_from_first_frame
+from .io import write_stack as write_stack
+from .motion.camera import Camera as Camera
+from .motion.cameras import CameraMode as CameraMode
+from .motion.cameras import camera_mode as camera_mode
+from .motion.cameras import find_cameras as find_cameras
+from .motion.detected_vibration import FollowedVibration as FollowedVibration
+from .motion.recorded import read_motion as read_motion
+from .motion.spline import FreeMotion as FreeMotion
+from .motion.timing import SensorTiming as SensorTiming
+from .motion.vibration import Vibration as Vibration
+from .motion.vibration import VibrationStd as VibrationStd
+from .motion.vibration import blind_frequencies as blind_frequencies
+from .registration import OffsetCurve as OffsetCurve
+from .registration import register_bands as register_bands
+from .report import comparison_figure as comparison_figure
+from .report import gain_figure as gain_figure
+from .report import motion_figure as motion_figure
+from .report import mtf_figure as mtf_figure
+from .report import offset_figure as offset_figure
+from .report import psf_figure as psf_figure
+from .report import read_vibration as read_vibration
+from .report import rows_figure as rows_figure
+from .report import save_figure as save_figure
+from .report import windows_figure as windows_figure
+from .report import write_offsets as write_offsets
+from .report import write_table as write_table
+from .report import write_vibration as write_vibration
+from .restoration import FixedDewarp as FixedDewarp
+from .restoration import RestorationMtf as RestorationMtf
+from .restoration import RestorationVerdict as RestorationVerdict
+from .restoration import RestorationWarning as RestorationWarning
+from .restoration import VibrationRestorer as VibrationRestorer
+from .restoration import judge_restoration as judge_restoration
+from .restoration import restoration_mtf as restoration_mtf
+from .restoration import restore as restore
+from .restoration import trusted_vibration as trusted_vibration
+from .restoration import visible_pixels as visible_pixels
+from .row_time import RowTimeCalibration as RowTimeCalibration
+from .row_time import calibrate_row_time as calibrate_row_time
+from .row_time import calibrate_row_time_by_exposure as calibrate_row_time_by_exposure
+from .row_time import calibrate_row_time_by_motion as calibrate_row_time_by_motion
+from .stacks import StackReport as StackReport
+from .stacks import VibrationCorrector as VibrationCorrector
+from .stacks import iterate_stack as iterate_stack
+from .stacks import process_stack as process_stack
+from .stacks import read_manifest as read_manifest
+from .stacks import restore_block as restore_block
+from .tracking import TrackedFrame as TrackedFrame
+from .tracking import VibrationTracker as VibrationTracker
+from .tracking import follow_vibration as follow_vibration
+from .video import Margins as Margins
+from .video import VideoBorder as VideoBorder
+from .video import process_video as process_video
 
-__all__ = [
-    "AccelerometerComparison",
-    "AngularRates",
-    "Camera",
-    "CameraMode",
-    "ClockAlignment",
-    "DetectionResult",
-    "DisplacementSpectrum",
-    "FixedDewarp",
-    "FollowedVibration",
-    "FreeMotion",
-    "Margins",
-    "MotionCheck",
-    "MotionDetection",
-    "MtfCurve",
-    "OffsetCurve",
-    "Optics",
-    "RestorationMtf",
-    "RestorationVerdict",
-    "RestorationWarning",
-    "RollingShutterVibration",
-    "RotationAlignment",
-    "RowTimeCalibration",
-    "RowVaryingBlur",
-    "SensorNoise",
-    "SensorTiming",
-    "SlantedEdge",
-    "StackInfo",
-    "StackReport",
-    "SweptTone",
-    "TimingDiagnosis",
-    "TimingWarning",
-    "TrackedFrame",
-    "Vibration",
-    "VibrationCorrector",
-    "VibrationDetector",
-    "VibrationRestorer",
-    "VibrationStd",
-    "VibrationTracker",
-    "VideoBorder",
-    "align_motion",
-    "blind_frequencies",
-    "calibrate_row_time",
-    "calibrate_row_time_by_exposure",
-    "calibrate_row_time_by_motion",
-    "camera_isd",
-    "camera_mode",
-    "check_motion",
-    "compare_accelerometer",
-    "comparison_figure",
-    "detect_motion",
-    "detect_swept_tone",
-    "detect_vibration",
-    "diagnose_timing",
-    "find_cameras",
-    "find_slanted_edges",
-    "follow_vibration",
-    "gain_figure",
-    "iterate_stack",
-    "judge_restoration",
-    "motion_figure",
-    "mtf_figure",
-    "offset_figure",
-    "open_stack",
-    "process_stack",
-    "process_video",
-    "psf_figure",
-    "psnr",
-    "read_gyroscope",
-    "read_manifest",
-    "read_motion",
-    "read_stack",
-    "read_stack_info",
-    "read_vibration",
-    "register_bands",
-    "restoration_mtf",
-    "restore",
-    "restore_block",
-    "row_psf",
-    "rows_figure",
-    "sampling_map",
-    "save_figure",
-    "simulate_frames",
-    "slanted_edge_mtf",
-    "ssim",
-    "timing_from_first_frame",
-    "trusted_vibration",
-    "visible_pixels",
-    "windows_figure",
-    "write_gcsv",
-    "write_isd",
-    "write_offsets",
-    "write_stack",
-    "write_stmap",
-    "write_table",
-    "write_vibration",
-]
 __version__: str

@@ -49,7 +49,7 @@ ATTACKS: dict[str, Attack] = {
     "concurrent": Attack("several runs with one output", 45),
     "disks": Attack("full and read-only disks", 69),
     "live_sessions": Attack("recordings of a camera", 204),
-    "memory": Attack("`--memory` in different layouts", 17),
+    "memory": Attack("`--memory` in different layouts", 15),
     "crafted": Attack("crafted files", 200),
     "workers": Attack("killed and missing Dask workers", 9),
     "api": Attack("hostile arguments of Python functions", 4000),

@@ -59,8 +59,7 @@ class ImageMotion:
     def trajectory(self) -> tuple[Tensor, Tensor]:
         """Components (B, R, N, A) at the Gauss-Legendre nodes of the exposures of rows, and weights (N,)."""
         rows = torch.arange(self.size[0], dtype=torch.float64, device=self.starts.device)
-        starts = self.starts[:, None] + rows * self.timing.row_time
-        motion = self.vibration
+        starts, motion = self.starts[:, None] + rows * self.timing.row_time, self.vibration
         if self.turns:  # the last column moves farthest
             last = torch.full((1,), 0.5 * self.size[1], dtype=torch.float64, device=starts.device)
             motion = ColumnMotion.of_columns(motion, last, self.timing, 1, self.size[0])
@@ -75,29 +74,21 @@ class ImageMotion:
         return _with_turns(self.vibration.mean_displacement(starts, self.exposure_time[:, None]))
 
     def move(self, points: Tensor) -> Tensor:
-        """Positions (B, S, 2) in the frame of scene points (B, S, 2) in px, both (x, y).
-
-        Newton's method for the row that shows each point, as in ``rows_showing``.
-        """
+        """Positions (x, y) in the frame of scene points (B, S, 2) in px, by Newton's method for their rows."""
         x, y = (points[..., 1 - axis] - 0.5 * (self.size[axis] - 1) for axis in (1, 0))
         rows, exposure = points[..., 1], self.exposure_time[:, None]
         for _ in range(8):
             residual = points[..., 1] + displacement_at(self.mean_displacement(rows), x, y)[..., 1] - rows
             starts = self.starts[:, None] + rows * self.timing.row_time
-            begin, end = (
-                displacement_at(_with_turns(self.vibration.displacement(times)), x, y)[..., 1].detach()
-                for times in (starts, starts + exposure)
-            )
+            components = (_with_turns(self.vibration.displacement(times)) for times in (starts, starts + exposure))
+            begin, end = (displacement_at(at_time, x, y)[..., 1].detach() for at_time in components)
             slope = (end - begin) * self.timing.row_time / exposure
             rows = rows + residual / (1.0 - slope).clamp(min=0.1)
         return torch.stack([points[..., 0] + displacement_at(self.mean_displacement(rows), x, y)[..., 0], rows], -1)
 
     @full_precision
     def move_images(self, images: Tensor, interpolation: Interpolation) -> Tensor:
-        """Form frames (B, C, R, W) from still images of the same shape, in row order, with mirrored boundaries.
-
-        Half-precision images are formed in float32.
-        """
+        """Form frames (B, C, R, W) in row order from still images, with mirrored boundaries, at least in float32."""
         dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
         components, weights = self.trajectory()
         strips = self._strips()
@@ -138,9 +129,8 @@ class ImageMotion:
         right, down = columns - x - middle_x, rows[:, None] - y - middle_y
         size = scale.square() + roll.square()
         right, down = (scale * right + roll * down) / size + middle_x, (scale * down - roll * right) / size + middle_y
-        source_rows, source_columns = (
-            mirrored(place.round().to(torch.int64), length) for place, length in ((down, R), (right, W))
-        )
+        places = (mirrored(place.round().to(torch.int64), length) for place, length in ((down, R), (right, W)))
+        source_rows, source_columns = places
         index = (source_rows * W + source_columns).flatten(1)[:, None].expand(-1, masks.shape[1], -1)
         return masks.flatten(-2).gather(-1, index).reshape(masks.shape)
 
@@ -154,9 +144,8 @@ class ImageMotion:
         count = int((high - low)[..., 1].amax().ceil()) + 2
         steps = torch.linspace(0.0, 1.0, count, dtype=boxes.dtype, device=boxes.device)
         side_rows = low[..., 1, None] + (high - low)[..., 1, None] * steps  # (B, N, S), at most one row apart
-        sides = torch.stack(
-            [torch.stack([x[..., None].expand_as(side_rows), side_rows], -1) for x in (low[..., 0], high[..., 0])], -3
-        )
+        columns = (x[..., None].expand_as(side_rows) for x in (low[..., 0], high[..., 0]))
+        sides = torch.stack([torch.stack([of_side, side_rows], -1) for of_side in columns], -3)
         moved = self.move(sides.flatten(1, -2)).reshape(sides.shape).flatten(2, 3)
         lowest, highest = moved.amin(-2)[..., None, :], moved.amax(-2)[..., None, :]
         is_high = boxes == high[..., None, :]  # per corner and coordinate
@@ -174,9 +163,8 @@ def _axis_ranges(name: str, value: Range, *, at_least: float = -math.inf) -> tup
     ranges = []
     for pair in pairs:
         if len(pairs) != 2 or not isinstance(pair, Sequence) or len(pair) != 2:
-            raise TypeError(
-                f"{name} must be a number, (low, high) or ((low, high), (low, high)) for x and y, got {quoted(value)}"
-            )
+            forms = "a number, (low, high) or ((low, high), (low, high)) for x and y"
+            raise TypeError(f"{name} must be {forms}, got {quoted(value)}")
         low, high = (check_number(name, number, at_least=at_least) for number in pair)
         if low > high:
             raise ValueError(f"{name} must not have low above high, got ({low:g}, {high:g})")
@@ -187,10 +175,9 @@ def _axis_ranges(name: str, value: Range, *, at_least: float = -math.inf) -> tup
 class RollingShutterVibration(GeometricAugmentationBase2D):
     """Record images of a still scene with a vibrating rolling-shutter camera (Eq. 9 of Liu et al. 2023).
 
-    ``g(x, y) = 1/T_e int f[x - X(t), y - Y(t)] dt`` for every row over its own exposure, with random vibration, image
-    motion and exposure. Images are distorted and blurred; keypoints move by the mean displacement of the row that shows
-    them, masks likewise to the nearest pixel, and boxes become the smallest upright boxes around their distorted
-    content. Images and masks are mirrored at their boundaries.
+    Every row is exposed at its own time, with random vibration, image motion and exposure. Images are distorted and
+    blurred; keypoints move by the mean displacement of the row that shows them, masks likewise to the nearest pixel;
+    boxes become the smallest upright ones around their content. Images and masks are mirrored at their boundaries.
 
     An image is frame 0 of a recording. In ``VideoSequential`` the frames of a clip that share one draw
     (``same_on_frame=True``, Kornia's default) are consecutive frames of one recording, ``frame_rows`` apart.
@@ -204,8 +191,8 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
         frequency: Range of f in Hz.
         phase: Range of phi in rad.
         image_motion: Range of v in px/s.
-        roll: Range of the amplitude of the rotation about the optical axis in rad, ``(low, high)`` or a number; None
-            for no roll. Frequency and phase are drawn from the ranges of x.
+        roll: Range of the amplitude of the rotation about the optical axis in rad, ``(low, high)`` or a number, with
+            frequency and phase from the ranges of x; None for no roll.
         zoom: The same for the relative change of scale.
         exposure_rows: Exposure in row times, a number or ``(low, high)``; by default that of the sensor.
         tones: Number of tones of each axis.
@@ -254,15 +241,12 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             if isinstance(of_turn, Sequence) and any(isinstance(part, Sequence) for part in of_turn):
                 raise TypeError(f"{name} must be a number or (low, high), got {quoted(of_turn)}")
             turns += _axis_ranges(name, of_turn or 0.0, at_least=0.0)[:1]
-        frequencies, phases = _axis_ranges("frequency", frequency, at_least=0.0), _axis_ranges("phase", phase)
-        self.flags = {
-            "amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns,
-            "frequency": frequencies + frequencies[:1] * len(turns),
-            "phase": phases + phases[:1] * len(turns),
-            "image_motion": _axis_ranges("image_motion", image_motion),
-            "exposure_rows": exposures,
-            "interpolation": interpolation,
-        }
+        self.flags = {"image_motion": _axis_ranges("image_motion", image_motion), "exposure_rows": exposures}
+        self.flags |= {"amplitude": _axis_ranges("amplitude", amplitude, at_least=0.0) + turns}
+        for name, drawn, lowest in (("frequency", frequency, 0.0), ("phase", phase, -math.inf)):
+            ranges = _axis_ranges(name, drawn, at_least=lowest)
+            self.flags[name] = ranges + ranges[:1] * len(turns)
+        self.flags["interpolation"] = interpolation
 
     def forward(self, input: Tensor, params: Parameters | None = None, **kwargs: Any) -> Tensor:
         """Record images (H, W), (C, H, W) or (B, C, H, W); the other arguments are those of Kornia's augmentations."""
@@ -297,12 +281,12 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
             raise ValueError("no vibration has been drawn yet: call the augmentation first")
         taken = self._gate(params).to(torch.float64)
         drawn = {name: params[name] for name in ("amplitude", "frequency", "phase", "image_motion")}
-        drawn |= {"amplitude": drawn["amplitude"] * taken[:, None, None]}
-        drawn |= {"image_motion": drawn["image_motion"] * taken[:, None]}
+        drawn["amplitude"] = drawn["amplitude"] * taken[:, None, None]
+        drawn["image_motion"] = drawn["image_motion"] * taken[:, None]
         step = self._recording_length(params)
         return Vibration(**{name: value[::step] for name, value in drawn.items()}, camera=None)
 
-    def compute_transformation(self, input: Tensor, params: Parameters, flags: Table) -> Tensor:
+    def compute_transformation(self, input: Tensor, *_: Any, **__: Any) -> Tensor:
         """Return identities (B, 3, 3): no matrix describes rows that move by different amounts."""
         return self.identity_matrix(input)
 
@@ -311,35 +295,28 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     ) -> Tensor:
         """Distort and blur images (B, C, H, W)."""
         if channels_appear_last(input.shape):
-            raise ValueError(
-                f"images of shape {tuple(input.shape)} appear to have their channels last: pass images.movedim(-1, -3)"
-            )
+            shape = tuple(input.shape)
+            raise ValueError(f"images of shape {shape} appear to have their channels last: pass images.movedim(-1, -3)")
         if input.numel() == 0:
             return input
         images = frames_to_row_order(input, self.timing)
         moved = self._motion(params, images).move_images(images, flags["interpolation"])
         return frames_from_row_order(moved, self.timing)
 
-    def apply_transform_mask(
-        self, input: Tensor, params: Parameters, flags: Table, transform: Tensor | None = None
-    ) -> Tensor:
+    def apply_transform_mask(self, input: Tensor, params: Parameters, *_: Any, **__: Any) -> Tensor:
         """Move masks (B, C, H, W) to the nearest pixel."""
         if input.numel() == 0:
             return input
         masks = frames_to_row_order(input, self.timing)
         return frames_from_row_order(self._motion(params, masks).move_masks(masks), self.timing)
 
-    def apply_transform_keypoint(
-        self, input: Keypoints, params: Parameters, flags: Table, transform: Tensor | None = None
-    ) -> Keypoints:
+    def apply_transform_keypoint(self, input: Keypoints, params: Parameters, *_: Any, **__: Any) -> Keypoints:
         """Move keypoints to their positions in the frame."""
         output = input.clone()
         output._data = self._moved(input.data, params, (2,), ImageMotion.move)
         return output
 
-    def apply_transform_box(
-        self, input: Boxes, params: Parameters, flags: Table, transform: Tensor | None = None
-    ) -> Boxes:
+    def apply_transform_box(self, input: Boxes, params: Parameters, *_: Any, **__: Any) -> Boxes:
         """Return the smallest upright boxes around the moved content of the boxes."""
         output = input.clone()
         output._data = self._moved(input.data, params, (4, 2), ImageMotion.move_boxes)
@@ -364,8 +341,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
     def _motion(self, params: Parameters, like: Tensor) -> ImageMotion:
         """The drawn motion of a batch in row order."""
         drawn = {name: params[name].to(dtype=torch.float64, device=like.device) for name in _DRAWN}
-        exposure_rows = drawn.pop("exposure_rows")
-        amplitude = drawn.pop("amplitude")
+        exposure_rows, amplitude = drawn.pop("exposure_rows"), drawn.pop("amplitude")
         vibration = Vibration(amplitude, camera=None, **drawn).to_row_order(self.timing)
         self.timing.check_rows(self._size(params)[0])
         length = self._recording_length(params)
@@ -394,8 +370,7 @@ class RollingShutterVibration(GeometricAugmentationBase2D):
 
     def inverse_transform(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Raise an error: the blur is inverted by restoration only."""
-        raise NotImplementedError(
-            "RollingShutterVibration has no inverse; restore(frames, timing, vibration) removes a known vibration"
-        )
+        remedy = "restore(frames, timing, vibration) removes a known vibration"
+        raise NotImplementedError(f"RollingShutterVibration has no inverse; {remedy}")
 
     inverse_boxes = inverse_keypoints = inverse_transform

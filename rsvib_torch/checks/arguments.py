@@ -51,10 +51,7 @@ def check_tensor(name: str, value: object) -> Tensor:
 
 
 def as_numbers(name: str, value: object, device: torch.device | None = None) -> Tensor:
-    """Return a copy of a tensor, a number or a nested list of numbers as a float64 tensor; gradients are kept.
-
-    By default on the device of a tensor.
-    """
+    """A copy of a number, tensor or nested list as a float64 tensor, by default on its device; gradients are kept."""
     if isinstance(value, Tensor):
         return check_tensor(name, value).to(dtype=torch.float64, device=device, copy=True)
     if isinstance(value, np.ma.MaskedArray):
@@ -62,25 +59,16 @@ def as_numbers(name: str, value: object, device: torch.device | None = None) -> 
     try:
         return torch.tensor(value, dtype=torch.float64, device="cpu" if device is None else device)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise TypeError(
-            f"{name} must be a number, a tensor, or numbers in lists of equal lengths, got {described(value)}"
-        ) from error
+        expected = "a number, a tensor, or numbers in lists of equal lengths"
+        raise TypeError(f"{name} must be {expected}, got {described(value)}") from error
 
 
 def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
     """Raise a ``ValueError`` unless tensors have the stated shapes.
 
-    Args:
-        values: Tensors by name; None and names without a stated shape are omitted.
-        shapes: Axes of a tensor: a size; a name for a size of at least 1 that is the same in all tensors, with its
-            limits if there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or
-            ``[...]`` for these or none. ``...`` alone, for values that are not tensors, is not checked.
-
-    Example:
-        >>> check_shapes({"scene": torch.zeros(3)}, {"scene": "... H W"})
-        Traceback (most recent call last):
-        ...
-        ValueError: scene must have shape (..., H, W), got (3,)
+    Stated are the axes: a size; a name for a size of at least 1 that is the same in all tensors, with its limits if
+    there are any (``A=2-4``); ``...`` for leading dimensions that are the same in all tensors, or ``[...]`` for these
+    or none. ``...`` alone, for values that are not tensors, is not checked; None is omitted.
     """
     known: dict[str, Any] = {}
     for name, stated in shapes.items():
@@ -98,12 +86,12 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
         if not fits or batch not in batches:
             names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
-            limits = {axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high}
-            sizes_known = [f"{axis} = {(limits | known)[axis]}" for axis in names if axis in limits | known]
-            where = f" with {', '.join(sizes_known)}" if sizes_known else ""
-            raise ValueError(
-                f"{name} must have shape ({', '.join(names)}{',' * (len(names) == 1)}){where}, got {shape}"
-            )
+            limits = {
+                axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high
+            } | known
+            where = ", ".join(f"{axis} = {limits[axis]}" for axis in names if axis in limits)
+            expected = f"({', '.join(names)}{',' * (len(names) == 1)}){' with ' * bool(where)}{where}"
+            raise ValueError(f"{name} must have shape {expected}, got {shape}")
         known |= {axis: size for (axis, low, high), size in zip(axes, sizes, strict=True) if low < high}
         if batch or lead == "...":
             known["..."] = batch
@@ -125,9 +113,8 @@ def check_images(images: Mapping[str, Tensor], shapes: Mapping[str, str]) -> Non
     """Check that tensors are floating-point images of the shapes of ``check_shapes``."""
     for name, image in images.items():
         if not image.is_floating_point():
-            raise TypeError(
-                f"{name} must be a floating-point tensor, got {image.dtype}; divide counts by their full scale"
-            )
+            problem = f"must be a floating-point tensor, got {image.dtype}"
+            raise TypeError(f"{name} {problem}; divide counts by their full scale")
     check_shapes(images, shapes)
 
 
@@ -141,9 +128,8 @@ def check_pixels(name: str, pixels: Tensor) -> None:
         raise ValueError(f"{name} must be finite, but pixel {pixel} is {pixels[pixel].item()}")
     largest = float(ends.abs().max())
     if largest > MAX_NUMBER:
-        raise ValueError(
-            f"{name} reach {largest:.3g}, at most {MAX_NUMBER:g} is possible: divide them by their full scale"
-        )
+        problem = f"reach {largest:.3g}, at most {MAX_NUMBER:g} is possible"
+        raise ValueError(f"{name} {problem}: divide them by their full scale")
 
 
 def check_broadcast(**tensors: object) -> None:
@@ -175,15 +161,6 @@ def checks_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Check the arguments of a function against its annotations before each call.
 
     Arguments that accept arrays are left to ``as_tensor``, which the function calls. Compiled graphs omit the checks.
-
-    Example:
-        >>> @checks_arguments
-        ... def doubled(count: int) -> int:
-        ...     return 2 * count
-        >>> doubled("3")
-        Traceback (most recent call last):
-        ...
-        TypeError: count must be a whole number, got '3' (str)
     """
     parameters = inspect.signature(function).parameters.values()
     # inspect.Signature.bind would take longer than the checks; calls that it refuses are refused by the function

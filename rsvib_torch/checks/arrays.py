@@ -22,12 +22,6 @@ def as_tensor(name: str, value: object) -> Tensor:
 
     The tensor shares the memory of an array if PyTorch supports its layout. Read-only arrays and arrays with negative
     strides or foreign byte order (FITS and TIFF files) are copied.
-
-    Example:
-        >>> as_tensor("frames", np.arange(3, dtype=">u2")[::-1]).tolist()
-        [2, 1, 0]
-        >>> as_tensor("frames", [torch.zeros(4, 5), torch.ones(4, 5)]).shape
-        torch.Size([2, 4, 5])
     """
     if isinstance(value, Tensor):
         return check_tensor(name, value)
@@ -44,13 +38,11 @@ def as_tensor(name: str, value: object) -> Tensor:
         return check_tensor(name, torch.as_tensor(value, device="cpu"))
     except (TypeError, ValueError, RuntimeError) as error:
         kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
-        files = isinstance(value, (str, os.PathLike)) or (
-            isinstance(value, (list, tuple)) and any(isinstance(item, (str, os.PathLike)) for item in value)
-        )
+        items = value if isinstance(value, (list, tuple)) else [value]
+        files = any(isinstance(item, (str, os.PathLike)) for item in items)
         remedy = "; read files with read_stack" if files else "; pass a list" if isinstance(value, Iterator) else ""
-        raise TypeError(
-            f"{name} must be a tensor or array of numbers, got {type(value).__name__}{kind}{remedy}"
-        ) from error
+        got = f"{type(value).__name__}{kind}{remedy}"
+        raise TypeError(f"{name} must be a tensor or array of numbers, got {got}") from error
 
 
 def _is_array(value: object) -> bool:
@@ -60,15 +52,10 @@ def _is_array(value: object) -> bool:
 
 def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
     """The tensors of a list in one tensor."""
-
-    def described(item: Tensor) -> str:
-        return f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}"
-
-    for index, item in enumerate(items):
-        if described(item) != described(items[0]):
-            raise ValueError(
-                f"{name} must be alike, but {name}[{index}] is {described(item)} and {name}[0] is {described(items[0])}"
-            )
+    kinds = [f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}" for item in items]
+    for index, kind in enumerate(kinds):
+        if kind != kinds[0]:
+            raise ValueError(f"{name} must be alike, but {name}[{index}] is {kind} and {name}[0] is {kinds[0]}")
     return torch.stack(list(items))
 
 

@@ -100,18 +100,13 @@ class Extensible:
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
 def options(group: type[_Group]) -> type[_Group]:
-    """Make a class a group of options: a frozen dataclass whose values are checked.
+    """Make a class a group of options: a frozen dataclass whose values are checked."""
 
-    Example:
-        >>> @options
-        ... class Bands:
-        ...     band_rows: int = Field(default=32, ge=4)
-        >>> Bands(band_rows=2)
-        Traceback (most recent call last):
-        ...
-        ValueError: band_rows must be at least 4, got 2 (int)
-    """
-    group.__get_pydantic_core_schema__ = classmethod(_accepts_tables)  # type: ignore[attr-defined]
+    def accept_tables(_: type, source: object, handler: Callable[[object], Table]) -> Table:
+        schema = handler(source)  # the group can be a table, whose values are not converted nevertheless
+        return schema | {"strict": False} if schema["type"] == "dataclass" else schema
+
+    group.__get_pydantic_core_schema__ = classmethod(accept_tables)  # type: ignore[attr-defined]
     made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
     initialise = made.__init__
     _describe(made)
@@ -134,12 +129,6 @@ def _describe(group: type) -> None:
         stated = (getattr(kind, "__pydantic_fields__", {}).get(name) for kind in group.__mro__)
         described_by = next((one for one in stated if one is not None and one.description), field)
         field.description = " ".join((described_by.description or "").split())
-
-
-def _accepts_tables(_: type, source: object, handler: Callable[[object], Table]) -> Table:
-    """Schema of a group that can be a table; its values are not converted nevertheless."""
-    schema = handler(source)
-    return schema | {"strict": False} if schema["type"] == "dataclass" else schema
 
 
 def _plain(value: Any) -> Any:
@@ -192,11 +181,10 @@ def _without_bounds(annotation: Any) -> Any:
 
 def _with_options(text: str, group: type) -> str:
     """A docstring in which the line ``options:`` is replaced by the options of a group; without text, only these."""
-    lines = (text or "Args:\n    options: Options.").splitlines()
-    place = next((number for number, line in enumerate(lines) if line.startswith("    options:")), len(lines))
     entries = (f"{name}: {field.description}" for name, field in fields_of(group).items())
     listed = [fill(entry, 116, initial_indent=" " * 4, subsequent_indent=" " * 8) for entry in entries]
-    return "\n".join([*lines[:place], *listed, *lines[place + 1 :]])
+    before, _, after = (text or "Args:\n    options: Options.").partition("    options:")
+    return "\n".join([before.removesuffix("\n"), *listed, *after.splitlines()[1:]])
 
 
 def not_an_option(name: str, message: str) -> PydanticCustomError:
@@ -387,15 +375,15 @@ def expected_text(annotation: object) -> str:
 
 def read_json(path: Path, what: str) -> Table:
     """Read a table from a JSON file of a kind, at most 1 GB."""
+
+    def refuse(name: str) -> float:
+        raise ValueError(f"{name} is not a JSON number")
+
     try:
         text = read_text(path, at_most=_MAX_JSON_BYTES)
-        data = json.loads(text, parse_constant=_no_constant)
+        data = json.loads(text, parse_constant=refuse)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a {what}: {error}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{path}: not a {what}: expected a table, got {type(data).__name__}")
     return data
-
-
-def _no_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")

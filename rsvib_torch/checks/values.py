@@ -15,12 +15,7 @@ MAX_NUMBER = 1e15
 
 
 def described(value: object) -> str:
-    """Type of a value, with the value if it is short, for error messages.
-
-    Example:
-        >>> described("3"), described(None), described([1, 2]), described([0.5] * 99)
-        ("'3' (str)", 'None', '[1, 2]', 'list')
-    """
+    """Type of a value, with the value if it is short, for error messages."""
     if value is None or getattr(value, "is_nested", False):
         return "None" if value is None else "a nested tensor"  # whose shape raises an error
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
@@ -95,6 +90,5 @@ def needed_package(name: str, purpose: str, extra: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
             raise
-        raise ModuleNotFoundError(
-            f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]", name=error.name
-        ) from error
+        needed = f"{purpose} needs the package {name.partition('.')[0]}: pip install rsvib_torch[{extra}]"
+        raise ModuleNotFoundError(needed, name=error.name) from error

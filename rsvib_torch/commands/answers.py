@@ -95,12 +95,10 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
         lines.append("cannot determine whether restoration helps: no two frames show the same scene")
     elif not result.moves:
         lines.append("no vibration was found that can be removed")
-    lines += [
-        f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"  # printed before
-        if reason.code == "axis_not_reliable"
-        else str(reason)
-        for reason in result.left_alone
-    ]
+    for reason in result.left_alone:
+        is_above = reason.code == "axis_not_reliable"  # its reasons were printed before
+        text = f"{reason.axis} unchanged: its vibration is not reliable, see the reasons above"
+        lines.append(text if is_above else str(reason))
     return [wrapped(line) for line in lines]
 
 

@@ -76,24 +76,27 @@ def export(given: ExportOptions) -> Answer:
     detected = reports.load_detection(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)
-        return Answer({"Offsets before and after correction": _residuals(detected)}, {"format": chosen}, [out])
+        lines = []  # for each axis, root mean square of the offsets and of the residuals
+        for axis, name in enumerate(AXES[: detected.vibration.num_axes]):
+            before = detected.offsets.offsets[..., axis][detected.offsets.good]
+            after, unit = before - detected.fitted[..., axis][detected.offsets.good], ("px", "px", "rad", "")[axis]
+            size = [f"{float(values.square().mean().sqrt()):.3g} {unit}" for values in (before, after)]
+            lines.append(f"{name}: {size[0]} before, {size[1]} after (root mean square)")
+        return Answer({"Offsets before and after correction": lines}, {"format": chosen}, [out])
     timing = detected.timing
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
     data: Table = {"format": chosen}
     if chosen == "isd":
         if given.camera_isd is None:
-            raise ValueError(
-                "isd needs the ISD of the camera at rest: give --isd FILE; camera_isd of Python builds one"
-            )
+            raise ValueError("isd needs the ISD of the camera at rest: give --isd FILE; camera_isd builds one")
         found = read_json(given.camera_isd, "ISD")
         rows = found.get("image_lines")
         motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)
-        written = exports.write_isd(
-            out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
-        )
-        form = "frame camera with jitter polynomials"
-        form = form if written == "frame" else "line scanner with one quaternion per row"
+        of_isd: Table = {"frame": given.frame, "model": given.model, "tolerance": given.tolerance}
+        written = exports.write_isd(out, motion, timing, found, **of_isd)
+        frame = "frame camera with jitter polynomials"
+        form = frame if written == "frame" else "line scanner with one quaternion per row"
         data |= {"model": written, "frame": given.frame}
         return Answer({"Sensor model": [f"frame {given.frame} as a {form}"]}, data, [out])
     shape, count = _extent(given)
@@ -116,9 +119,7 @@ def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:
         shape = io.read_stack_info(given.frames).shape
         size, count = size or (shape[-2], shape[-1]), shape[0] if count is None else count
     if size is None or count is None:
-        raise ValueError(
-            "the size and the number of the frames are not known: give --frames, or --size and --num-frames"
-        )
+        raise ValueError("size and number of the frames are not known: give --frames, or --size and --num-frames")
     return size, count
 
 
@@ -131,28 +132,13 @@ def _trusted(
         motion, reasons = restoration.trusted_vibration(detected, timing, count, rows)
         notes = [str(replace(one, details={**one.details, "action": "exported"})) for one in reasons]
         if not bool(motion.moving_axes().any()):
-            raise ValueError(
-                f"nothing to export: {'; '.join(notes) or 'no vibration'}; --force exports it nevertheless"
-            )
+            why = "; ".join(notes) or "no vibration"
+            raise ValueError(f"nothing to export: {why}; --force exports it nevertheless")
         for note in notes:
             warn(note)
     if given.focal_length is None:
         return motion
     if motion.camera is not None:
-        raise ValueError(
-            f"the vibration was detected with focal_length={motion.camera.focal_length:g} px; omit --focal-length"
-        )
+        known = f"focal_length={motion.camera.focal_length:g} px"
+        raise ValueError(f"the vibration was detected with {known}; omit --focal-length")
     return motion.with_camera(rsvib_torch.Camera(given.focal_length))
-
-
-def _residuals(detected: rsvib_torch.DetectionResult) -> list[str]:
-    """A line for each axis: root mean square of the offsets and of the residuals."""
-    curve = detected.offsets
-    lines = []
-    for axis, name in enumerate(AXES[: detected.vibration.num_axes]):
-        before = curve.offsets[..., axis][curve.good]
-        after = before - detected.fitted[..., axis][curve.good]
-        unit = ("px", "px", "rad", "")[axis]
-        size = [f"{float(values.square().mean().sqrt()):.3g}" for values in (before, after)]
-        lines.append(f"{name}: {size[0]} {unit} before, {size[1]} {unit} after (root mean square)")
-    return lines

@@ -1,9 +1,11 @@
 """Commands ``init``, a configuration file for the camera of a stack, and ``cameras``, the known camera models."""
 
+import itertools
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -68,7 +70,10 @@ def init(given: InitOptions) -> Answer:
     """
     frames, out, sensor, camera, preset = given.frames, given.out, given.sensor, given.camera, given.preset
     if given.list_presets:
-        listed = {name: _first_comment(text) for name, text in presets().items()}
+        listed = {}
+        for name, text in presets().items():  # with the comment at the top in one line
+            comment = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+            listed[name] = " ".join(line.removeprefix("#").strip() for line in comment)
         return Answer({"Presets": [f"{name}: {text}" for name, text in listed.items()]}, {"presets": listed})
     if preset is not None and (frames is not None or sensor or camera is not None):
         raise ValueError("--preset is a complete configuration: give no frames and no values of the sensor with it")
@@ -80,23 +85,12 @@ def init(given: InitOptions) -> Answer:
         raise ValueError(f"{out} exists; --overwrite replaces it, --out FILE writes another file")
     check_outputs([out], [] if frames is None else io.stack_files(frames))
     check_writable(out)
-    if preset is not None:
-        if preset not in presets():
-            raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
-        text = presets()[preset]
-    else:
-        assert frames is not None
-        text = _describe_camera(frames, sensor, camera)
+    if preset is not None and preset not in presets():
+        raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
+    text = presets()[preset] if preset is not None else _describe_camera(Path(frames or ""), sensor, camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
     return Answer({}, {}, [out], [run_step(frames or Path("FRAMES"), Path("results"), ["--config", str(out)])])
-
-
-def _first_comment(text: str) -> str:
-    """The comment at the top of a preset in one line."""
-    lines = text.splitlines()
-    end = next(number for number, line in enumerate(lines) if not line.startswith("#"))
-    return " ".join(line.removeprefix("#").strip() for line in lines[:end])
 
 
 @options
@@ -115,15 +109,12 @@ def cameras(given: CamerasOptions) -> Answer:
     """
     modes = find_cameras(" ".join(given.search or ()))
     head = ("brand", "model", "view", "width x height", "fps", "readout (ms)", "row time (us)", "entries")
-    rows = [
-        (
-            *(mode.brand, mode.model, mode.lens, f"{mode.width} x {mode.height}", f"{mode.frame_rate:g}"),
-            measured_text(1e3 * mode.readout_time, 1e3 * mode.readout_time_std),
-            measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std),
-            str(mode.calibrations),
-        )
-        for mode in modes
-    ]
+    rows = []
+    for mode in modes:
+        readout = measured_text(1e3 * mode.readout_time, 1e3 * mode.readout_time_std)
+        times = (readout, measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std))
+        size = (f"{mode.width} x {mode.height}", f"{mode.frame_rate:g}")
+        rows.append((mode.brand, mode.model, mode.lens, *size, *times, str(mode.calibrations)))
     data = [asdict(mode) | {"row_time": mode.row_time, "row_time_std": mode.row_time_std} for mode in modes]
     return Answer({"Cameras": [text_table(head, rows, most=len(rows))]}, {"cameras": data})
 
@@ -132,9 +123,7 @@ def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> t
     """Row time in s of a camera model in the mode of the frames, and where it comes from."""
     if "frame_rate" not in values:
         raise ValueError(f"the mode of {camera} depends on the frame rate: give --frame-rate")
-    columns, rows = info.shape[-1], info.shape[-2]
-    if values.get("scan_axis") == "x":
-        columns, rows = rows, columns
+    rows, columns = info.shape[-2:] if values.get("scan_axis") != "x" else info.shape[:-3:-1]
     mode = camera_mode(camera, width=columns, height=rows, frame_rate=values["frame_rate"])
     time = measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std)
     return mode.row_time, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
@@ -142,15 +131,11 @@ def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> t
 
 def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -> str:
     """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
-    with working(f"reading {path}"):
-        reader = io.open_stack(path)
-        info = reader.info
-        first = reader.frame(0)
-        reader.close()
+    with working(f"reading {path}"), closing(io.open_stack(path)) as reader:
+        info, first = reader.info, reader.frame(0)
     size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
     note(f"{path}: {size}")
-    values = dict(given)
-    rows = info.shape[-1] if values.get("scan_axis") == "x" else info.shape[-2]
+    values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
     stated = stated_rate(info)
     if stated is not None and "frame_rate" not in given:
         values["frame_rate"] = stated
@@ -168,7 +153,11 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         except ValueError as error:
             proposal = f" The file names its camera, {info.camera}: {error}."
     if info.is_integer and info.full_scale is None:
-        likely["full_scale"] = _likely_full_scale(first)
+        # the largest count of the bit depth that the frame uses; multiples of 16 are 12 bits shifted by 4
+        import numpy as np  # noqa: PLC0415
+
+        step = max(int(np.gcd.reduce(first.ravel())), 1)
+        likely["full_scale"] = float(((1 << max(int(first.max()) // step, 255).bit_length()) - 1) * step)
     elif info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
     track = gyroscope.read_camera_track(path)
@@ -180,8 +169,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
             f"{math.degrees(track.turned):.2g} degrees, and their rows no longer show its motion"
         )
     _complete(values, rows, likely, proposal)
-    settings = read_config(None, sensor=values)
-    _check_timing(settings.timing, rows)
+    _check_timing(read_config(None, sensor=values).timing, rows)
     head = [
         f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
         "Values hold for one mode of the camera: resolution, cropping, binning and frame rate change the row time.",
@@ -191,61 +179,38 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
     if info.frame_times is not None and not info.time_error:
         head.append("The frames file states the time of every frame, which all commands use.")
     order = ("row_time", "exposure_time", "frame_rate", "scan_axis", "readout_direction", "full_scale")
-    defaults = {"scan_axis": "y", "readout_direction": "forward"}
-    values = defaults | values
+    values = {"scan_axis": "y", "readout_direction": "forward"} | values
     return sensor_toml({name: values[name] for name in order if name in values}, head)
-
-
-def _likely_full_scale(pixels: Any) -> float:
-    """Largest count of the bit depth that a frame uses; counts that are multiples of 16 are 12 bits shifted by 4."""
-    import numpy as np  # noqa: PLC0415
-
-    step = max(int(np.gcd.reduce(pixels.ravel())), 1)
-    return float(((1 << max(int(pixels.max()) // step, 255).bit_length()) - 1) * step)
 
 
 def _complete(values: Table, rows: int, likely: Mapping[str, float], proposal: str) -> None:
     """Ask for the values that are missing in a terminal, otherwise name all of them in an error."""
-    questions: dict[str, tuple[str, Callable[[str], float]]] = {
-        "frame_rate": ("--frame-rate", rate),
-        "row_time": ("--row-time", seconds),
-        "exposure_time": ("--exposure", seconds),
-    }
-    if "full_scale" in likely:
-        questions["full_scale"] = ("--full-scale", rate)
-    missing = {name: question for name, question in questions.items() if name not in values}
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        lines = [
-            f"{stated} is missing. {_hint(name, values, rows, likely, proposal)}"
-            for name, (stated, _) in missing.items()
-        ]
-        if lines:
-            raise MistakesError(lines)
-    for name, (stated, convert) in missing.items():
-        typer.echo(f"\n{_hint(name, values, rows, likely, proposal)}", err=True)
+    known = {"frame_rate": "--frame-rate", "row_time": "--row-time", "exposure_time": "--exposure"}
+    known |= {"full_scale": "--full-scale"} if "full_scale" in likely else {}
+    missing = {name: stated for name, stated in known.items() if name not in values}
+
+    def hint(name: str) -> str:  # how to find a value, with the limits that follow from the frames
+        if name == "row_time" and values.get("frame_rate"):
+            longest = 1e6 / (values["frame_rate"] * rows)
+            return f"{_HINTS[name]} Here it is less than {longest:.4g} us.{proposal}"
+        return f"{_HINTS[name]} Frame 0 indicates {likely[name]:g}." if name in likely else _HINTS[name]
+
+    if missing and not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise MistakesError(f"{stated} is missing. {hint(name)}" for name, stated in missing.items())
+    for name, stated in missing.items():
+        typer.echo(f"\n{hint(name)}", err=True)
         limits = {"row_time": 1.0 / rows, "exposure_time": 1.0}  # frame periods
         longest = limits[name] / values["frame_rate"] if name in limits else math.inf
 
-        def checked_answer(text: str, convert: Callable[[str], float] = convert, longest: float = longest) -> float:
-            value = convert(text)
+        def checked_answer(text: str, is_time: bool = name in limits, longest: float = longest) -> float:
+            value = seconds(text) if is_time else rate(text)
             if not 0 < value <= longest:
                 limit = "" if math.isinf(longest) else f" and at most {longest:.4g} s; units such as us can be added"
                 raise typer.BadParameter(f"expected a number above 0{limit}; got {text!r}")
             return value
 
-        default = f"{likely[name]:.6g}" if name in likely else None
-        values[name] = typer.prompt(
-            stated.strip("-").replace("-", " "), default=default, value_proc=checked_answer, err=True
-        )
-
-
-def _hint(name: str, values: Mapping[str, Any], rows: int, likely: Mapping[str, float], proposal: str) -> str:
-    """How to find a value, with the limits that follow from the frames."""
-    if name == "row_time" and values.get("frame_rate"):
-        return f"{_HINTS[name]} Here it is less than {1e6 / (values['frame_rate'] * rows):.4g} us.{proposal}"
-    if name in likely:
-        return f"{_HINTS[name]} Frame 0 indicates {likely[name]:g}."
-    return _HINTS[name]
+        question, default = stated.strip("-").replace("-", " "), f"{likely[name]:.6g}" if name in likely else None
+        values[name] = typer.prompt(question, default=default, value_proc=checked_answer, err=True)
 
 
 def _check_timing(timing: SensorTiming, rows: int) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -84,12 +83,6 @@ class LiveOptions(CameraOptions, RangeOptions):
         return self.part_of(Path(self.source))
 
     @property
-    def frame_size(self) -> tuple[int, int]:
-        """(height, width) of the frames on standard input."""
-        width, height = size_of(self.size or "", "WIDTHxHEIGHT in px such as 1024x768")
-        return height, width
-
-    @property
     def is_camera(self) -> bool:
         """Whether the source is the number or URL of a camera."""
         return self.source.isdecimal() or "://" in self.source
@@ -118,13 +111,9 @@ def live_session(given: LiveOptions) -> Answer:
             check_tree(path, "zarr.json", "Zarr group")
         check_writable(path, folder=path.suffix == ".zarr")
     method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
-    restoration = {
-        name: value
-        for name, value in settings.restoration.items()
-        if name in method_options(method) and name != "joint"
-    }
-    drops = given.file is None or given.realtime
-    source = _source(given, settings)
+    available = set(method_options(method)) - {"joint"}
+    restoration = {name: value for name, value in settings.restoration.items() if name in available}
+    drops, source = given.file is None or given.realtime, _source(given, settings)
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs = _outputs(given, settings, stream)
         shown = [output for output in outputs if isinstance(output, video.PageOutput)]
@@ -137,32 +126,19 @@ def live_session(given: LiveOptions) -> Answer:
                 check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
                 video.save_spectrogram(given.spectrogram, spectrogram)
 
-        tracker = tracking.VibrationTracker(
-            settings.timing,
-            **restoration | given.tracker | {"method": method},
-            steady=given.steady,
-            wobble=given.steady > 0,
-            full_scale=source.full_scale if given.full_scale is None or given.file else given.full_scale,
-            channels="first",
-        )
-        report = video.run_live(
-            source,
-            tracker,
-            outputs,
-            border=video.VideoBorder(given.border),
-            drops=drops,
-            waiting=given.waiting,
-            max_frames=given.num_frames,
-            spectrogram=spectrogram,
-            progress=_StateText(shown[0]) if shown else None,
-            save=save,
-        )
+        chosen: Table = restoration | given.tracker | {"method": method, "channels": "first"}
+        scale = source.full_scale if given.full_scale is None or given.file else given.full_scale
+        steadied: Table = {"steady": given.steady, "wobble": given.steady > 0}
+        tracker = tracking.VibrationTracker(settings.timing, **chosen, **steadied, full_scale=scale)
+        limits: Table = {"drops": drops, "waiting": given.waiting, "max_frames": given.num_frames}
+        progress = _state_text(shown[0]) if shown else None
+        sinks: Table = {"spectrogram": spectrogram, "progress": progress, "save": save}
+        border = video.VideoBorder(given.border)
+        report = video.run_live(source, tracker, outputs, border=border, **limits, **sinks)
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
-    missing = {
-        "dropped, because processing was too slow (fewer --columns)": report.dropped,
-        "not delivered by the source": report.lost,
-    }
+    slow = "dropped, because processing was too slow (fewer --columns)"
+    missing = {slow: report.dropped, "not delivered by the source": report.lost}
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
@@ -174,18 +150,16 @@ def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
     if given.is_camera:
         return video.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
     if given.file is None:
-        size = given.frame_size
+        width, height = size_of(given.size or "", "WIDTHxHEIGHT in px such as 1024x768")
         # not sys.stdin.buffer: Python aborts at the exit if a thread still waits in it
         stream = os.fdopen(sys.stdin.fileno(), "rb", closefd=False)
-        return video.PipeSource(stream, size, given.pixel_format, settings.timing)
+        return video.PipeSource(stream, (height, width), given.pixel_format, settings.timing)
     scale = given.full_scale if given.full_scale is not None else settings.full_scale
     return video.FileSource(given.file, settings.timing, scale, realtime=given.realtime)
 
 
 def _check_options(given: LiveOptions) -> None:
     """Refuse options that do not go with the source."""
-    if given.source == "-" and given.size is None:
-        raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
     if given.source != "-" and given.size is not None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
     if given.realtime and given.file is None:
@@ -225,44 +199,40 @@ def _frames_on_standard_output(*, enabled: bool) -> Iterator[BinaryIO | None]:
         yield frames
 
 
-class _StateText:
+def _state_text(page: video.PageOutput) -> Callable[[tracking.TrackedFrame, video.LiveReport], None]:
     """Text below the frames of the page, twice per second."""
+    due = 0.0
 
-    def __init__(self, page: video.PageOutput) -> None:
-        self._page, self._next, self._lock = page, 0.0, threading.Lock()
-
-    def __call__(self, tracked: tracking.TrackedFrame, report: video.LiveReport) -> None:
-        now = time.perf_counter()
-        if now < self._next:
+    def show(tracked: tracking.TrackedFrame, report: video.LiveReport) -> None:
+        nonlocal due
+        if time.perf_counter() < due:
             return
-        self._next = now + 0.5  # s
-        found = tracked.detection
+        due = time.perf_counter() + 0.5  # s
         lines = [f"time {tracked.time:.2f} s, {tracked.state}, {report.frames} frames written"]
-        self._page.show_state("\n".join([*lines, *([] if found is None else [found.summary()])]))
+        lines += [] if tracked.detection is None else [tracked.detection.summary()]
+        page.show_state("\n".join(lines))
+
+    return show
 
 
 def _answer(source: str, report: video.LiveReport, files: list[Path], *, drops: bool) -> Answer:
-    rate = report.frames / report.seconds
+    rate = f"{report.seconds:.1f} s ({report.frames / report.seconds:.1f} per second)"
     lines = [
-        f"{number_of(report.frames, 'frame')} in {report.seconds:.1f} s ({rate:.1f} per second), "
-        f"{report.tracked} with known motion",
+        f"{number_of(report.frames, 'frame')} in {rate}, {report.tracked} with known motion",
         f"dropped {report.dropped}, not delivered {report.lost}, unusable {report.unusable}; vibration detected "
         f"{number_of(report.detections, 'time')}",
     ]
     if report.predicted:
         lines.append(f"{number_of(report.predicted, 'late frame')} predicted instead of measured")
     if drops:
-        lines.append(
-            f"delay: {report.latency(0.5)} frame periods in the median, {report.latency(0.99)} in 99 % of the frames"
-        )
+        delay = f"delay: {report.latency(0.5)} frame periods in the median"
+        lines.append(f"{delay}, {report.latency(0.99)} in 99 % of the frames")
     found = report.detection
     names = ("frames", "tracked", "predicted", "unusable", "dropped", "lost", "detections", "seconds")
-    data = {
-        **{name: getattr(report, name) for name in names},
-        "delay_median": report.latency(0.5) if drops else None,
-        "delay_99": report.latency(0.99) if drops else None,
-        "detection": None if found is None else detection_data(found),
-    }
+    delays = {"delay_median": 0.5, "delay_99": 0.99}
+    data = {name: getattr(report, name) for name in names}
+    data |= {name: report.latency(part) if drops else None for name, part in delays.items()}
+    data["detection"] = None if found is None else detection_data(found)
     results = {f"Live frames of {source}": lines}
     if found is not None:
         results["Vibration at the last frame"] = [found.summary()]

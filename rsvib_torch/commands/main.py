@@ -97,19 +97,12 @@ _REPLACED = {
 _INTERRUPTED = 130  # exit code of typer after Ctrl-C; older versions raise Abort
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
+@app.callback(invoke_without_command=True)
+def _options(version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False) -> None:
+    """Measure and remove the vibration of a rolling-shutter camera."""
+    if version:
         print_line(f"rsvib {rsvib_torch.__version__}")
         raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
-) -> None:
-    """Measure and remove the vibration of a rolling-shutter camera."""
 
 
 def run_command(arguments: Sequence[str]) -> int:

@@ -70,8 +70,7 @@ def motion(given: MotionOptions) -> Answer:
     if isinstance(result, detection.MotionDetection):
         rows, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
         columns |= {f"std_{name}": np.interp(times, rows, stds[:, axis]) for axis, name in enumerate("xy")}
-    digits = {"time": 9}
-    texts = {name: [f"{value:.{digits.get(name, 5)}f}" for value in values] for name, values in columns.items()}
+    texts = {name: [f"{v:.{9 if name == 'time' else 5}f}" for v in values] for name, values in columns.items()}
     reports.write_columns(out, texts)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
     restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
@@ -147,12 +146,10 @@ def known(given: KnownOptions) -> Answer:
     input is written unchanged, unless --force is given.
     """
     manifest = given.restored.with_name(f"{given.restored.name}.manifest.json")
-    outputs = [*io.stack_files(given.restored), manifest]
-    shared.check_new(outputs, given.overwrite or "resume" in given.processing, [*given.inputs, given.motion])
-    recorded = _recorded(given)
-    camera = None
-    if given.unit is None and given.focal_length is not None:
-        camera = rsvib_torch.Camera(given.focal_length)
+    outputs, replaces = [*io.stack_files(given.restored), manifest], given.overwrite or "resume" in given.processing
+    shared.check_new(outputs, replaces, [*given.inputs, given.motion])
+    recorded, focal_length = _recorded(given), given.focal_length if given.unit is None else None
+    camera = None if focal_length is None else rsvib_torch.Camera(focal_length)
     info, scale, options = given.planned_restoration()
     info, timing = replace(info, full_scale=scale), given.settings.timing
     io.check_stack_target(
@@ -163,45 +160,38 @@ def known(given: KnownOptions) -> Answer:
     results: dict[str, list[str]] = {}
     data: Table = {"alignment": None, "check": None}
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
-        fitted = {"fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
+        fitted: Table = {"camera": camera, "fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
         with working("aligning the recording"):
-            found = stacks.align_stack(
-                given.stack, info, timing, recorded, camera=camera, offsets=given.offsets, **fitted
-            )
-        results["Recording on the clock of the frames"] = [found.summary()]
-        data["alignment"] = _without_curve(found)
+            found = stacks.align_stack(given.stack, info, timing, recorded, offsets=given.offsets, **fitted)
+        results["Recording on the clock of the frames"], data["alignment"] = [found.summary()], _without_curve(found)
         _refuse(given, found.reasons)
         placed = found.motion
-        if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):
-            timing = _with_row_time(timing, found.row_time)
+        if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
+            rows = timing.row_time / found.row_time
+            in_rows: Table = {"exposure_rows": rows * timing.exposure_rows, "frame_rows": rows * timing.frame_rows}
+            timing = replace(timing, row_time=found.row_time, **in_rows)
     else:
         placed = recorded.retimed(given.offset)
-        _check_covers(given, recorded, placed, io.timing_from_first_frame(timing, info), info.shape)
+        starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
+        last = (
+            float(starts[-1] - starts[0]) + info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+        )
+        if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
+            needed = f"the frames need {given.offset:.6g} to {given.offset + last:.6g} s"
+            raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
     # 2. Whether it explains the offsets of rows; rates were compared by the alignment.
     check = _check_motion(given, info, timing, placed) if isinstance(recorded, rsvib_torch.FreeMotion) else None
     if check is not None:
-        results["Motion of the frames"] = [check.summary()]
-        data["check"] = _without_curve(check)
+        results["Motion of the frames"], data["check"] = [check.summary()], _without_curve(check)
     # 3. Restoration in windows.
     counts = info.shape[0] > 8
-    window = {"window": given.settings.stack["window"]} if "window" in given.settings.stack else {}
+    of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed, "manifest": manifest}
+    of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
-        run = stacks.process_stack(
-            given.stack,
-            given.restored,
-            timing,
-            motion=placed,
-            restoration=options,
-            full_scale=scale,
-            force=given.force,
-            device=str(given.torch_device),
-            manifest=manifest,
-            progress=progress if counts else None,
-            **window | given.processing,
-        )
+        show = progress if counts else None
+        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=show)
     note_lost(given.restored, run.not_kept)
-    stored = stacks.read_manifest(manifest)
-    first = None if run.first is None else run.first.restoration
+    stored, first = stacks.read_manifest(manifest), None if run.first is None else run.first.restoration
     if run.windows == 1 and first is not None:
         warn_of_restoration(first)
         results["Restoration"] = restoration_lines(first, info.shape[0])
@@ -220,27 +210,15 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     if given.unit is not None:
         if given.fit_row_time:
             raise ValueError("--fit-row-time is for a gyroscope, without --unit")
-        return rsvib_torch.read_motion(
-            given.motion,
-            unit=given.unit,
-            focal_length=given.focal_length,
-            time_unit=given.time_unit,
-            signs=(-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0),
-        )
+        signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
+        units: Table = {"unit": given.unit, "focal_length": given.focal_length, "time_unit": given.time_unit}
+        return rsvib_torch.read_motion(given.motion, **units, signs=signs)
     if given.flip_x or given.flip_y or given.offset is not None or given.time_unit != "s":
         raise ValueError(
             "--flip-x, --flip-y, --offset and --time-unit are for a CSV file with the columns time, x and y, and need "
             "--unit; axes and clock of a gyroscope are estimated from the frames"
         )
     return rsvib_torch.read_gyroscope(given.motion)
-
-
-def _with_row_time(timing: rsvib_torch.SensorTiming, row_time: float) -> rsvib_torch.SensorTiming:
-    """The timing with another row time, and the same exposure and frame period in seconds."""
-    rows = timing.row_time / row_time
-    return replace(
-        timing, row_time=row_time, exposure_rows=rows * timing.exposure_rows, frame_rows=rows * timing.frame_rows
-    )
 
 
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
@@ -251,24 +229,6 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
         warn(reason)
 
 
-def _check_covers(
-    given: KnownOptions,
-    recorded: rsvib_torch.FreeMotion,
-    placed: rsvib_torch.FreeMotion,
-    timing: rsvib_torch.SensorTiming,
-    shape: tuple[int, ...],
-) -> None:
-    """Raise an error unless a recording at the stated offset covers the frames."""
-    starts = timing.frame_starts(shape[0])
-    readout = shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    first, last = 0.0, float(starts[-1] - starts[0]) + readout
-    if placed.start > first + 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
-        raise ValueError(
-            f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, the frames need "
-            f"{(given.offset or 0.0) + first:.6g} to {(given.offset or 0.0) + last:.6g} s"
-        )
-
-
 def _check_motion(
     given: KnownOptions, info: StackInfo, timing: rsvib_torch.SensorTiming, motion: rsvib_torch.FreeMotion
 ) -> gyroscope.MotionCheck | None:
@@ -276,9 +236,6 @@ def _check_motion(
 
     Of a long stack, frames in its middle are compared. If the clock is stated, an error is a warning.
     """
-    if info.shape[0] < 2:
-        warn("cannot determine whether the motion fits: the comparison needs two frames")
-        return None
     try:
         with working("comparing the motion"):
             check = stacks.check_stack_motion(given.stack, info, timing, motion)
@@ -333,16 +290,11 @@ def compare(given: CompareOptions) -> Answer:
         shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-    times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    record = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    found = detection.DetectionResult.load(given.vibration)
+    stated: Table = {"pixel_size": given.pixel_size, "offset": given.offset, "offsets": given.offsets}
     with working("comparing"):
-        result = gyroscope.compare_accelerometer(
-            detection.DetectionResult.load(given.vibration),
-            times,
-            acceleration,
-            pixel_size=given.pixel_size,
-            offset=given.offset,
-            offsets=given.offsets,
-        )
+        result = gyroscope.compare_accelerometer(found, *record, **stated)
         if given.out is not None:
             result.plot(given.out)
     files = [] if given.out is None else [given.out]
@@ -415,39 +367,33 @@ def calibrate(given: CalibrateOptions) -> Answer:
     for path, info in zip(paths, infos, strict=True):
         for sentence in io.describe_stack(info, None):
             note(sentence)
-        if info.shape[1:] != infos[0].shape[1:]:
-            raise ValueError(
-                f"{path}: frames of shape {info.shape[1:]}, expected {infos[0].shape[1:]} as in {paths[0]}"
-            )
+        expected = infos[0].shape[1:]
+        if info.shape[1:] != expected:
+            raise ValueError(f"{path}: frames of shape {info.shape[1:]}, expected {expected} as in {paths[0]}")
     with working("reading the frames"):
         stack = torch.cat([io.read_stack(path, full_scale=given.full_scale) for path in paths])
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
     with working("measuring the motion" if given.by_motion else "measuring the flicker"):
         if given.by_motion:
-            result = row_time.calibrate_row_time_by_motion(
-                stack,
-                frame_rate=given.frame_rate or 0.0,
-                row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
-                exposure_time=given.exposure[0] if given.exposure else None,
-                scan_axis=axis,
-                readout_direction=given.readout_direction,
-            )
+            exposure = given.exposure[0] if given.exposure else None
+            limits = (given.row_time[0], given.row_time[1]) if given.row_time else None
+            known: Table = {"row_time": limits, "exposure_time": exposure, "readout_direction": given.readout_direction}
+            frame_rate = given.frame_rate or 0.0
+            result = row_time.calibrate_row_time_by_motion(stack, frame_rate=frame_rate, scan_axis=axis, **known)
         elif given.flicker_frequency is None:
-            exposure = given.exposure or []
-            result = row_time.calibrate_row_time_by_exposure(stack, exposure, scan_axis=axis, gamma=given.gamma)
+            exposures = given.exposure or []
+            result = row_time.calibrate_row_time_by_exposure(stack, exposures, scan_axis=axis, gamma=given.gamma)
         else:
+            known = {"on_fraction": given.on_fraction, "light_contrast": given.light_contrast, "gamma": given.gamma}
             result = row_time.calibrate_row_time(
-                stack,
-                given.flicker_frequency,
-                frame_rate=given.frame_rate,
-                on_fraction=given.on_fraction,
-                light_contrast=given.light_contrast,
-                scan_axis=axis,
-                gamma=given.gamma,
+                stack, given.flicker_frequency, frame_rate=given.frame_rate, scan_axis=axis, **known
             )
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
-    table = _calibrated_toml(result, given.scan_axis)
+    period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
+    values = {"row_time": result.row_time, "exposure_time": result.exposure_time, **period}
+    values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
+    table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[axis]
     readout = measured_text(1e3 * result.row_time * rows, 1e3 * result.row_time_std * rows)
     steps = ["enter the values that are left open"] * (" = \n" in table)
@@ -476,12 +422,8 @@ def _check_given(given: CalibrateOptions) -> None:
                 "--by-motion and --frame-rate for frames of a vibrating camera"
             )
         return
-    light = {
-        "--frequency": given.flicker_frequency,
-        "--on-fraction": given.on_fraction,
-        "--light-contrast": given.light_contrast,
-    }
-    for name, value in light.items():
+    light = {"--frequency": given.flicker_frequency, "--on-fraction": given.on_fraction}
+    for name, value in (light | {"--light-contrast": given.light_contrast}).items():
         if value is not None:
             raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
     if given.frame_rate is None:
@@ -490,16 +432,3 @@ def _check_given(given: CalibrateOptions) -> None:
         raise ValueError("--by-motion takes one --exposure, that of all frames")
     if given.row_time and len(given.row_time) != 2:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")
-
-
-def _calibrated_toml(result: row_time.RowTimeCalibration, scan_axis: str) -> str:
-    """The table ``[sensor]`` of a configuration file; unknown values are comments to be filled in."""
-    period: dict[str, object] = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
-    values = {
-        "row_time": result.row_time,
-        "exposure_time": result.exposure_time,
-        **period,
-        "scan_axis": scan_axis,
-        "readout_direction": result.readout_direction,
-    }
-    return sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])

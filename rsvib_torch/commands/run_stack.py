@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 _RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
+_USUAL = (None, False, 1, "pass")  # values of options that change nothing
 _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
@@ -100,7 +101,7 @@ def run(given: RunOptions) -> Answer:
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
-    common = {"full_scale": scale, "restoration": restoration, "device": str(given.torch_device)}
+    common = given.of_stack(scale, restoration)
     # videos of more than one window are followed from frame to frame
     if given.moved or (given.video and io.is_video(frames) and info.shape[0] > chosen.window):
         answer = _run_followed(given, out / output, common)
@@ -118,62 +119,42 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
     resources = {name: value for name, value in given.processing.items() if name in ("memory", "workers")}
     counts = info.shape[0] > chosen.window
+    of_run = common | given.processing | {"bad_frames": chosen.bad_frames, "manifest": out / "manifest.json"}
     with working(f"restoring {frames.name}", counts=counts) as progress:
-        result = stacks.process_stack(
-            frames,
-            restored,
-            settings.timing,
-            **common,
-            **given.processing,
-            bad_frames=chosen.bad_frames,
-            manifest=out / "manifest.json",
-            progress=progress if counts else None,
-        )
+        of_run["progress"] = progress if counts else None
+        result = stacks.process_stack(frames, restored, settings.timing, **of_run)
     first = result.first
     if first is None:  # the run was complete before, or its first window was
         first = next(iter(stacks.iterate_stack(frames, settings.timing, **common, **resources)))
-    names: list[str] = []
-    with whole_folder(out) as folder:
-        if len(first.frames):
-            with working("drawing the frames"):
-                names += written.draw_safely(folder / "before_after.png", lambda: _comparison(given, common, first))
-        names += [restored.name, "manifest.json"]
-        if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
-            assert first.restoration is not None
-            restoration = common["restoration"]
-            reports.write_restoration(folder / "restoration.json", first.restoration, restoration, result.not_kept)
-            timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*written.write_detection(folder, first.detection, timing, given.pixel_size), "restoration.json"]
-        else:
-            names += written.write_windows(folder, out / "manifest.json", given.pixel_size)
-    answer = _answer_of_windows(given, restored, result, first, info.shape[0])
-    answer.files += [out / name for name in names]
-    return answer
-
-
-def _answer_of_windows(
-    given: RunOptions, restored: Path, result: stacks.StackReport, first: stacks.WindowResult, count: int
-) -> Answer:
-    """What a run on a stack of ``count`` frames found and did, with its warnings."""
-    frames, out = given.stack, given.out
     if result.bad_frames:
         warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
     written.note_lost(restored, result.not_kept)
-    if result.windows == 1 and isinstance(first.detection, detection.DetectionResult):  # it was not followed
-        assert first.restoration is not None
-        answers.warn_of_restoration(first.restoration)
-        answer = answers.stack_answer(frames, first.detection, given.pixel_size, first.restoration, count)
-        more, steps = [], answers.steps_after_detection(first.detection, frames, given.settings)
-    else:
-        stored = stacks.read_manifest(out / "manifest.json")
-        written.warn_of_failures(stored)
-        answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
-        more, steps = ["--manifest", str(out / "manifest.json")], []
+    found, restoration = first.detection, first.restoration
+    names, more, steps = [restored.name, "manifest.json"], ["--manifest", str(out / "manifest.json")], []
+    with whole_folder(out) as folder:
+        if len(first.frames):
+            with working("drawing the frames"):
+                picture = folder / "before_after.png"
+                names = written.draw_safely(picture, lambda: _comparison(given, common, first)) + names
+        # one vibration of all frames, which was not followed
+        if result.windows == 1 and restoration is not None and isinstance(found, detection.DetectionResult):
+            target, chosen_options = folder / "restoration.json", common["restoration"]
+            reports.write_restoration(target, restoration, chosen_options, result.not_kept)
+            timing = io.timing_from_first_frame(settings.timing, info)
+            names += [*written.write_detection(folder, found, timing, given.pixel_size), "restoration.json"]
+            answers.warn_of_restoration(restoration)
+            answer = answers.stack_answer(frames, found, given.pixel_size, restoration, info.shape[0])
+            more, steps = [], answers.steps_after_detection(found, frames, settings)
+        else:
+            stored = stacks.read_manifest(out / "manifest.json")
+            names += written.write_windows(folder, stored, given.pixel_size)
+            answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     if result.restored:
-        steps.insert(0, answers.page_step(frames, out / "report", given.settings, *more))
+        steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
     if not given.video and io.is_video(frames) and result.restored < result.windows:
-        steps.insert(0, answers.run_step(frames, out / "followed", given.settings.arguments))
+        steps.insert(0, answers.run_step(frames, out / "followed", settings.arguments))
     answer.next_steps += steps
+    answer.files += [out / name for name in names]
     return answer
 
 
@@ -195,41 +176,32 @@ def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) ->
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
-    only_windows = {
-        "--window": given.windows.get("window"),
-        "--follow": given.windows.get("follow"),
-        "--bad-frames skip": given.windows.get("bad_frames") == "skip",
-        "--scheduler": "scheduler" in given.processing,
-        "--compression": "compression" in given.processing,
-        "--joint": restoration.get("joint"),
-        "--scale": restoration.get("scale", 1) != 1,
-        "--mosaic": restoration.get("mosaic"),
-        "--optics-sigma": restoration.get("optics"),
-    }
-    refused = [name for name, value in only_windows.items() if value]
+    stated = given.windows | given.processing | restoration
+    of_windows = ("window", "follow", "bad_frames", "scheduler", "compression", "joint", "scale", "mosaic", "optics")
+    changed = [name for name in of_windows if stated.get(name) is True or stated.get(name) not in _USUAL]
+    refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
     if refused:
         raise ValueError(
-            f"{', '.join(refused)} cannot be used with --video, which follows the frames one by one; give --output "
-            "restored.mp4 instead of --video, which processes windows"
+            f"{refused} cannot be used with --video, which follows the frames one by one; give --output restored.mp4 "
+            "instead of --video, which processes windows"
         )
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = out / "manifest.json"
+    of_run = common | given.moved | given.processing | {"manifest": manifest}
     with working(f"restoring {frames.name}", counts=True) as progress:
-        result = video.process_video(
-            frames,
-            restored,
-            settings.timing,
-            **common,
-            **given.moved,
-            **given.processing,
-            manifest=manifest,
-            progress=progress,
-        )
+        result = video.process_video(frames, restored, settings.timing, **of_run, progress=progress)
     stored = stacks.read_manifest(manifest)
-    drawn = written.draw_safely(out / "before_after.png", lambda: _followed_figure(frames, restored, stored))
+    index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
+
+    def comparison() -> Figure:
+        raw = read_frame(frames, index, stored.settings["full_scale"])
+        raw = raw if stored.margins is None else video.Margins(**stored.margins).cut(raw)
+        return reports.comparison_figure(raw, read_frame(restored, index, None))
+
+    drawn = written.draw_safely(out / "before_after.png", comparison)
     with whole_folder(out) as folder:
-        names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, manifest, given.pixel_size)]
+        names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, stored, given.pixel_size)]
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         warn(f"{bad} could not be used and repeat the frame before: see manifest.json")
@@ -253,12 +225,3 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     answer.files += [out / name for name in names]
     answer.next_steps.append(answers.page_step(frames, out / "report", settings, "--manifest", manifest))
     return answer
-
-
-def _followed_figure(frames: Path, restored: Path, manifest: stacks.StackManifest) -> Figure:
-    """Draw one of the first frames of a video beside the restored one."""
-    index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
-    raw = read_frame(frames, index, manifest.settings["full_scale"])
-    if manifest.margins is not None:
-        raw = video.Margins(**manifest.margins).cut(raw)
-    return reports.comparison_figure(raw, read_frame(restored, index, None))

@@ -4,7 +4,7 @@ import itertools
 import os
 import re
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -46,12 +46,7 @@ def _with_unit(text: str, units: Mapping[str, int], expected: str) -> float:
 
 
 def seconds(text: str) -> float:
-    """A time in seconds: a number or a fraction, with or without a unit.
-
-    Example:
-        >>> seconds("14.5us"), seconds("1/500"), seconds("2e-5")
-        (1.45e-05, 0.002, 2e-05)
-    """
+    """A time in seconds: a number or a fraction, with or without a unit."""
     return _with_unit(text, _TIME_UNITS, "a time such as 14.5us, 1/500 or 2e-5 (in s)")
 
 
@@ -65,18 +60,19 @@ def rate(text: str) -> float:
     return _with_unit(text, {"": 1}, "a number such as 29.97 or 30000/1001")
 
 
-def _range_of_frames(text: str) -> str:
-    """START:END, as it was given."""
-    if re.fullmatch(r"\d*:\d*", text) is None:
-        raise typer.BadParameter(f"expected START:END such as 100:200, 100: or :200, got {text!r}")
-    return text
+def _of_form(pattern: str, expected: str) -> Callable[[str], str]:
+    """Parser of a text of a form, which returns it as it was given."""
+
+    def parse(text: str) -> str:
+        if re.fullmatch(pattern, text) is None:
+            raise typer.BadParameter(f"expected {expected}, got {text!r}")
+        return text
+
+    return parse
 
 
-def _axes(text: str) -> str:
-    """Names of axes with commas between them, as they were given."""
-    if not set(text.split(",")) <= {*AXES}:
-        raise typer.BadParameter(f"expected axes such as x,y or x,y,roll,zoom, got {text!r}")
-    return text
+_range_of_frames = _of_form(r"\d*:\d*", "START:END such as 100:200, 100: or :200")
+_axes = _of_form(rf"({'|'.join(AXES)})(,({'|'.join(AXES)}))*", "axes such as x,y or x,y,roll,zoom")
 
 
 def size_of(text: str, expected: str) -> tuple[int, int]:
@@ -149,27 +145,24 @@ class CameraOptions:
     """Replace results that exist already."""
 
     def settings_for(self, frames: Path | None, frame_range: str | None = None) -> Config:
-        """Configuration file and the options that replace its keys, or the options alone.
-
-        Without either the frame rate is the one that the file of the frames states.
-        """
+        """Configuration file and the options that replace its keys, or these alone and what the frames state."""
         sensor = self.sensor
         if self.readout_time is not None:
             if self.config is not None or "row_time" in sensor or frames is None:
                 raise ValueError("--readout-time replaces --row-time of frames in a file, and goes without --config")
             shape = io.read_stack_info(frames).shape
             sensor = sensor | {"row_time": self.readout_time / shape[-1 if sensor.get("scan_axis") == "x" else -2]}
+        if self.config is None and frames is not None and "row_time" in sensor:
+            exposure = None if "exposure_time" in sensor else stated_exposure(frames)
+            sensor = sensor | ({} if exposure is None else {"exposure_time": exposure})
+            if "exposure_time" in sensor and "frame_rate" not in sensor:
+                frame_rate = stated_rate(io.read_stack_info(frames))
+                if frame_rate is not None:
+                    note(
+                        f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it"
+                    )
+                    sensor = sensor | {"frame_rate": frame_rate}
         missing = [option for name, option in _TIMES.items() if name not in sensor]
-        if self.config is None and "--exposure" in missing and "--row-time" not in missing and frames is not None:
-            exposure = stated_exposure(frames)
-            if exposure is not None:
-                missing.remove("--exposure")
-                sensor = sensor | {"exposure_time": exposure}
-        if self.config is None and missing == ["--frame-rate"] and frames is not None:
-            frame_rate = stated_rate(io.read_stack_info(frames))
-            if frame_rate is not None:
-                note(f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it")
-                sensor, missing = sensor | {"frame_rate": frame_rate}, []
         if self.config is None and missing:
             raise ValueError(
                 f"the camera is not described: give {', '.join(missing)}, or --config FILE (rsvib init FRAMES writes "
@@ -212,6 +205,10 @@ class StackCommand(RangeOptions, CameraOptions, DeviceOptions):
     def inputs(self) -> list[Path]:
         """Files that are read."""
         return [*io.stack_files(self.stack), *([] if self.config is None else [self.config])]
+
+    def of_stack(self, scale: float | None, restoration: Table) -> Table:
+        """Options that the functions for stacks have in common."""
+        return {"full_scale": scale, "restoration": restoration, "device": str(self.torch_device)}
 
     def planned_restoration(self, given: Mapping[str, Any] | None = None) -> "tuple[StackInfo, float | None, Table]":
         """What the file states, its full scale, and options of ``restore``: configured, replaced by those ``given``."""
@@ -306,11 +303,8 @@ def check_new(
     check_outputs(paths, [path for path in inputs if path is not None], folder=folder)
     existing = [path for path in paths if os.path.lexists(path) and not (path.is_dir() and not any(path.iterdir()))]
     if existing and not overwrite:
-        names = ", ".join(path.name for path in existing)
-        raise FileExistsError(
-            f"results exist already in {existing[0].parent}: {names}; choose another name, or replace them with "
-            "--overwrite"
-        )
+        found = f"results exist already in {existing[0].parent}: {', '.join(path.name for path in existing)}"
+        raise FileExistsError(f"{found}; choose another name, or replace them with --overwrite")
 
 
 def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float | None) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -39,7 +40,6 @@ class Stack:
 
     frames: Tensor  # (T, H, W) or (T, C, H, W), full scale 1
     info: io.StackInfo  # data type and metadata of the file, with exposure times for frame times
-    full_scale: float | None  # count that corresponds to full scale; None for floating point
     timing: rsvib_torch.SensorTiming  # the sensor, with the frame times of the file
 
 
@@ -57,18 +57,16 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     print_notes(info, config)
     times = io.exposure_times(info, config.timing)
     info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
-    return Stack(frames.to(given.torch_device), info, scale, timing)
+    return Stack(frames.to(given.torch_device), info, timing)
 
 
 def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
     """A frame of a stack, with 0 for missing pixels."""
     from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
 
-    reader = io.open_stack(path)
-    scale, nodata = full_scale or reader.info.full_scale, reader.info.nodata
-    frame: Tensor = counts_to_frames(reader.frame(index)[None], scale, str(path), nodata)[0].nan_to_num(0.0)
-    reader.close()
-    return frame
+    with closing(io.open_stack(path)) as reader:
+        scale, pixels = full_scale or reader.info.full_scale, reader.frame(index)[None]
+    return counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -79,8 +77,7 @@ def print_notes(info: io.StackInfo, config: Config) -> None:
 
 def _detect(stack: Stack, config: Config) -> detection.DetectionResult:
     with working("detecting the vibration"):
-        result: detection.DetectionResult = detection.detect_vibration(stack.frames, stack.timing, **config.detection)
-    return result
+        return detection.detect_vibration(stack.frames, stack.timing, **config.detection)
 
 
 def _restore(
@@ -90,28 +87,6 @@ def _restore(
     with working("restoring and judging"):
         result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
     answers.warn_of_restoration(result, output)
-    return result
-
-
-def restore_and_save(
-    path: Path,
-    stack: Stack,
-    motion: Motion | DetectedVibration,
-    options: Table,
-    force: bool,
-    report: Path | None = None,
-) -> stacks.RestoredFrames:
-    """Restore frames, and write them; the input unchanged if it is no worse, unless ``force``."""
-    result = _restore(stack, motion, options, force)
-    frames = result.frames
-    if stack.info.nodata is not None:
-        frames = stacks.without_data(frames, stack.frames)
-    with working(f"writing {path.name}"):
-        io.write_stack(path, frames, dtype=stack.info.dtype, full_scale=stack.full_scale, like=stack.info)
-    not_kept = io.metadata_not_kept(stack.info, path, tuple(frames.shape))
-    written.note_lost(path, not_kept)
-    if report is not None:
-        reports.write_restoration(report, result, options, not_kept)
     return result
 
 
@@ -139,9 +114,7 @@ def simulate(given: SimulateOptions) -> Answer:
     settings, frames, scene = given.settings_for(None), given.frames, given.scene
     shared.check_new(io.stack_files(frames), given.overwrite, [*io.stack_files(scene), settings.path])
     if settings.simulation is None:
-        raise ValueError(
-            f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames, ..."
-        )
+        raise ValueError(f"{settings.source}: simulation: missing key; expected a table with vibration, num_frames")
     simulation, target = settings.simulation, given.torch_device
     vibration = simulation.vibration.to_vibration()
     image = io.read_stack(scene, full_scale=given.full_scale)
@@ -151,15 +124,10 @@ def simulate(given: SimulateOptions) -> Answer:
     dtype = "float32" if scale is None else "uint8" if scale <= 255 else "uint16"
     io.check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
     with working("simulating the frames"):
-        simulated = imaging.simulate_frames(
-            image[0].to(target),
-            settings.timing,
-            vibration,
-            simulation.num_frames,
-            frame_size=simulation.frame_size,
-            noise=simulation.noise,
-            generator=torch.Generator(target).manual_seed(simulation.seed if given.seed is None else given.seed),
-        )
+        generator = torch.Generator(target).manual_seed(simulation.seed if given.seed is None else given.seed)
+        form: Table = {"frame_size": simulation.frame_size, "noise": simulation.noise, "generator": generator}
+        still, count = image[0].to(target), simulation.num_frames
+        simulated = imaging.simulate_frames(still, settings.timing, vibration, count, **form)
     with working(f"writing {frames}"):
         stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
@@ -215,37 +183,28 @@ def detect(given: DetectOptions) -> Answer:
             result = _detect(stack, settings)
             may_change = windows.get("follow") is not False and stacks.may_change(result, count)
         if many or may_change:
-            manifest = _detect_windows(given, info, folder, windows)
-            found = stacks.read_manifest(manifest).detections()
+            stored = _detect_windows(given, info, folder / "manifest.json", windows)
+            found = stored.detections()
             reliable = sum(0.0 if one is None else float(one.reliable.sum()) for one in found) / len(found)
             if result is not None and not reliable > float(result.reliable.sum()):
-                manifest.unlink()  # a steady vibration of all frames is known as well
+                (folder / "manifest.json").unlink()  # a steady vibration of all frames is known as well
             else:
                 result = None
         if result is not None:
             names = written.write_detection(folder, result, stack.timing, given.pixel_size)
+            answer = answers.stack_answer(frames, result, given.pixel_size)
+            answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
         else:
-            names = [*written.write_windows(folder, manifest, given.pixel_size), "manifest.json"]
+            names = [*written.write_windows(folder, stored, given.pixel_size), "manifest.json"]
+            title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
+            answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
+            if any(record.followed is not None for record in stored.windows):
+                run = ("run", frames, out / "restored", *settings.arguments)
+                follow = ["--follow"] * (windows.get("follow") is True)
+                answer.next_steps.append(answers.next_step("restore the frames", *run, *follow))
+            else:
+                answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     written.remove_old(out, (*written.OF_DETECTION, *written.OF_WINDOWS), names)
-    if result is not None:
-        answer = answers.stack_answer(frames, result, given.pixel_size)
-        answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
-    else:
-        stored = stacks.read_manifest(out / "manifest.json")
-        written.warn_of_failures(stored)
-        title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
-        answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
-        if any(record.followed is not None for record in stored.windows):
-            run = (
-                "run",
-                frames,
-                out / "restored",
-                *settings.arguments,
-                *["--follow"] * (windows.get("follow") is True),
-            )
-            answer.next_steps.append(answers.next_step("restore the frames", *run))
-        else:
-            answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
     answer.files += [out / name for name in names]
     return answer
 
@@ -254,21 +213,15 @@ def detect(given: DetectOptions) -> Answer:
 _LONG = 256
 
 
-def _detect_windows(given: DetectOptions, info: io.StackInfo, folder: Path, windows: Table) -> Path:
-    """Detect the vibration in the windows of a stack; the ``manifest.json`` in a folder."""
-    settings, frames, manifest = given.settings, given.stack, folder / "manifest.json"
+def _detect_windows(given: DetectOptions, info: io.StackInfo, manifest: Path, windows: Table) -> stacks.StackManifest:
+    """Detect the vibration in the windows of a stack, and write the manifest."""
+    settings, frames = given.settings, given.stack
+    scale = shared.full_scale_of(frames, info, settings, given.full_scale)
+    common: Table = {"full_scale": scale, "device": str(given.torch_device)}
+    common["detection"] = None if windows.get("follow") is True else settings.detection
     with working(f"detecting in {frames.name}", counts=True) as progress:
-        stacks.detect_stack(
-            frames,
-            manifest,
-            settings.timing,
-            **windows,
-            detection=None if windows.get("follow") is True else settings.detection,
-            full_scale=shared.full_scale_of(frames, info, settings, given.full_scale),
-            device=str(given.torch_device),
-            progress=progress,
-        )
-    return manifest
+        stacks.detect_stack(frames, manifest, settings.timing, **windows, **common, progress=progress)
+    return stacks.read_manifest(manifest)
 
 
 @options
@@ -305,7 +258,14 @@ def restore_frames(given: RestoreOptions) -> Answer:
     if report is not None:
         check_writable(report)
     stack = load(given, options)
-    result = restore_and_save(restored, stack, detected, options, given.force, report)
+    result = _restore(stack, detected, options, given.force)
+    images = result.frames if info.nodata is None else stacks.without_data(result.frames, stack.frames)
+    with working(f"writing {restored.name}"):
+        io.write_stack(restored, images, dtype=info.dtype, full_scale=scale, like=stack.info)
+    not_kept = io.metadata_not_kept(stack.info, restored, tuple(images.shape))
+    written.note_lost(restored, not_kept)
+    if report is not None:
+        reports.write_restoration(report, result, options, not_kept)
     return Answer(
         {"Vibration": [detected.summary()], "Restoration": answers.restoration_lines(result, len(stack.frames))},
         {"detection": detected.to_dict(), "restoration": reports.restoration_data(result)},
@@ -325,32 +285,15 @@ def _restore_windows(given: RestoreOptions) -> Answer:
         timing = replace(timing, frame_start_times=stored.frame_start_times)
     reports.check_same_timing(str(vibration), stored, timing)
     window = manifest.settings.get("window")
-    if "video" in manifest.settings:
-        raise ValueError(
-            f"{vibration}: it describes a video that was followed frame by frame, and its parts are not windows; "
-            "detect the windows (rsvib detect --window 8), or repeat rsvib run --video"
-        )
-    if any(record.followed is not None for record in manifest.windows):
-        raise ValueError(
-            f"{vibration}: its vibration was followed from frame to frame, and is not that of windows; repeat rsvib run"
-        )
-    if not isinstance(window, int):
-        raise ValueError(f"{vibration}: settings.window: missing key; expected a whole number")
+    if not isinstance(window, int) or any(record.followed is not None for record in manifest.windows):
+        followed = "its vibration was followed from frame to frame, and is not that of windows"
+        raise ValueError(f"{vibration}: {followed}; repeat rsvib run, or detect the windows (rsvib detect --window 8)")
     info, scale, options = given.planned_restoration(given.restoration)
     print_notes(info, given.settings)
+    common = given.of_stack(scale, options) | {"force": given.force, "window": window}
+    common["given"] = manifest.detections()
     with working(f"restoring {given.stack.name}", counts=True) as progress:
-        result = stacks.process_stack(
-            given.stack,
-            given.restored,
-            given.settings.timing,
-            window=window,
-            given=manifest.detections(),
-            restoration=options,
-            full_scale=scale,
-            force=given.force,
-            device=str(given.torch_device),
-            progress=progress,
-        )
+        result = stacks.process_stack(given.stack, given.restored, given.settings.timing, **common, progress=progress)
     written.note_lost(given.restored, result.not_kept)
     answer = answers.windows_answer("Vibration", stacks.read_manifest(result.manifest), result)
     answer.files += [given.restored, result.manifest]
@@ -379,7 +322,7 @@ def report(given: ReportOptions) -> Answer:
     figures are also written as PNG files.
     """
     settings, frames, out = given.settings, given.stack, given.out
-    boxes = [_edge_box(text) for text in given.edge or []]
+    list(map(_edge_box, given.edge or ()))  # errors before anything is computed
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     written.check_folder(out, ["report.html"], given.overwrite, inputs)
@@ -387,7 +330,7 @@ def report(given: ReportOptions) -> Answer:
     if given.manifest is not None and windows is not None and windows.output is not None and windows.is_followed:
         made = given.manifest.with_name(windows.output["name"])
         if windows.totals()["restored"] and made.exists():
-            return _report_of_run(given, windows, made, boxes)
+            return _report_of_run(given, windows, made)
     stack = load(given, options)
     detection = _detect(stack, settings)
     result = _restore(stack, detection, options, given.force, "page")
@@ -411,7 +354,6 @@ def report(given: ReportOptions) -> Answer:
         given,
         windows,
         answer,
-        boxes,
         frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
         restored=result.frames,
         was_restored=result.restored,
@@ -424,7 +366,7 @@ def report(given: ReportOptions) -> Answer:
     )
 
 
-def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path, boxes: list[reports.Box]) -> Answer:
+def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path) -> Answer:
     """The page of a run that followed the vibration: two frames in the middle, before and after it."""
     import torch  # noqa: PLC0415
 
@@ -439,7 +381,6 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
         given,
         windows,
         answer,
-        boxes,
         frames=before if windows.margins is None else Margins(**windows.margins).cut(before),
         restored=after,
         was_restored=True,
@@ -448,9 +389,7 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
     )
 
 
-def _write_page(
-    given: ReportOptions, windows: stacks.StackManifest | None, answer: Answer, boxes: list[reports.Box], **content: Any
-) -> Answer:
+def _write_page(given: ReportOptions, windows: stacks.StackManifest | None, answer: Answer, **content: Any) -> Answer:
     """Write the page of this content, and add its files to the answer."""
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     page = reports.Report(
@@ -462,7 +401,7 @@ def _write_page(
         **content,
     )
     with whole_folder(given.out) as folder, working("writing the page"):
-        files = reports.write_report_page(folder, page, boxes or None)
+        files = reports.write_report_page(folder, page, list(map(_edge_box, given.edge or ())) or None)
         shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
     answer.files += [given.out / name for name in files]
     return answer
@@ -470,8 +409,8 @@ def _write_page(
 
 def _edge_box(text: str) -> reports.Box:
     """Position of a slanted edge (top, left, height, width) in px."""
-    numbers = [part.strip() for part in text.split(",")]
-    if len(numbers) != 4 or not all(number.isdecimal() for number in numbers):
+    numbers = [int(part) for part in text.split(",") if part.strip().isdecimal()]
+    if len(numbers) != 4 or text.count(",") != 3:
         raise ValueError(f"--edge must be TOP,LEFT,HEIGHT,WIDTH in px, got {text!r}")
-    top, left, height, width = map(int, numbers)
+    top, left, height, width = numbers
     return top, left, height, width

@@ -69,19 +69,14 @@ def current_output() -> Output:
 
 
 def print_line(message: str) -> None:
-    """Print a text to standard output; long lines are not wrapped, and control codes are escaped.
-
-    Raises:
-        OSError: If it cannot be written, as in a pipe whose reader has ended.
-    """
+    """Print a text to standard output; long lines are not wrapped, and control codes are escaped."""
     try:
         print(printable(message, lines=True), flush=True)
-    except OSError as error:
+    except OSError as error:  # as in a pipe whose reader has ended
         # what is left in the buffer would fail again at the exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise OSError(
-            f"the answer cannot be written to standard output ({error.strerror}); the files are complete"
-        ) from error
+        problem = f"the answer cannot be written to standard output ({error.strerror})"
+        raise OSError(f"{problem}; the files are complete") from error
 
 
 def show_answer(command: str, answer: Answer) -> None:
@@ -116,9 +111,8 @@ def note(message: str) -> None:
 def error_line(message: str, kind: str = "error") -> None:
     """Print a message to standard error, with the prefix ``rsvib: error:``.
 
-    Control codes are escaped, and long texts are shortened.
-    Lines are wrapped between words in a terminal, and not at all in a file or pipe. If nobody reads them, as after the
-    end of a terminal, the command continues.
+    Control codes are escaped, and long texts are shortened. Lines are wrapped in a terminal only. If nobody reads them,
+    as after the end of a terminal, the command continues.
     """
     message = shortened(message)
     if kind == "warning":
@@ -167,36 +161,22 @@ class _StateColumn(ProgressColumn):
         return Text("  ".join([*parts, *([f"{elapsed} so far"] if passed >= _SHOWN_AFTER else [])]))
 
 
-def _progress() -> Progress:
-    """A progress bar on standard error that is removed at the end; nothing is shown unless it is a terminal."""
-    console = Console(stderr=True)
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=10),
-        _StateColumn(),
-        console=console,
-        transient=True,
-        disable=_outputs[-1].quiet or not console.is_terminal,
-    )
-
-
 @contextmanager
 def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int, int], None]]:
-    """Show the elapsed time, and progress, rate and remaining time of a loop.
+    """Show the elapsed time, and progress, rate and remaining time of a loop; in a terminal it is removed at the end.
 
     In a log, which is not a terminal, they are lines: the first one after ``LOG_AFTER`` seconds, each of the others
     after twice the time. With ``counts``, the block calls the function that it gets with the number of processed frames
     and of all frames; otherwise, the loops in it report their steps.
     """
-    begun = time.monotonic()
-    with _progress() as progress:
+    begun, console, quiet = time.monotonic(), Console(stderr=True), _outputs[-1].quiet
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(bar_width=10), _StateColumn())
+    disable = quiet or not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=disable) as progress:
         task = progress.add_task(printable(description), total=None, begun=begun)
 
         def show(done: int, total: int, unit: str = "frames") -> None:
-            if (
-                done == 0 or progress.tasks[0].total is None
-            ):  # another loop; frames of a resumed run are not in the rate
+            if done == 0 or progress.tasks[0].total is None:  # another loop; resumed frames are not in the rate
                 progress.reset(task, total=total, unit=unit, first=done, begun=begun)
             progress.update(task, completed=done)
 
@@ -208,7 +188,7 @@ def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int
                 error_line(f"{description}: {_StateColumn().render(progress.tasks[0])}", "progress")
                 after = time.monotonic() - begun
 
-        if not Console(stderr=True).is_terminal and not _outputs[-1].quiet:
+        if not console.is_terminal and not quiet:
             threading.Thread(target=write_lines, daemon=True).start()
         try:
             with nullcontext() if counts else listening(show):

@@ -63,17 +63,18 @@ def write_detection(
     return [*drawn, "vibration.json", "tones.csv", "offsets.csv", "spectrum.csv"]
 
 
-def write_windows(folder: Path, path: Path, pixel_size: float | None = None) -> list[str]:
-    """Write summary, table and figure of the windows of a manifest, and return the names of the files."""
-    manifest = stacks.read_manifest(path)
+def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: float | None = None) -> list[str]:
+    """Write summary, table and figure of windows, warn of failures, and return the names of the files."""
+    warn_of_failures(manifest)
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
-        drawn = []
-        if manifest.gyroscope is None:  # no tones are searched for otherwise
-            drawn = draw_safely(
-                folder / "windows.png", lambda: reports.windows_figure(manifest.times(), manifest.detections())
-            )
+
+        def draw() -> Figure:
+            return reports.windows_figure(manifest.times(), manifest.detections())
+
+        # otherwise, no tones are searched for
+        drawn = draw_safely(folder / "windows.png", draw) if manifest.gyroscope is None else []
     return [*drawn, "windows.json", "tones.csv"]
 
 

@@ -9,19 +9,8 @@ from pydantic import Field
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
-from rsvib_torch.datasets.drawing import (
-    FLOAT,
-    Blur,
-    Canvas,
-    Size,
-    bars,
-    disc,
-    edge,
-    fractal_texture,
-    rectangle,
-    rotated,
-    sectors,
-)
+from rsvib_torch.datasets import drawing
+from rsvib_torch.datasets.drawing import FLOAT, Blur, Canvas, Size, bars, disc, edge, rectangle, rotated, sectors
 
 _INK, _PAPER = 0.07, 0.86  # of full scale; a printed chart: grain and texture of either stay within 0 ... 1
 _Centre = tuple[float, float]
@@ -33,17 +22,12 @@ def resolution_chart(
 ) -> Tensor:
     """Draw a resolution chart: slanted edges, hyperbolic wedges, bar groups, stars, rings and grey fields.
 
-    A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals, dark on light
-    and light on dark in turn, and bar groups, rings, stars and textured grey steps between them, on paper with a fine
-    grain. Edges are error functions of the distance, without aliasing at any size. The result is float32 (height,
-    width) with values in 0 ... 1.
+    A star in the middle, wedges along both axes that end at Nyquist, slanted squares on the diagonals, and bar groups,
+    rings, stars and textured grey steps between them, on paper with a fine grain. Edges are error functions of the
+    distance, without aliasing at any size. The result is float32 (height, width) with values in 0 ... 1.
 
-    Args:
-        height: Rows, at least 64.
-        width: Columns, at least 64.
-        sigma: Blur of the optics in px (Gaussian, pixel area included).
-        seed: Seed of the grain and texture.
-        field: px, approximate size of a field of the chart, at least 32.
+    The optics blur by ``sigma`` px (Gaussian, pixel area included); ``seed`` is that of grain and texture; ``field`` is
+    the approximate size of a field of the chart in px.
 
     Example:
         >>> chart = resolution_chart(256, 320)
@@ -51,8 +35,8 @@ def resolution_chart(
         (torch.Size([256, 320]), True)
     """
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    grain = fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
-    texture = fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
+    grain = drawing.fractal_texture(height, width, generator, exponent=0.5, longest=64.0, sigma=sigma)
+    texture = drawing.fractal_texture(height, width, generator, exponent=1.2, longest=40.0, sigma=sigma)
     canvas = Canvas(torch.full((height, width), _PAPER, **FLOAT), sigma)
 
     rim = max(10.0, 0.014 * min(height, width))
@@ -104,12 +88,11 @@ def _draw_star(canvas: Canvas, centre: _Centre, radius: float, count: int) -> No
     canvas.paint(centre, radius, _INK, lambda x, y: disc(x, y, count / math.pi + 1.0, sigma))
     width = 0.02 * radius + 0.8
     for outline in (1.0, 1.1):
-        canvas.paint(
-            centre,
-            outline * radius + width,
-            _INK,
-            lambda x, y, r=outline * radius: disc(x, y, r + width, sigma) - disc(x, y, r, sigma),  # type: ignore[misc]
-        )
+
+        def ring(x: Tensor, y: Tensor, r: float = outline * radius) -> Tensor:
+            return disc(x, y, r + width, sigma) - disc(x, y, r, sigma)
+
+        canvas.paint(centre, outline * radius + width, _INK, ring)
 
 
 def _draw_wedge(canvas: Canvas, middle: _Centre, side: int, *, begin: float, length: float) -> None:
@@ -197,12 +180,11 @@ def _draw_needles(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, 
     for index in range(8):
         angle = math.pi * (index + 0.25) / 8
         width = 0.7 + 0.006 * size * (index % 4)
-        canvas.paint(
-            centre,
-            0.45 * size,
-            _INK,
-            lambda x, y, a=angle, w=width: rectangle(*rotated(x, y, a), 0.45 * size, w, sigma),  # type: ignore[misc]
-        )
+
+        def needle(x: Tensor, y: Tensor, angle: float = angle, width: float = width) -> Tensor:
+            return rectangle(*rotated(x, y, angle), 0.45 * size, width, sigma)
+
+        canvas.paint(centre, 0.45 * size, _INK, needle)
     canvas.paint(centre, 0.13 * size, _INK, lambda x, y: disc(x, y, 0.13 * size, sigma))
     canvas.paint(centre, 0.1 * size, _PAPER, lambda x, y: disc(x, y, 0.1 * size, sigma))
 

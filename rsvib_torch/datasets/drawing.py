@@ -14,10 +14,7 @@ from torch import Tensor
 
 Size = Annotated[int, Field(ge=64)]  # rows or columns of a scene
 Blur = Annotated[float, Field(ge=0.4)]  # px; a narrower blur cannot be sampled
-FLOAT: Any = {
-    "dtype": torch.float32,
-    "device": "cpu",
-}  # of all values; drawn scenes do not depend on defaults of PyTorch
+FLOAT: Any = {"dtype": torch.float32, "device": "cpu"}  # drawn scenes do not depend on defaults of PyTorch
 
 
 def edge(distance: Tensor, sigma: float) -> Tensor:

@@ -52,13 +52,8 @@ def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6
     """Draw towns and fields from above, with Gaussian optics: float32 (height, width) with values in 0 ... 1.
 
     Fractal ground in districts of different direction: fields with furrows and hedges, streets with rows of small
-    gabled buildings and their shadows, larger works, woods, country roads and a river.
-
-    Args:
-        height: Rows, at least 64.
-        width: Columns, at least 64.
-        seed: Seed of everything random.
-        sigma: Blur of the optics in px (Gaussian, pixel area included).
+    gabled buildings and their shadows, larger works, woods, country roads and a river. The optics blur by ``sigma`` px
+    (Gaussian, pixel area included).
 
     Example:
         >>> scene = city_and_fields(128, 96, seed=3)
@@ -103,9 +98,8 @@ def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _
 def _lay_out_lines(height: int, width: int, generator: torch.Generator) -> list[_Line]:
     """Main roads, and a river as the last line."""
     count = 4
-    angle = (
-        math.pi * (torch.arange(count, device="cpu") + 0.8 * torch.rand(count, generator=generator, **FLOAT)) / count
-    )
+    steps = torch.arange(count, device="cpu") + 0.8 * torch.rand(count, generator=generator, **FLOAT)
+    angle = math.pi * steps / count
     share = 0.2 + 0.6 * torch.rand(count, 2, generator=generator, **FLOAT)
     through = torch.tensor([width, height], device="cpu") * share
     level = through[:, 0] * angle.cos() + through[:, 1] * angle.sin()
@@ -217,10 +211,8 @@ def _plan_buildings(
 ) -> Tensor:
     """Rows of buildings along the streets of every town and works district, and a few farms in the fields.
 
-    Returns:
-        (N, 8) buildings that do not overlap: centre x and y, half of the two sides, direction of the first side in
-        rad, tone of the roof, length of the shadow, all lengths in px, and 1 where the two sides of the roof differ
-        in tone, 0 where it is flat.
+    The (N, 8) values are centre x and y, half of the two sides, direction of the first side in rad, tone of the roof,
+    length of the shadow, all lengths in px, and 1 where the two sides of the roof differ in tone, 0 where it is flat.
     """
     kinds = enumerate(districts.kind.view(-1).tolist())
     plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]

@@ -29,10 +29,6 @@ def gathered(pieces: Iterable[tuple[slice, Tensor]], count: int, dim: int) -> Te
 
     Each piece is copied as soon as it is computed, so that one piece at a time needs memory. Pieces that require
     gradients, and those of a graph that is recorded, are concatenated. A piece that is the whole is returned.
-
-    Example:
-        >>> gathered(((slice(i, i + 1), torch.full((1, 2), float(i))) for i in range(3)), 3, 0).tolist()
-        [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
     """
     kept: list[Tensor] = []
     whole: Tensor | None = None

@@ -26,10 +26,7 @@ def allowed_threads() -> int:
 
 @contextmanager
 def threads_for(images: Tensor) -> Iterator[None]:
-    """One thread within each operation of this block if images (..., H, W) on a CPU are small.
-
-    ``in_parallel`` uses as many threads as before.
-    """
+    """One thread within operations on small images (..., H, W) on a CPU; ``in_parallel`` uses as many as before."""
     allowed = torch.get_num_threads()
     if allowed == 1 or images.device.type != "cpu" or images.shape[-2:].numel() > _SMALL:
         yield

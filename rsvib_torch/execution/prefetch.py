@@ -49,10 +49,6 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
 
     The thread uses a number of ``threads`` of PyTorch. It ends with the generator, or when this one is closed. Errors
     are raised behind the items before them.
-
-    Example:
-        >>> list(prefetched((letter for letter in "abc"), 2))
-        ['a', 'b', 'c']
     """
     with _pool(1, threads, items) as pool:
         made = in_order(repeat(0), lambda _: pool.submit(next, items, _END), lambda: count + 1, Future.result, deque())
@@ -62,13 +58,6 @@ def prefetched(items: Generator[Item, None, None], count: int, threads: int = 1)
 def in_threads(
     work: Callable[..., Result], items: Generator[tuple[Any, ...], None, None], *, at_once: int, threads: int = 1
 ) -> Generator[Result, None, None]:
-    """Results of ``work(*item)`` in the order of the items, from ``at_once`` threads, while one more item is made.
-
-    Each thread uses a number of ``threads`` of PyTorch.
-
-    Example:
-        >>> list(in_threads(pow, ((number, 2) for number in range(4)), at_once=2))
-        [0, 1, 4, 9]
-    """
+    """Results of ``work(*item)`` in order, from ``at_once`` threads with ``threads`` of PyTorch each."""
     with _pool(at_once, threads, items) as pool:
         yield from in_order(items, lambda item: pool.submit(work, *item), lambda: at_once + 1, Future.result, deque())

@@ -24,17 +24,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 def steps(total: int, unit: str) -> Callable[..., None]:
-    """Begin a loop; the result is called after each step, or with the number of steps after several, from any thread.
-
-    Example:
-        >>> with listening(lambda done, total, unit: print(f"{done} of {total} {unit}")):
-        ...     advance = steps(3, "frames")
-        ...     advance()
-        ...     advance(2)
-        0 of 3 frames
-        1 of 3 frames
-        3 of 3 frames
-    """
+    """Begin a loop; the result is called after each step, or with the number of steps after several, by any thread."""
     done, listeners = 0, _listeners[-1:]
 
     def advance(count: int = 1) -> None:

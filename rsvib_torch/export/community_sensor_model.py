@@ -77,9 +77,6 @@ def camera_isd(
         radii: Semi-major and semi-minor axis of the body in km; by default those of the Earth.
         ephemeris_time: Time of the middle of the frame in s.
 
-    Returns:
-        The ISD, which ``json.dump`` can write.
-
     Example:
         >>> isd = camera_isd(Camera(2e5), (1024, 1024), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
         >>> isd["focal_length_model"], isd["detector_center"]
@@ -100,25 +97,19 @@ def camera_isd(
     if any(camera.distortion):  # usgscsm does not divide by the focal length
         lens = {"radtan": {"coefficients": [k1 / f**2, k2 / f**4, p1 / f, p2 / f, k3 / f**6]}}
     once = {"ephemeris_times": [ephemeris_time], "reference_frame": 1}
+    centre = [0.5 * side + offset for side, offset in zip((width, height), camera.principal_point, strict=True)]
     return {
         "name_model": _FRAME,
-        "name_platform": "unknown",
-        "name_sensor": "unknown",
+        **dict.fromkeys(("name_platform", "name_sensor"), "unknown"),
         "image_lines": height,
         "image_samples": width,
-        "center_ephemeris_time": ephemeris_time,
-        "starting_ephemeris_time": ephemeris_time,
-        "detector_sample_summing": 1,
-        "detector_line_summing": 1,
-        "starting_detector_line": 0,
-        "starting_detector_sample": 0,
+        **dict.fromkeys(("center_ephemeris_time", "starting_ephemeris_time"), ephemeris_time),
+        **dict.fromkeys(("detector_sample_summing", "detector_line_summing"), 1),
+        **dict.fromkeys(("starting_detector_line", "starting_detector_sample"), 0),
         "focal2pixel_lines": [0.0, 0.0, 1.0],
         "focal2pixel_samples": [0.0, 1.0, 0.0],
         "focal_length_model": {"focal_length": f},
-        "detector_center": {
-            "line": 0.5 * height + camera.principal_point[1],
-            "sample": 0.5 * width + camera.principal_point[0],
-        },
+        "detector_center": dict(zip(("sample", "line"), centre, strict=True)),
         "interpolation_method": "lagrange",
         "optical_distortion": lens,
         "radii": {"semimajor": radii[0], "semiminor": radii[1], "unit": "km"},
@@ -143,37 +134,22 @@ def write_isd(
 ) -> Literal["frame", "line-scan"]:
     """Write the ISD of one frame of a vibrating camera, for the Community Sensor Model.
 
-    The given ISD describes the camera at rest: without the motion, pixel and ray belong together as it states. The
-    pixel at p of the frame, whose row is displaced by D (mean over its exposure), has the ray of the camera at rest at
-    p - D. Two models are available:
+    The given ISD describes the camera at rest. The pixel at p of the frame, whose row is displaced by D (mean over its
+    exposure), has the ray of the camera at rest at p - D. Two models are available (docs/export.md):
 
-    * ``"frame"``: the ISD with polynomials ``jitter`` for lines (the displacement along y) and samples (along x), of
-      the lowest degree up to 12 that suffices. They hold for all columns, and the exposure times have a step at every
-      line, so that this model is for slow motion without roll. ``lineExposureTimes`` are seconds since one readout
-      duration before the exposure of the first row, since the polynomials are zero at time 0.
-    * ``"line-scan"``: a line scanner with one quaternion per row. All rows have the rays of one line of the sensor,
-      which a rotation takes to their place: a row at y px from the principal point is wider by the factor
-      ``sqrt(1 + y^2 / f^2)``, so that this model is for narrow fields of view, and for rows read from top to bottom.
-      The position is constant during the frame; uniform image motion is part of the quaternions.
+    * ``"frame"``: the ISD with polynomials ``jitter`` of the lowest degree up to 12 that suffices. They hold for all
+      columns, and the exposure times have a step at every line, so that this model is for slow motion without roll.
+    * ``"line-scan"``: a line scanner with one quaternion per row, whose rows have the rays of one line of the sensor:
+      for narrow fields of view, and for rows read from top to bottom.
 
-    Args:
-        path: The file to write; an existing file is replaced, but not that of ``isd``.
-        motion: One motion, in image axes. A camera is not required; if it has one, its focal length must be that of
-            the ISD.
-        timing: The sensor, with image rows as rows.
-        isd: The ISD of the camera as a mapping or JSON file, or that of ``camera_isd``. Fields that do not concern the
-            motion are kept. Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used,
-            which becomes the middle of the frame.
-        frame: Number of the frame.
-        model: ``"frame"``, ``"line-scan"``, or ``"auto"`` for the first of them that is accurate enough.
-        tolerance: Largest error of a position in px, in both directions between image and ground.
+    The motion, in image axes, needs no camera; if it has one, its focal length must be that of the ISD. ``isd`` is that
+    of the camera as a mapping or JSON file, or that of ``camera_isd``; fields that do not concern the motion are kept.
+    Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used, which becomes the middle
+    of the frame. ``model="auto"`` is the first that is accurate enough; ``tolerance`` is the largest error of a
+    position in px, in both directions between image and ground.
 
     Returns:
-        The model that was written.
-
-    Raises:
-        ValueError: If the motion is a batch, the ISD lacks a field or has another focal length, columns are exposed one
-            after another, or no permitted model is accurate enough; the message states the errors and their reasons.
+        The model that was written. An error states why no permitted model is accurate enough.
 
     Example:
         >>> import tempfile
@@ -209,26 +185,18 @@ def write_isd(
                 "them: motion.with_camera(...)"
             )
     reasons = []
-    found: Table | None = None
-    written: Literal["frame", "line-scan"] = "frame"
-    if model in ("auto", "frame"):
-        found, reason = _with_jitter(camera, lines, displacement, timing, tolerance)
-        reasons.append(reason)
-    if found is None and model in ("auto", "line-scan"):
-        written = "line-scan"
-        if timing.readout_direction == "reverse":
-            reasons.append("line-scan: rows are read from bottom to top")
-        else:
-            found, reason = _as_line_scan(camera, displacement, timing, tolerance)
-            reasons.append(reason)
-    if found is None:
-        raise ValueError(
-            f"no sensor model represents this motion within {tolerance:g} px ({'; '.join(reasons)}); pass a larger "
-            "tolerance, or export the exact positions with write_stmap"
-        )
-    with whole_file(path) as part:
-        part.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return written
+    models: dict[Literal["frame", "line-scan"], Any] = {"frame": _with_jitter, "line-scan": _as_line_scan}
+    for name, build in models.items():
+        found, reason = build(camera, lines, displacement, timing, tolerance) if model in ("auto", name) else (None, "")
+        if found is not None:
+            with whole_file(path) as part:
+                part.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            return name
+        reasons += [reason] * bool(reason)
+    raise ValueError(
+        f"no sensor model represents this motion within {tolerance:g} px ({'; '.join(reasons)}); pass a larger "
+        "tolerance, or export the exact positions with write_stmap"
+    )
 
 
 def _displacements(motion: Motion, timing: SensorTiming, size: tuple[int, int], frame: int) -> tuple[Array, Array]:
@@ -283,9 +251,7 @@ class _Camera:
         value: Any = self.isd
         for name in names:
             if not isinstance(value, Mapping) or name not in value:
-                raise ValueError(
-                    f"{self.source}: {'.'.join(names)}: missing key of an ISD; camera_isd builds a complete one"
-                )
+                raise ValueError(f"{self.source}: {'.'.join(names)}: missing key of an ISD; camera_isd builds one")
             value = value[name]
         return validated(f"{self.source}: {'.'.join(names)}", value, TypeAdapter(kind, config={"strict": True}), kind)
 
@@ -347,10 +313,8 @@ def _with_jitter(
     for degree in range(1, min(_MAX_DEGREE, rows) + 1):
         # the time times a Chebyshev series, which is zero at time 0, as powers of the time from the highest on
         fitted = [np.polynomial.Chebyshev.fit(shown, values / shown, degree - 1) for values in target.T]
-        power = np.zeros((degree, 2))
-        for axis, series in enumerate(fitted):
-            coefficients = series.convert(kind=np.polynomial.Polynomial).coef[::-1]
-            power[degree - len(coefficients) :, axis] = coefficients
+        powers = (series.convert(kind=np.polynomial.Polynomial).coef[::-1] for series in fitted)
+        power = np.stack([np.pad(values, (degree - len(values), 0)) for values in powers], -1)
         value = (shown[:, None] ** np.arange(degree, 0, -1)) @ power
         rest = float(np.maximum(np.abs(value - low), np.abs(value - high)).max())
         if rest - columns <= 0.1 * tolerance:
@@ -372,9 +336,11 @@ def _with_jitter(
 
 
 def _as_line_scan(
-    camera: _Camera, displacement: Array, timing: SensorTiming, tolerance: float
+    camera: _Camera, _: Array, displacement: Array, timing: SensorTiming, tolerance: float
 ) -> tuple[Table | None, str]:
     """The ISD of a line scanner with one quaternion per row, None if it is not accurate enough, and its error."""
+    if timing.readout_direction == "reverse":
+        return None, "line-scan: rows are read from bottom to top"
     rows = len(displacement)
     line = np.arange(rows)[:, None] - _PADDING + 0.5
     sample = np.linspace(0.5, camera.size[1] - 0.5, _COLUMNS)
@@ -417,14 +383,12 @@ def _as_line_scan(
         new = {key: np.broadcast_to(value, (len(times), value.shape[-1])).tolist() for key, value in values.items()}
         return kept | new | {"ephemeris_times": times.tolist()}
 
+    found |= dict.fromkeys(("t0_ephemeris", "t0_quaternion"), float(first - centre))
+    found |= dict.fromkeys(("dt_ephemeris", "dt_quaternion"), float(duration))
     found |= {
         "name_model": _LINE_SCAN,
         "starting_ephemeris_time": float(times[_PADDING] - 0.5 * duration),
         "line_scan_rate": [[0.5, float(times[_PADDING] - centre - 0.5 * duration), float(duration)]],
-        "t0_ephemeris": float(first - centre),
-        "dt_ephemeris": float(duration),
-        "t0_quaternion": float(first - centre),
-        "dt_quaternion": float(duration),
         "starting_detector_line": 0,
         "detector_center": {"line": float(-camera.offset[0]), "sample": float(camera.centre[1])},
         "instrument_pointing": states("instrument_pointing", times, quaternions=pointing),

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import tifffile
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
@@ -71,16 +70,6 @@ def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frame
         yield torch.from_numpy(places).movedim(0, -1)
 
 
-def _channels(positions: Tensor, convention: StmapConvention) -> NDArray[np.float32]:
-    """(H, W, 3): the map in a convention, and 1 where the position lies in the frame, else 0."""
-    height, width = positions.shape[:2]
-    x, y = positions.unbind(-1)
-    inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-    if convention == "nuke":
-        x, y = (x + 0.5) / width, (height - 0.5 - y) / height
-    return torch.stack([x, y, inside.to(x)], -1).to(torch.float32).cpu().numpy()
-
-
 @checks_arguments
 def write_stmap(
     folder: str | os.PathLike[str],
@@ -93,28 +82,12 @@ def write_stmap(
 ) -> list[Path]:
     """Write the ``sampling_map`` of every frame as a float32 TIFF with three channels: an STMap.
 
-    The first two channels are the position (x, y) in px of ``sampling_map``, counted from the centre of the first
-    pixel, in one of two conventions:
+    The first two channels are the position (x, y) of ``sampling_map``, for ``"nuke"`` as
+    ``((x + 0.5) / width, (height - 0.5 - y) / height)``, for ``"opencv"`` in px from the centre of the first pixel, as
+    ``cv2.remap`` uses it (docs/export.md). The third channel is 1 where it lies in the recorded frame, else 0.
 
-    * ``"nuke"``: ``((x + 0.5) / width, (height - 0.5 - y) / height)``: red is 0 at the left and 1 at the right edge of
-      the recorded frame, green 0 at its bottom and 1 at its top; a map that changes nothing has
-      ``(0.5 / width, 1 - 0.5 / height)`` in its top left pixel. This is what the STMap node of Nuke samples. Load the
-      files as raw data, without a colour space.
-    * ``"opencv"``: (x, y) themselves, the maps of ``cv2.remap``.
-
-    The third channel is 1 where the position lies in the recorded frame, else 0. In float32 the positions are rounded
-    by at most 2.5e-4 px in frames of 8192 px; a TIFF of 16 bits would round them by up to 0.06 px.
-
-    Args:
-        folder: Folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ...; it is created, files of these names are replaced.
-        motion: One motion, in image axes.
-        timing: The sensor.
-        size: (height, width) of the frames.
-        num_frames: Number of frames.
-        convention: ``"nuke"`` or ``"opencv"``.
-
-    Returns:
-        The files.
+    The folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ... is created, and files of these names are replaced; their
+    paths are returned. Other arguments are those of ``sampling_map``.
 
     Example:
         >>> import tempfile
@@ -128,10 +101,15 @@ def write_stmap(
         >>> round(float(cv2.remap(frame, map_x, map_y, cv2.INTER_LINEAR)[25, 30]), 2)  # a quarter of a period: X = 2 px
         32.0
     """
-    digits = max(4, math.ceil(math.log10(num_frames + 1)))
+    digits, (height, width) = max(4, math.ceil(math.log10(num_frames + 1))), size
     names = []
     with whole_folder(folder) as part:
         for frame, positions in enumerate(_maps(motion, timing, size, num_frames)):
+            x, y = positions.unbind(-1)
+            inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+            if convention == "nuke":
+                x, y = (x + 0.5) / width, (height - 0.5 - y) / height
             names.append(f"stmap_{frame:0{digits}d}.tif")
-            tifffile.imwrite(part / names[-1], _channels(positions, convention), photometric="rgb")
+            channels = torch.stack([x, y, inside.to(x)], -1).to(torch.float32).cpu().numpy()
+            tifffile.imwrite(part / names[-1], channels, photometric="rgb")
     return [Path(folder, name) for name in names]

@@ -22,10 +22,7 @@ Kind = Literal["file", "folder", "tree"]
 
 def nearest_folder(path: Path) -> Path:
     """The lowest existing folder above ``path``."""
-    parent = path.absolute().parent
-    while not parent.exists() and parent != parent.parent:
-        parent = parent.parent
-    return parent
+    return next((folder for folder in path.absolute().parents if folder.exists()), path.absolute())
 
 
 def sync(path: Path) -> None:
@@ -45,26 +42,14 @@ def sync(path: Path) -> None:
         os.close(file)
 
 
-def sync_tree(path: Path) -> None:
-    """``sync`` a file, or a folder with everything in it."""
-    for folder, _, names in os.walk(path, topdown=False):
-        for name in names:
-            sync(Path(folder, name))
-        sync(Path(folder))
-    if path.is_file():
-        sync(path)
-
-
 def make_folder(path: Path) -> None:
     """Create a folder, and those above it, if it does not exist; its name is on the disk when the function returns."""
     existing = nearest_folder(path)
     path.mkdir(parents=True, exist_ok=True)
-    folder = path.absolute().parent
-    while True:
+    for folder in path.absolute().parents:
         sync(folder)
-        if folder in (existing, folder.parent):
+        if folder == existing:
             return
-        folder = folder.parent
 
 
 def remove_abandoned(path: Path) -> None:
@@ -100,10 +85,9 @@ def error_of_full_disk(error: Exception) -> int | None:
 
 @contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder on the file system of ``path``; those that killed processes left for it are removed.
+    """A temporary folder on the file system of ``path``, which errors of a full disk name.
 
-    Raises:
-        OSError: With the name of ``path``, if the disk is full.
+    Those that killed processes left for it are removed.
     """
     parent = nearest_folder(path)
     remove_abandoned(path)
@@ -141,13 +125,14 @@ def check_target(path: Path, kind: Kind = "file", *, parent_exists: bool = True)
     if size > _LONGEST_NAME:
         raise OSError(f"cannot write {path.name[:40]}...: its name has {size} bytes, at most {_LONGEST_NAME} fit")
     check_not_special(path)
-    if kind == "file" and path.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder")
-    if kind == "file" and parent_exists and not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
-    if kind != "file" and path.exists() and not path.is_dir():
+    if kind == "file":
+        if path.is_dir():
+            raise IsADirectoryError(f"cannot write {path}: it is a folder")
+        if parent_exists and not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"cannot write {path}: folder {path.absolute().parent} does not exist")
+    elif path.exists() and not path.is_dir():
         raise NotADirectoryError(f"cannot write folder {path}: a file of that name exists")
-    if kind != "file" and path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
+    elif path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"cannot write into folder {path}: it is not writable")
 
 
@@ -177,7 +162,9 @@ def whole(path: str | os.PathLike[str], kind: Kind = "file", companions: tuple[s
     check_target(target, kind, parent_exists=False)
     with temporary_folder(target) as folder:
         yield folder / target.name
-        sync_tree(folder)
+        for place, _, names in os.walk(folder, topdown=False):
+            for name in (*names, ""):
+                sync(Path(place, name))
         make_folder(target.parent)
         if kind == "folder" and target.is_dir():
             moves = [(file, target / file.name) for file in sorted((folder / target.name).iterdir())]

@@ -9,12 +9,7 @@ import psutil
 
 
 def size_text(count: int) -> str:
-    """A number of bytes with its unit.
-
-    Example:
-        >>> size_text(6_300_000_000), size_text(96_000)
-        ('6.3 GB', '96 KB')
-    """
+    """A number of bytes with its unit."""
     for unit, factor in (("GB", 10**9), ("MB", 10**6)):
         if count >= factor:
             return f"{count / factor:.3g} {unit}"
@@ -36,40 +31,34 @@ def check_fits(what: str, needed: int, remedy: str) -> None:
         raise ValueError(f"{what} need {size_text(needed)} of memory, of which {size_text(free)} are free; {remedy}")
 
 
-def _free_addresses() -> list[int]:
+def _free_addresses() -> Iterator[int]:
     """Free parts of address space and data segment, if they are limited (``ulimit -v``, ``-d``, some batch systems)."""
-    limits = {"vms": resource.getrlimit(resource.RLIMIT_AS)[0], "data": resource.getrlimit(resource.RLIMIT_DATA)[0]}
-    limits = {name: limit for name, limit in limits.items() if limit != resource.RLIM_INFINITY}
-    if not limits:
-        return []
     used = psutil.Process().memory_info()
-    return [limit - int(getattr(used, name, 0)) for name, limit in limits.items()]
+    for name, kind in (("vms", resource.RLIMIT_AS), ("data", resource.RLIMIT_DATA)):
+        limit = resource.getrlimit(kind)[0]
+        if limit != resource.RLIM_INFINITY:
+            yield limit - int(getattr(used, name, 0))
 
 
-# Folder of the groups, and names of limits, usage, and files in the page cache (https://docs.kernel.org/admin-guide:
-# cgroup-v2.html, cgroup-v1/memory.html)
-_GROUPS = (
-    ("sys/fs/cgroup", ("memory.max", "memory.high"), "memory.current", "inactive_file"),
-    ("sys/fs/cgroup/memory", ("memory.limit_in_bytes",), "memory.usage_in_bytes", "total_inactive_file"),
-)
+# Limits of versions 2 and 1 (https://docs.kernel.org/admin-guide: cgroup-v2.html, cgroup-v1/memory.html)
+_LIMITS = ("memory.max", "memory.high", "memory.limit_in_bytes")
 
 
 def _free_in_groups(root: Path) -> Iterator[int]:
     """Free memory of each control group of this process and of those above it, if they have a limit."""
-    for folder, limits, usage, cache in _GROUPS:
-        top = root / folder
-        version_1 = top.name == "memory"
-        pattern = r"^\d+:(?:[^:]*,)?memory(?:,[^:]*)?:/(.*)$" if version_1 else r"^0::/(.*)$"
-        named = re.search(pattern, _text(root / "proc/self/cgroup"), re.MULTILINE)
-        group = top / named[1] if named else top
-        if not group.is_dir():  # of another namespace: only the top is visible
-            group = top
+    for line in _text(root / "proc/self/cgroup").splitlines():
+        _, controllers, name = line.split(":", 2)  # of version 2 no controllers
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        top = root / "sys/fs/cgroup" / ("memory" if controllers else "")
+        group = top / name.lstrip("/")
+        group = group if group.is_dir() else top  # of another namespace: only the top is visible
         for place in (group, *(above for above in group.parents if above.is_relative_to(top))):
-            cached = re.search(rf"^{cache} (\d+)$", _text(place / "memory.stat"), re.MULTILINE)
-            used = _text(place / usage).strip()
-            for limit in (_text(place / name).strip() for name in limits):
+            cached = re.findall(r"^(?:total_)?inactive_file (\d+)$", _text(place / "memory.stat"), re.MULTILINE)
+            used = (_text(place / "memory.current") or _text(place / "memory.usage_in_bytes")).strip()
+            for limit in (_text(place / name).strip() for name in _LIMITS):
                 if used.isdecimal() and limit.isdecimal():  # not "max"
-                    yield int(limit) - int(used) + (int(cached[1]) if cached else 0)
+                    yield int(limit) - int(used) + max(map(int, cached), default=0)
 
 
 def _text(path: Path) -> str:

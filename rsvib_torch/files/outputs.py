@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from itertools import combinations
 from pathlib import Path
 
@@ -22,11 +23,10 @@ def _inside(path: _Path, folder: _Path) -> bool:
 
 def _identity(path: _Path) -> tuple[int, int] | None:
     """Device and number of a file or folder, which all its names share; None if it does not exist."""
-    try:
+    with suppress(OSError):
         status = os.stat(path)
-    except OSError:
-        return None
-    return status.st_dev, status.st_ino
+        return status.st_dev, status.st_ino
+    return None
 
 
 def _same(path: _Path, other: _Path) -> bool:
@@ -62,16 +62,14 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
     for output in outputs:
         check_not_special(output)
     for source in inputs:
-        for output in outputs:
-            reason = _conflict(output, source)
-            if reason is not None:
-                raise ValueError(f"cannot write {output}: {reason}; choose another name")
+        places = [(f"cannot write {output}", output, "name") for output in outputs]
         if folder is not None and (os.path.isdir(source) or not _inside(source, folder)):
-            reason = _conflict(folder, source)
+            places.append((f"cannot write into {folder}", folder, "folder"))
+        for problem, place, remedy in places:
+            reason = _conflict(place, source)
             if reason is not None:
-                raise ValueError(f"cannot write into {folder}: {reason}; choose another folder")
+                raise ValueError(f"{problem}: {reason}; choose another {remedy}")
     for one, other in combinations(outputs, 2):
-        if _same(one, other):
-            raise ValueError(f"cannot write {one} and {other}: they are the same file; choose two names")
-        if _inside(one, other) or _inside(other, one):
-            raise ValueError(f"cannot write {one} and {other}: one lies inside the other; choose two names")
+        if _same(one, other) or _inside(one, other) or _inside(other, one):
+            reason = "they are the same file" if _same(one, other) else "one lies inside the other"
+            raise ValueError(f"cannot write {one} and {other}: {reason}; choose two names")

@@ -1,25 +1,17 @@
-from .formats import StackFormat, register_format
-from .frame_times import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
-from .stack_info import FrameError, FrameReader, StackInfo, is_video
-from .stack_reading import open_stack, read_stack, read_stack_info
-from .stack_writing import check_stack_target, metadata_not_kept, stack_files, write_stack
-
-__all__ = [
-    "FrameError",
-    "FrameReader",
-    "StackFormat",
-    "StackInfo",
-    "TimingWarning",
-    "check_stack_target",
-    "describe_stack",
-    "exposure_times",
-    "is_video",
-    "metadata_not_kept",
-    "open_stack",
-    "read_stack",
-    "read_stack_info",
-    "register_format",
-    "stack_files",
-    "timing_from_first_frame",
-    "write_stack",
-]
+from .formats import StackFormat as StackFormat
+from .formats import register_format as register_format
+from .frame_times import TimingWarning as TimingWarning
+from .frame_times import describe_stack as describe_stack
+from .frame_times import exposure_times as exposure_times
+from .frame_times import timing_from_first_frame as timing_from_first_frame
+from .stack_info import FrameError as FrameError
+from .stack_info import FrameReader as FrameReader
+from .stack_info import StackInfo as StackInfo
+from .stack_info import is_video as is_video
+from .stack_reading import open_stack as open_stack
+from .stack_reading import read_stack as read_stack
+from .stack_reading import read_stack_info as read_stack_info
+from .stack_writing import check_stack_target as check_stack_target
+from .stack_writing import metadata_not_kept as metadata_not_kept
+from .stack_writing import stack_files as stack_files
+from .stack_writing import write_stack as write_stack

@@ -30,10 +30,7 @@ def attributes_of(info: StackInfo) -> Table:
 
 
 def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], dtype: np.dtype) -> StackInfo:
-    """Interpret a stored array of (H, W), (T, H, W), (T, C, H, W), or (T, H, W, C) if ``axes`` states it, as a stack.
-
-    The attributes are those of ``attributes_of``, or times of other programs; all may be missing.
-    """
+    """A stored array as a stack; the attributes are those of ``attributes_of``, or times of other programs."""
     axes = str(attributes.get("axes", {2: "HW", 3: "THW", 4: "TCHW"}.get(len(shape), "")))
     if len(axes) != len(shape) or axes not in ("HW", "THW", "TCHW", "THWC") or min(shape) < 1:
         raise ValueError(f"array of shape {shape} with axes {axes!r}; expected HW, THW, TCHW or THWC")
@@ -46,10 +43,9 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
         shape = (1, *shape)
     elif axes == "THWC":
         shape = (shape[0], shape[3], shape[1], shape[2])
-    stated: Table = {}
     if attributes.get("frame_times") is not None:
-        times = np.asarray(attributes["frame_times"], dtype=np.float64).ravel()
-        stated["frame_times"] = tuple(float(time) for time in times)
+        times = np.asarray(attributes["frame_times"], dtype=np.float64)
+        stated: Table = {"frame_times": tuple(times.ravel().tolist())}
     else:
         stated = times_of_attributes(attributes, shape[0])
     resolution = attributes.get("resolution")
@@ -57,11 +53,10 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
         x, y = (float(value) for value in resolution)
         resolution = (x, y, str(attributes.get("resolution_unit", "centimeter")))
     full_scale = attributes.get("full_scale")
-    full_scale = known_full_scale(dtype, None if full_scale is None else float(full_scale))
     return StackInfo(
         shape,
         dtype.name,
-        full_scale,
+        known_full_scale(dtype, None if full_scale is None else float(full_scale)),
         resolution=resolution,
         channels_last=axes == "THWC",
         orientation=orientation_of(attributes.get("orientation")),

@@ -11,8 +11,6 @@ import numpy as np
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo, readable_frame
 from rsvib_torch.numerics.tables import Array
 
-Read = Callable[[int, int], Array]
-
 
 class BlockReader(FrameReader):
     """Frames that are read in blocks of a number of frames ``together``; a block is kept until its last frame was read.
@@ -25,7 +23,7 @@ class BlockReader(FrameReader):
         self,
         path: Path,
         info: StackInfo,
-        read: Read,
+        read: Callable[[int, int], Array],
         together: int = 1,
         more_bytes: int = 0,
         close: Callable[[], None] = lambda: None,
@@ -118,7 +116,8 @@ def part_reader(reader: FrameReader, start: int, end: int | None) -> BlockReader
         path=None,  # the sound of a video, and metadata of all frames, are not those of a part
         metadata={name: None if tag and tag.scope == "stack" else tag for name, tag in info.metadata.items()},
     )
-    path = info.path or Path()
-    return BlockReader(
-        path, part, lambda first, _: reader.frame(start + first)[None], 1, info.decoding_bytes, reader.close
-    )
+
+    def read(first: int, _: int) -> Array:
+        return reader.frame(start + first)[None]
+
+    return BlockReader(info.path or Path(), part, read, 1, info.decoding_bytes, reader.close)

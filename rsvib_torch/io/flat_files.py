@@ -13,7 +13,7 @@ from rsvib_torch.checks.arrays import channels_appear_last
 from rsvib_torch.checks.validation import Section, read_json, validate
 from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
-from rsvib_torch.io.full_scale import check_dtype, known_full_scale
+from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.numerics.tables import Array
 
@@ -24,24 +24,23 @@ def open_npy(path: Path) -> BlockReader:
         with path.open("rb") as file:
             head = BytesIO(file.read(1 << 14))  # bytes; NumPy accepts headers of up to 10,000
         first = np.lib.format.read_magic(head) == (1, 0)
-        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        shape, fortran_order, dtype = read(head)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read_header(head)
         check_dtype(dtype)
-        if len(shape) == 2:
-            shape = (1, *shape)
-        if len(shape) not in (3, 4) or min(shape) < 1:
-            raise ValueError(f"array has shape {shape}; expected (H, W), (T, H, W) or (T, C, H, W)")
         if channels_appear_last(shape):
             raise ValueError(f"array of shape {shape} appears to have its channels last; store (T, C, H, W)")
-        info = StackInfo(shape, dtype.name, known_full_scale(dtype))
+        info = info_from_attributes({}, shape, dtype)
         reader = contiguous_reader(path, info, head.tell(), dtype)
         if not fortran_order:
             return reader
         reader.close()
         # all frames together: the pixels of a frame lie everywhere in the file
-        return BlockReader(
-            path, info, lambda *_: np.load(path, allow_pickle=False).reshape(shape), shape[0], info.frame_bytes
-        )
+
+        def read(*_: int) -> Array:
+            frames: Array = np.load(path, allow_pickle=False).reshape(info.shape)
+            return frames
+
+        return BlockReader(path, info, read, info.shape[0], info.frame_bytes)
 
 
 def write_npy(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
@@ -76,13 +75,9 @@ class _Sidecar(Section):
     resolution: tuple[float, float, str] | None = Field(default=None, strict=False)
 
 
-def _sidecar_path(path: Path) -> Path:
-    return path.with_name(path.name + ".json")
-
-
 def open_raw(path: Path) -> BlockReader:
     """Open a file of pixels whose layout its sidecar states."""
-    beside = _sidecar_path(path)
+    beside = path.with_name(f"{path.name}.json")
     if not beside.exists():
         raise FileNotFoundError(f"{path}: raw frames need the sidecar {beside.name}, which does not exist")
     sidecar = validate(_Sidecar, read_json(beside, "sidecar of raw frames"), str(beside))
@@ -102,7 +97,7 @@ def write_raw(path: Path, info: StackInfo, frames: Iterator[Array], compression:
         attributes["resolution"].append(attributes.pop("resolution_unit"))
     kind = {"format": "rsvib raw", "version": 1, "shape": info.stored_shape, "dtype": info.dtype}
     content = {**kind, "byte_order": "little", "offset": 0, **attributes}
-    _sidecar_path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    path.with_name(f"{path.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     with path.open("wb") as file:
         for frame in frames:
             file.write(info.to_stored(frame).data)

@@ -15,8 +15,6 @@ from rsvib_torch.io.stack_info import FFV1, H264, READ_ONLY_VIDEO, FrameReader, 
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import quoted
 
-Frame = Array
-
 
 # Contract of a format. All functions are called with the path of the stack; ``write`` with that of a temporary file or
 # folder, which the caller renames when it is complete (``rsvib_torch/files/atomic.py``).
@@ -39,37 +37,22 @@ Frame = Array
 # Writing:     ``write`` takes the frames one after another; the caller synchronises the files with the disk.
 @dataclass(frozen=True)
 class StackFormat:
-    """How stacks are stored in files with certain endings.
+    """How stacks are stored in files with certain endings."""
 
-    Attributes:
-        name: Name in messages.
-        endings: File endings, lower case with the dot; ``""`` is a name without an ending.
-        open: Opens a stack for reading.
-        write: ``write(path, info, frames, compression)`` writes a stack from an iterator of its frames; None for
-            formats that are only read.
-        dtypes: NumPy names of the data types that can be written.
-        check: Raises an error if a stack cannot be written to a path.
-        kind: ``"file"``; ``"folder"``, which may contain other files; or ``"tree"``, a folder that is replaced as one.
-        marker: File that identifies a folder of any name as a stack of this format.
-        companions: Endings of additional files, which are appended to the file name.
-        compressions: Values of ``compression`` besides None.
-        keeps: What is stored besides pixels: ``"full_scale"``, ``"frame_times"``, ``"orientation"``, ``"resolution"``
-            and ``"metadata"``, attributes of ``StackInfo``.
-    """
-
-    name: str
-    endings: tuple[str, ...]
+    name: str  # in messages
+    endings: tuple[str, ...]  # lower case with the dot; ``""`` is a name without an ending
     open: Callable[[Path], FrameReader]
-    write: Callable[[Path, StackInfo, Iterator[Frame], str | None], None] | None = None
-    dtypes: tuple[str, ...] = (
+    # ``write(path, info, frames, compression)``; None for formats that are only read
+    write: Callable[[Path, StackInfo, Iterator[Array], str | None], None] | None = None
+    dtypes: tuple[str, ...] = (  # NumPy names of those that can be written
         "uint8", "int8", "uint16", "int16", "uint32", "int32", "float16", "float32", "float64",
     )  # fmt: skip
-    check: Callable[[Path, StackInfo], None] | None = None
-    kind: Literal["file", "folder", "tree"] = "file"
-    marker: str = ""
-    companions: tuple[str, ...] = ()
-    compressions: tuple[str, ...] = ()
-    keeps: tuple[str, ...] = ()
+    check: Callable[[Path, StackInfo], None] | None = None  # raises an error if a stack cannot be written to a path
+    kind: Literal["file", "folder", "tree"] = "file"  # a "folder" may contain other files; a "tree" is replaced as one
+    marker: str = ""  # file that identifies a folder of any name as a stack of this format
+    companions: tuple[str, ...] = ()  # endings of additional files, which are appended to the file name
+    compressions: tuple[str, ...] = ()  # values of ``compression`` besides None
+    keeps: tuple[str, ...] = ()  # attributes of ``StackInfo`` that are stored besides the pixels
 
 
 def packaged_format(
@@ -145,12 +128,6 @@ FORMATS: dict[str, StackFormat] = {ending: form for form in _FORMATS_OF_THE_PACK
 
 def register_format(form: StackFormat) -> None:
     """Register a format for reading and writing stacks; it replaces earlier formats of the same endings.
-
-    Args:
-        form: The format; see the contract above ``StackFormat``.
-
-    Raises:
-        ValueError: If it has no ending, or one without a dot or in upper case.
 
     Example:
         >>> register_format(StackFormat("portable", ("pgm",), open=lambda path: None))

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.motion.timing import MAX_START_TIME, MIN_ROW_TIME, SensorTiming
-from rsvib_torch.text import number_of
 
 _RATE_TOLERANCE = 0.01  # relative; files state 30 for 29.97 frames per second (0.1 %)
 
@@ -32,20 +31,16 @@ class TimingWarning(UserWarning):
 class _Spacing:
     """Spacing of the frames of a file."""
 
-    numbers: NDArray[np.float64]  # (T,) intervals from the first frame to each, more than one where frames were dropped
+    # (T,) intervals from the first frame to each, several where frames were dropped; None if the rate is variable:
+    # times are not whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one
+    numbers: NDArray[np.float64] | None
     interval: float  # s, without dropped frames: of a straight line, or the median if the rate is variable
-    shortest: float  # s, shortest interval if the rate is variable, otherwise ``interval``
-    longest: float  # s, longest interval if the rate is variable, otherwise ``interval``
+    limits: tuple[float, float]  # s, shortest and longest interval if the rate is variable, otherwise ``interval``
     error: float  # s, of ``interval`` due to the error of the times
-    # whether times are whole intervals apart, to within their error, 2 % (clock of a camera), and a quarter of one
-    equal: bool
 
 
 def _spacing(info: StackInfo) -> _Spacing | None:
-    """Spacing according to the times or the frame rate of a file; None if it states neither.
-
-    Impossible ones are refused.
-    """
+    """Spacing by the times or the frame rate of a file; None if it states neither. Impossible ones are refused."""
     few = info.frame_times is None or len(info.frame_times) < 2
     if few and info.frame_rate is None:
         return None
@@ -60,7 +55,7 @@ def _spacing(info: StackInfo) -> _Spacing | None:
         )
     if few:
         period = float(intervals[0])
-        return _Spacing(np.zeros(0), period, period, period, 0.0, equal=True)
+        return _Spacing(np.zeros(0), period, (period, period), 0.0)
     median = float(np.median(intervals))
     single = float(intervals[np.round(intervals / median) == 1].mean())  # more accurate if times are rounded
     whole = np.round(intervals / single)
@@ -69,8 +64,8 @@ def _spacing(info: StackInfo) -> _Spacing | None:
     jitter = float(np.abs(times - line(numbers)).max())
     if whole.min() >= 1 and jitter <= min(max(info.time_error, 0.02 * single), 0.25 * single):
         interval = float(line.convert().coef[1])
-        return _Spacing(numbers, interval, interval, interval, info.time_error / float(numbers[-1]), equal=True)
-    return _Spacing(numbers, median, float(intervals.min()), float(intervals.max()), info.time_error, equal=False)
+        return _Spacing(numbers, interval, (interval, interval), info.time_error / float(numbers[-1]))
+    return _Spacing(None, median, (float(intervals.min()), float(intervals.max())), info.time_error)
 
 
 def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
@@ -86,7 +81,7 @@ def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
     if info.frame_times is not None and info.time_error == 0.0:
         period *= max(1, round(spacing.interval / period))
     tolerance = _RATE_TOLERANCE * period + spacing.error
-    return spacing.shortest - tolerance <= period <= spacing.longest + tolerance
+    return spacing.limits[0] - tolerance <= period <= spacing.limits[1] + tolerance
 
 
 def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] | None:
@@ -98,12 +93,6 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     numbers of intervals apart to within their error or 2 % of a period, the result consists of multiples of the
     sensor's frame period, with gaps where frames were dropped. Otherwise the frame rate is variable: the times are
     returned as they are if their error is less than a tenth of a period.
-
-    Example:
-        >>> info = StackInfo((4, 8, 8), "uint8", 255.0, (0.0, 0.033, 0.067, 0.2), time_error=0.001)
-        >>> timing = SensorTiming(row_time=1 / 30000, exposure_rows=100, frame_rows=1000)
-        >>> [round(30 * time) for time in exposure_times(info, timing)]
-        [0, 1, 2, 6]
     """
     if info.frame_times is None and info.frame_numbers is not None:
         return tuple(number * timing.frame_period for number in info.frame_numbers)
@@ -112,7 +101,7 @@ def exposure_times(info: StackInfo, timing: SensorTiming) -> tuple[float, ...] |
     spacing = _spacing(info)
     if spacing is None or not _same_rate(info, timing):
         return None
-    if spacing.equal:
+    if spacing.numbers is not None:
         return tuple(float(number) * timing.frame_period for number in spacing.numbers)
     return info.frame_times if info.time_error <= 0.1 * timing.frame_period else None
 
@@ -121,26 +110,22 @@ def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     """The sensor with the frame times of a file, unless it has its own or the frames are evenly spaced."""
     if timing.frame_start_times is not None:
         return timing
-    name, spacing, times = info.path or "the file", _spacing(info), exposure_times(info, timing)
+    spacing, times, text = _spacing(info), exposure_times(info, timing), ""
     if spacing is not None and not _same_rate(info, timing):
         exact = info.frame_times is not None and info.time_error == 0.0
         used = "the times of the file are used" if exact else f"{timing.frame_rate:.5g} is used, with equal intervals"
-        warnings.warn(
-            f"{name}: {1.0 / spacing.interval:.5g} frames per second according to its {info.time_source}, but "
+        text = (
+            f"{1.0 / spacing.interval:.5g} frames per second according to its {info.time_source}, but "
             f"{timing.frame_rate:.5g} according to the sensor (frame_rows={timing.frame_rows:g}, "
             f"row_time={timing.row_time:g} s); {used}. If the file is right, set the frame rate to "
             f"{1.0 / spacing.interval:.6g} (frame_rows={spacing.interval / timing.row_time:.6g}) or correct row_time; "
-            "if the sensor is right (slow motion), nothing needs to be changed",
-            TimingWarning,
-            stacklevel=2,
+            "if the sensor is right (slow motion), nothing needs to be changed"
         )
     elif times is None and info.frame_times is not None and len(info.frame_times) > 1:
-        warnings.warn(
-            f"{name}: the {info.time_source} are irregular and have errors of up to {1e3 * info.time_error:.3g} ms; "
-            "equal intervals are assumed, set frame_start_times if they are not",
-            TimingWarning,
-            stacklevel=2,
-        )
+        text = f"the {info.time_source} are irregular and have errors of up to {1e3 * info.time_error:.3g} ms; "
+        text += "equal intervals are assumed, set frame_start_times if they are not"
+    if text:
+        warnings.warn(f"{info.path or 'the file'}: {text}", TimingWarning, stacklevel=2)
     if times is None or (info.time_error and np.ptp(np.diff(times)) < 1e-9 * timing.frame_period):
         return timing
     return replace(timing, frame_start_times=times)
@@ -150,12 +135,8 @@ def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
 def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     """The timing of a stack: the sensor, with the frame times of the file relative to the first frame.
 
-    Args:
-        timing: The sensor. Its own ``frame_start_times``, if it has any, are kept.
-        info: What the file states, from ``read_stack_info``.
-
-    Warns:
-        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
+    Those of the sensor, if it has any, are kept. A ``TimingWarning`` states if the file, which ``info`` from
+    ``read_stack_info`` describes, has another frame rate than the sensor, or irregular times that are too rough.
 
     Example:
         >>> import rsvib_torch as rsv
@@ -165,37 +146,30 @@ def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTimi
         [0.0, 0.0333, 0.1]
     """
     of_stack = timing_of_stack(timing, info)
-    if timing.frame_start_times is not None or of_stack.frame_start_times is None:
+    times = of_stack.frame_start_times
+    if timing.frame_start_times is not None or times is None:
         return of_stack
-    times = [float(time) for time in of_stack.frame_start_times]
-    return replace(of_stack, frame_start_times=tuple(time - times[0] for time in times))
+    return replace(of_stack, frame_start_times=tuple(float(time) - float(times[0]) for time in times))
 
 
 def describe_stack(info: StackInfo, timing: SensorTiming | None) -> list[str]:
     """Sentences about an orientation, dropped frames and unequal intervals that a file states."""
-
-    def missing_frames(count: int) -> str:
-        return f"{number_of(count, 'frame')} {'is' if count == 1 else 'are'} missing"
-
-    name, notes = info.path or "the file", []
+    name, notes, missing, source = info.path or "the file", [], 0, f"its {info.time_source}"
     if info.orientation in _ORIENTATIONS:
-        notes.append(
-            f"{name}: displayed {_ORIENTATIONS[info.orientation]}; rows, x and y are those of the stored frames"
-        )
+        displayed = _ORIENTATIONS[info.orientation]
+        notes.append(f"{name}: displayed {displayed}; rows, x and y are those of the stored frames")
     if timing is None or timing.frame_start_times is not None:
         return notes
-    if info.frame_times is None and info.frame_numbers is not None:
-        missing = info.frame_numbers[-1] + 1 - info.shape[0]
-        notes.append(f"{name}: {missing_frames(missing)} according to the numbers in the file names, which are used")
     times, spacing = exposure_times(info, timing), _spacing(info)
-    if times is not None and spacing is not None and len(spacing.numbers):
+    if info.frame_times is None and info.frame_numbers is not None:
+        missing, source = info.frame_numbers[-1] + 1 - info.shape[0], "the numbers in the file names"
+    elif times is not None and spacing is not None and spacing.numbers is None:
+        low, high = (1e3 * interval for interval in spacing.limits)
+        error = f"whose error is up to {1e3 * info.time_error:.2g} ms"
+        notes.append(f"{name}: frame intervals of {low:.4g} to {high:.4g} ms; {source} are used, {error}")
+    elif times is not None and spacing is not None and spacing.numbers is not None and len(spacing.numbers):
         missing = round(float(spacing.numbers[-1])) + 1 - len(times)
-        if not spacing.equal:
-            low, high = (1e3 * float(interval) for interval in (np.diff(times).min(), np.diff(times).max()))
-            notes.append(
-                f"{name}: frame intervals of {low:.4g} to {high:.4g} ms; its {info.time_source} are used, whose error "
-                f"is up to {1e3 * info.time_error:.2g} ms"
-            )
-        elif missing:
-            notes.append(f"{name}: {missing_frames(missing)} according to its {info.time_source}, which are used")
+    if missing:
+        are = "frame is" if missing == 1 else "frames are"
+        notes.append(f"{name}: {missing} {are} missing according to {source}, which are used")
     return notes

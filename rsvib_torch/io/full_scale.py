@@ -55,10 +55,7 @@ def full_scale_of_counts(counts: Array, full_scale: float | None, name: str) -> 
 
 
 def counts_to_frames(counts: Array, full_scale: float | None, name: str, nodata: float | None = None) -> Tensor:
-    """Convert pixels as stored to float32 frames; floats keep their values, and pixels of the value ``nodata`` are NaN.
-
-    ``name`` is the file or argument, for messages.
-    """
+    """Pixels as stored as float32 frames; floats keep their values, ``nodata`` is NaN, messages have the ``name``."""
     if nodata is not None:
         missing = counts == counts.dtype.type(nodata)
         if missing.any():
@@ -77,10 +74,7 @@ def counts_to_frames(counts: Array, full_scale: float | None, name: str, nodata:
 
 
 def frames_to_counts(frames: Tensor, dtype: np.dtype, full_scale: float | None, nodata: float | None = None) -> Array:
-    """Convert frames of full scale 1 to pixels to store: integers are scaled, rounded and clipped; floats are kept.
-
-    NaN is stored as ``nodata``; without it, frames that are not finite cannot be stored as integers.
-    """
+    """Frames of full scale 1 as pixels to store: integers scaled, rounded and clipped; NaN as ``nodata``."""
     pixels = frames.detach().cpu()
     if nodata is not None:
         missing = torch.isnan(pixels)

@@ -76,14 +76,12 @@ def _times_beside(file: Any, dataset: Any, count: int) -> Table:
     h5py = _h5py()
     found: Table = {}
     for group in (file, dataset.parent):
-        members = {
-            name: group[name]
-            for name in time_attributes(dict.fromkeys(group))
-            if isinstance(group.get(name, getlink=True), h5py.HardLink) and isinstance(group[name], h5py.Dataset)
-        }
         found |= time_attributes(group.attrs)
-        for name, member in members.items():
-            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf" and not _is_outside(member):
+        for name in time_attributes(dict.fromkeys(group)):
+            member = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+            if not isinstance(member, h5py.Dataset) or _is_outside(member):
+                continue
+            if member.shape in ((), (1,), (count,)) and member.dtype.kind in "iuf":
                 found[name] = member[...]
                 found |= {f"{name}_units": member.attrs[key] for key in ("unit", "units") if key in member.attrs}
     return times_of_attributes(found, count)

@@ -4,7 +4,6 @@ Pillow reads headers and metadata and verifies PNG files; OpenCV decodes them: P
 """
 
 import io
-import math
 import re
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -29,7 +28,7 @@ from rsvib_torch.numerics.tables import Array
 
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
 _LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032
-_CHANNELS = {"1": 1, "L": 1, "I;16": 1, "P": 3, "RGB": 3, "LA": 4, "RGBA": 4}  # of a decoded PNG file, by mode
+_CHANNELS = {"L": 1, "I;16": 1, "RGB": 3, "RGBA": 4}  # by mode
 _LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and previews have 64 KB each, colour profiles 3 MB
 _PNG_HEADER = 8 + 25  # bytes of the signature and the chunk with the size
 
@@ -40,36 +39,26 @@ def image_info(path: Path) -> StackInfo:
     with readable_stack(path, "PNG" if is_png else "JPEG"), path.open("rb") as file:
         head = file.read(_LONGEST_HEADER)  # Pillow would search a file of any size for it, at 20 MB/s
         file_size = file.seek(0, io.SEEK_END)
-        image = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
-        info = _png_info(image, head, file_size) if is_png else _jpeg_info(image)
-        if file_size > 4 * np.dtype(info.dtype).itemsize * math.prod(info.shape) + _LONGEST_HEADER:
-            raise ValueError(f"{file_size} bytes are too many for {image.width} x {image.height} px")
+        image: Any = PngImageFile(io.BytesIO(head)) if is_png else JpegImageFile(io.BytesIO(head))
+        if is_png and image.is_animated:
+            raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
+        if image.mode not in _CHANNELS:
+            raise ValueError(f"pixels are {image.mode}; expected grey, RGB or RGBA")
+        channels, dtype = _CHANNELS[image.mode], np.dtype(np.uint16 if is_png and head[24] == 16 else np.uint8)
+        if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
+            channels = 4
+        size, nbytes = f"{image.width} x {image.height} px", image.width * image.height * channels * dtype.itemsize
+        if is_png and nbytes > 8 * _LARGEST_RATIO * file_size:  # 1 bit is 1 byte
+            raise ValueError(f"its header states {size}, which {file_size} bytes cannot hold")
+        if file_size > 4 * nbytes + _LONGEST_HEADER:
+            raise ValueError(f"{file_size} bytes are too many for {size}")
+        shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
+        stated, dpi, resolution = image.info.get(_FULL_SCALE), image.info.get("dpi"), None
+        if is_png and dpi is not None and min(dpi) > 0:
+            resolution = (round(dpi[0] / 0.0254) / 100.0, round(dpi[1] / 0.0254) / 100.0, "centimeter")
+        full_scale = known_full_scale(dtype, None if stated is None else float(stated))
+        info = StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
         return replace(info, **exif_fields(image.info.get("exif", b"")))
-
-
-def _jpeg_info(image: Any) -> StackInfo:
-    if image.mode not in ("L", "RGB"):
-        raise ValueError(f"pixels are {image.mode}; expected grey or RGB")
-    shape = (1, 3, image.height, image.width) if image.mode == "RGB" else (1, image.height, image.width)
-    return StackInfo(shape, "uint8", 255.0, channels_last=image.mode == "RGB")
-
-
-def _png_info(image: Any, head: bytes, file_size: int) -> StackInfo:
-    if image.is_animated:
-        raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
-    dtype = np.dtype(np.uint16 if head[24] == 16 else np.uint8)  # bits of a value
-    channels = _CHANNELS[image.mode]
-    if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
-        channels = 4
-    if image.width * image.height * channels * dtype.itemsize > 8 * _LARGEST_RATIO * file_size:  # 1 bit is 1 byte
-        raise ValueError(f"its header states {image.width} x {image.height} px, which {file_size} bytes cannot hold")
-    shape = (1, image.height, image.width) if channels == 1 else (1, channels, image.height, image.width)
-    stated = image.info.get(_FULL_SCALE)
-    full_scale = known_full_scale(dtype, None if stated is None else float(stated))
-    dpi, resolution = image.info.get("dpi"), None
-    if dpi is not None and min(dpi) > 0:
-        resolution = (round(dpi[0] / 0.0254) / 100.0, round(dpi[1] / 0.0254) / 100.0, "centimeter")
-    return StackInfo(shape, dtype.name, full_scale, resolution=resolution, channels_last=channels > 1)
 
 
 def decode_image(path: Path) -> Array:
@@ -90,10 +79,7 @@ def decode_image(path: Path) -> Array:
 
 
 def encode_png(path: Path, frame: Array, info: StackInfo) -> None:
-    """Write one frame (H, W) or (C, H, W).
-
-    Full scale, resolution and orientation are stored as chunks ``tEXt``, ``pHYs`` and ``eXIf``.
-    """
+    """Write one frame (H, W) or (C, H, W), with full scale, resolution and orientation in chunks of their own."""
     if frame.ndim == 3:
         frame = np.moveaxis(frame, 0, -1)[..., (2, 1, 0, 3)[: frame.shape[0]] if frame.shape[0] > 1 else (0,)]
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(frame))
@@ -121,13 +107,8 @@ _ENDINGS = (*_PNG, *_TIFF, *_JPEG)
 _PNG_TYPES = ("uint8", "uint16")
 
 
-def _natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Key that sorts frame9 before frame10."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
-
-
 def _frame_files(path: Path) -> list[Path]:
+    """The files of a folder in natural order (frame9 before frame10), or one file."""
     if not path.is_dir():
         return [path]
     visible = [file for file in path.iterdir() if not file.name.startswith(".") and file.is_file()]
@@ -137,7 +118,12 @@ def _frame_files(path: Path) -> list[Path]:
         raise ValueError(f"{path}: the folder contains both {' and '.join(found)} files; expected one kind")
     if not found:
         raise ValueError(f"{path}: the folder contains no PNG, TIFF or JPEG files")
-    return sorted(files[found[0]], key=_natural_key)
+
+    def parts(file: Path) -> list[tuple[int, int, str]]:
+        split = re.split(r"(\d+)", file.name)
+        return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in split if part]
+
+    return sorted(files[found[0]], key=parts)
 
 
 def _frame_numbers(files: list[Path]) -> tuple[int, ...] | None:
@@ -177,11 +163,6 @@ def _read_frame(file: Path) -> Array:
         return reader.frame(0)
 
 
-def _without_position(info: StackInfo) -> StackInfo:
-    """What must be the same in all files of a folder."""
-    return replace(info, resolution=None, frame_times=None)
-
-
 def open_images(path: Path) -> BlockReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
@@ -196,10 +177,9 @@ def open_images(path: Path) -> BlockReader:
             continue
         if first is None:
             first = (info, file)
-        if _without_position(info) != _without_position(first[0]):
-            raise ValueError(
-                f"frames of different size or kind: {first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
-            )
+        if replace(info, resolution=first[0].resolution, frame_times=first[0].frame_times) != first[0]:
+            kinds = f"{first[1].name} is {first[0].kind}, {file.name} is {info.kind}"
+            raise ValueError(f"frames of different size or kind: {kinds}")
     if first is None or len(damaged) > len(files) // 2:
         raise next(iter(damaged.values()))
     of_files = [info.metadata for info in infos if info is not None]
@@ -283,6 +263,5 @@ def check_folder(path: Path, info: StackInfo) -> None:
         others = images - set(_frame_names(info))
         if others:
             kind = next(kind for kind, endings in _KINDS.items() if Path(min(others)).suffix.lower() in endings)
-            raise ValueError(
-                f"{path}: the folder contains other {kind} files, e.g. {min(others)}; choose another folder"
-            )
+            found = f"other {kind} files, e.g. {min(others)}"
+            raise ValueError(f"{path}: the folder contains {found}; choose another folder")

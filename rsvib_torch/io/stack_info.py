@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -121,15 +121,11 @@ class StackInfo(Summarised):
     @property
     def nodata(self) -> float | None:
         """Value of pixels without data that the tag GDAL_NODATA states, if the data type can hold it."""
-        tag = self.metadata.get("GDAL_NODATA")
-        try:
+        tag, value = self.metadata.get("GDAL_NODATA"), math.nan
+        with suppress(ValueError):
             value = math.nan if tag is None else float(str(tag.value).strip("\0 "))
-        except ValueError:
-            return None
-        if math.isnan(value):
-            return None
         limits = np.iinfo(self.dtype) if self.is_integer else np.finfo(self.dtype)
-        fits = limits.min <= value <= limits.max and (value.is_integer() or not self.is_integer)
+        fits = limits.min <= value <= limits.max and (value.is_integer() or not self.is_integer)  # NaN does not
         return value if fits else None
 
     @property
@@ -169,15 +165,8 @@ class StackInfo(Summarised):
         if count == self.shape[0]:
             return self
         shape = (count, *self.shape[1:])
-        return replace(
-            self,
-            shape=shape,
-            frame_times=None,
-            frame_numbers=None,
-            path=None,
-            files=None,
-            metadata=self.metadata_for(shape),
-        )
+        unknown: dict[str, Any] = dict.fromkeys(("frame_times", "frame_numbers", "path", "files"))
+        return replace(self, shape=shape, metadata=self.metadata_for(shape), **unknown)
 
     def restored_as(self, scale: int, mosaic: str | None) -> "StackInfo":
         """The kind of stack of the restored frames: ``scale`` times the rows and columns, colours of a mosaic."""
@@ -219,21 +208,13 @@ class FrameReader(Protocol):
 
     def close(self) -> None:
         """Close the file, if it is open between frames."""
-        return
 
 
 _RANGE = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
 
 def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
-    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them.
-
-    Example:
-        >>> split_range(Path("clip.mp4[100:200]"))
-        (PosixPath('clip.mp4'), (100, 200))
-        >>> split_range(Path("clip.mp4"))
-        (PosixPath('clip.mp4'), None)
-    """
+    """The file of a stack and the frames ``NAME[START:END]`` that are read of it; None for all of them."""
     found = _RANGE.fullmatch(path.name)
     if found is None or path.exists():
         return path, None
@@ -248,13 +229,9 @@ def is_video(path: Path) -> bool:
 
 @contextmanager
 def readable_stack(path: Path, kind: str) -> Iterator[None]:
-    """Convert any exception of a decoder of a ``kind`` of files, which may have every type, into a ``ValueError``.
-
-    A file without read permission remains an ``OSError``.
-    """
+    """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""
     if not path.is_dir():
-        with path.open("rb"):
-            pass
+        path.open("rb").close()
     try:
         yield
     except MemoryError:

@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -31,15 +32,8 @@ _MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a min
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
-    Args:
-        path: As in ``read_stack``.
-
-    Returns:
-        An object with ``info``, ``frame(index)`` and ``close()``.
-
-    Raises:
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
-        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
+    The path is as in ``read_stack``. The result has ``info``, ``frame(index)`` and ``close()``; damage of single frames
+    is detected when they are read.
 
     Example:
         >>> reader = open_stack("frames.tif")  # doctest: +SKIP
@@ -63,15 +57,9 @@ def read_stack_info(path: PathLike) -> StackInfo:
     """Read what a file states about its stack: shape, data type and full scale, without its pixels.
 
     Arguments and errors are those of ``open_stack``; unknown values are None.
-
-    Example:
-        >>> info = read_stack_info("frames.tif")  # doctest: +SKIP
-        >>> info.shape, info.dtype, info.full_scale  # doctest: +SKIP
-        ((3, 64, 48), 'uint16', 4095.0)
     """
-    reader = open_stack(path)
-    reader.close()
-    return reader.info
+    with closing(open_stack(path)) as reader:
+        return reader.info
 
 
 @checks_arguments
@@ -97,19 +85,13 @@ def read_stack(path: PathLike | Sequence[PathLike], *, full_scale: float | None 
         float32 frames, (T, H, W) or (T, C, H, W); NaN at pixels that have the value of the tag GDAL_NODATA.
 
     Raises:
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
         ValueError: If it is damaged, its frames differ in size, the full scale is unknown or exceeded, or the frames do
             not fit into the free memory.
 
     Example:
-        >>> import tempfile
-        >>> import torch
-        >>> import rsvib_torch as rsv
-        >>> frames = torch.rand(3, 64, 48, generator=torch.Generator().manual_seed(0))
-        >>> path = tempfile.mkdtemp() + "/frames.tif"
-        >>> rsv.write_stack(path, frames, dtype="uint16", full_scale=4095)  # 12 bits in a 16-bit file
-        >>> rsv.read_stack(path).shape, rsv.read_stack(path).max() <= 1.0  # the file states its full scale
-        (torch.Size([3, 64, 48]), tensor(True))
+        >>> frames = read_stack("frames.tif", full_scale=4095)  # 12 bits in a 16-bit file  # doctest: +SKIP
+        >>> frames.shape, float(frames.max()) <= 1.0  # doctest: +SKIP
+        (torch.Size([3, 64, 48]), True)
     """
     paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
     return torch.from_numpy(_read_pixels(paths, full_scale, as_counts=False)[0])
@@ -129,8 +111,7 @@ def _read_pixels(
     infos: list[StackInfo] = []
     count = 0  # frames of all files
     for path in paths:
-        reader = open_stack(path)
-        try:
+        with closing(open_stack(path)) as reader:
             info = reader.info
             infos.append(info)
             first = infos[0]
@@ -142,11 +123,10 @@ def _read_pixels(
             count += info.shape[0]
             joined = count if len(paths) > 1 else 0  # the frames of all files are copied into one array
             frame_bytes = _FRAME_COPIES * math.prod(info.shape[1:])
+            pixel_bytes = (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
             check_fits(
                 f"{path}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px",
-                (info.shape[0] + joined) * math.prod(info.shape[1:]) * dtype.itemsize
-                + frame_bytes
-                + info.decoding_bytes,
+                pixel_bytes + frame_bytes + info.decoding_bytes,
                 "process the stack in windows (iterate_stack, process_stack, rsvib run)",
             )
             pixels = np.empty(info.shape, dtype)
@@ -155,8 +135,6 @@ def _read_pixels(
                 frame = reader.frame(index)
                 pixels[index] = frame if stored else counts_to_frames(frame, stated, str(path), first.nodata)
                 advance()
-        finally:
-            reader.close()
         parts.append(pixels)
     return parts[0] if len(parts) == 1 else np.concatenate(parts), stated, first
 
@@ -170,12 +148,7 @@ class LoadedFrames(NamedTuple):
 
 
 def load_frames(frames: FramesOrFiles, full_scale: float | None) -> LoadedFrames:
-    """Read frames that are given by the paths of their files; other frames are returned unchanged.
-
-    Example:
-        >>> load_frames([[[0.5]]], None)
-        LoadedFrames(frames=[[[0.5]]], full_scale=None, info=None)
-    """
+    """Read frames that are given by the paths of their files; other frames are returned unchanged."""
     if isinstance(frames, (str, os.PathLike)):
         paths: list[PathLike] = [frames]
     elif isinstance(frames, (list, tuple)) and frames and all(isinstance(item, (str, os.PathLike)) for item in frames):

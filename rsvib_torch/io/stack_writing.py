@@ -13,6 +13,7 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_target, check_tree, check_writable, whole
 from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
@@ -21,12 +22,7 @@ from rsvib_torch.numerics.tables import Array
 
 
 def stack_files(path: PathLike) -> list[Path]:
-    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars).
-
-    Example:
-        >>> [path.name for path in stack_files("frames.raw")]
-        ['frames.raw', 'frames.raw.json']
-    """
+    """The paths that a stack occupies: its file or folder, and the files beside it (sidecars)."""
     path, _ = split_range(Path(path))
     form = FORMATS.get(path.suffix.lower())
     return [path, *(path.with_name(path.name + ending) for ending in (() if form is None else form.companions))]
@@ -35,10 +31,7 @@ def stack_files(path: PathLike) -> list[Path]:
 def check_info_target(
     path: Path, info: StackInfo, compression: str | None = None, *, check_folder: bool = True
 ) -> StackFormat:
-    """The format in which ``path`` is written; raises the error that writing would raise.
-
-    Without ``check_folder``, its folder need not exist.
-    """
+    """The format in which ``path`` is written, or the error of writing; ``check_folder``: its folder must exist."""
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
     if form.write is None:
@@ -53,6 +46,8 @@ def check_info_target(
         check_choice("compression", compression, form.compressions)
     if form.check is not None:
         form.check(path, info)
+    if info.is_integer:
+        required_full_scale(info.full_scale, np.dtype(info.dtype), path)
     if form.kind == "tree":
         check_tree(path, form.marker, f"{form.name} stack")
     if check_folder:
@@ -60,20 +55,19 @@ def check_info_target(
     return form
 
 
-def _info_to_write(info: StackInfo, like: StackInfo | None) -> StackInfo:
-    """A stack with what is stated about the stack from which it was computed, except times that are not exact."""
+def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None, like: StackInfo | None) -> StackInfo:
+    """A stack to write, with what ``like`` states except times that are not exact."""
+    if len(shape) not in (3, 4) or min(shape) < 1:
+        raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
+    kind = np.dtype(dtype or np.float32)
+    full_scale = known_full_scale(kind) if kind.kind == "f" or full_scale is None else full_scale
+    info = StackInfo(tuple(shape), kind.name, full_scale)
     if like is None:
         return info
-    kept = like.with_frames(info.shape[0])
-    return replace(
-        kept,
-        shape=info.shape,
-        dtype=info.dtype,
-        full_scale=info.full_scale,
-        frame_times=None if kept.time_error else kept.frame_times,
-        time_error=0.0,
-        metadata=like.metadata_for(info.shape, info.dtype),
-    )
+    kept = like.with_frames(shape[0])
+    stated: Table = {"shape": info.shape, "dtype": info.dtype, "full_scale": full_scale}
+    times, metadata = None if kept.time_error else kept.frame_times, like.metadata_for(info.shape, info.dtype)
+    return replace(kept, **stated, frame_times=times, time_error=0.0, metadata=metadata)
 
 
 def check_stack_target(
@@ -83,36 +77,18 @@ def check_stack_target(
     dtype: str | None = None,
     full_scale: float | None = None,
     like: StackInfo | None = None,
-) -> float | None:
-    """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed.
-
-    Returns:
-        The full scale that would be used; None for floats.
-    """
-    if len(shape) not in (3, 4) or min(shape) < 1:
-        raise ValueError(f"frames must have shape (T, H, W) or (T, C, H, W), got {tuple(shape)}")
-    kind = np.dtype(dtype or np.float32)
-    if kind.kind == "f":
-        full_scale = None
-    elif full_scale is None:
-        full_scale = known_full_scale(kind)
-    check_info_target(Path(path), _info_to_write(StackInfo(tuple(shape), kind.name, full_scale), like))
-    return None if kind.kind == "f" else required_full_scale(full_scale, kind, path)
+) -> None:
+    """Raise the error that ``write_stack`` would raise for frames of this shape, before they are computed."""
+    check_info_target(Path(path), _planned(shape, dtype, full_scale, like))
 
 
 def metadata_not_kept(
     like: StackInfo, path: PathLike, shape: tuple[int, ...], *, dtype: str | None = None
 ) -> tuple[str, ...]:
-    """What a file states about its frames and the file with the restored frames will not state.
+    """What a file states about its frames and the file ``path`` with the restored frames will not state.
 
-    Args:
-        like: The stack that is restored.
-        path: The stack to write.
-        shape: Its shape, (T, H, W) or (T, C, H, W).
-        dtype: Its data type; None for the same.
-
-    Returns:
-        Names of tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
+    ``shape`` is that of the restored frames, ``dtype`` their data type if it is another one. The result has names of
+    tags, ``"full scale"``, ``"resolution"``, ``"orientation"`` and ``"frame times"``.
 
     Example:
         >>> info = StackInfo((8, 1024, 1024), "uint16", 4095.0, resolution=(300.0, 300.0, "inch"))
@@ -130,9 +106,8 @@ def metadata_not_kept(
     lost = [name for name, tag in like.metadata_for(shape, dtype).items() if tag is None or "metadata" not in keeps]
     if in_files and shape[-2:] == like.shape[-2:]:  # otherwise a georeference is lost
         lost = [name for name in lost if not name.endswith(DIFFERENT)]
-    lost += ["full scale"] * (stated and "full_scale" not in keeps)
-    lost += ["resolution"] * (like.resolution is not None and "resolution" not in keeps)
-    lost += ["orientation"] * (like.orientation != 1 and "orientation" not in keeps)
+    others = {"full_scale": stated, "resolution": like.resolution is not None, "orientation": like.orientation != 1}
+    lost += [name.replace("_", " ") for name, has in others.items() if has and name not in keeps]
     lost += ["frame times"] * (timed and not ("frame_times" in keeps and shape[0] == like.shape[0]))
     return tuple(lost)
 
@@ -187,10 +162,6 @@ def write_stack(
             NaN as its nodata value; ``metadata_not_kept`` lists those that are not. If both files are videos, the
             presentation times of the frames and the audio are copied. Its file must not be ``path``.
 
-    Raises:
-        OSError: If the file cannot be written.
-        ValueError: If the format does not support them, the full scale is unknown, or ``path`` is the file of ``like``.
-
     Example:
         >>> import tempfile
         >>> import torch
@@ -213,9 +184,8 @@ def write_stack(
         frames = frames.to(torch.float64) / full_scale  # exact for integers of 32 bits
     axis = channel_axis("frames", frames.shape, channels)
     frames = frames.movedim(axis, -3) if frames.ndim > 3 else frames
-    full_scale = check_stack_target(path, tuple(frames.shape), dtype=dtype, full_scale=full_scale)
-    nodata = None if like is None or dtype != like.dtype else like.nodata
-    pixels = frames_to_counts(frames, np.dtype(dtype or np.float32), full_scale, nodata)
-    info = _info_to_write(StackInfo(tuple(pixels.shape), pixels.dtype.name, full_scale), like)
+    info = _planned(tuple(frames.shape), dtype, full_scale, like)
     form = check_info_target(path, info, compression)
+    nodata = None if like is None or dtype != like.dtype else like.nodata
+    pixels = frames_to_counts(frames, np.dtype(info.dtype), info.full_scale, nodata)
     write_frames(form, path, info, _counted(pixels), compression)

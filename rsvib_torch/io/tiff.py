@@ -39,10 +39,9 @@ def _name(photometric: Any) -> str:
 
 
 def _pages(tif: Any) -> list[_Page]:
-    """What the headers of all pages state; tifffile interprets one in 0.05 ms.
+    """What the headers of all pages state, in a chain that must not leave the file or be circular.
 
-    Raises:
-        ValueError: If the chain of headers leaves the file or is circular, where tifffile stops without an error.
+    tifffile interprets one in 0.05 ms, and ends such a chain without an error.
     """
     pages: list[_Page] = []
     visited: set[int] = set()
@@ -72,15 +71,13 @@ def _pages(tif: Any) -> list[_Page]:
 
 def _is_complete(page: Any, size: int) -> bool:
     """Whether the stored pixels of a page lie within a file of ``size`` bytes."""
-    ends = map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
+    ends = [] if page is None else map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
     return max(ends, default=size + 1) <= size
 
 
-def _with_channels_first(values: Any, axes: str) -> Any:
-    """Pixels, or the shape, of a page with channels before the image axes."""
-    if axes != "YXS":
-        return values
-    return (values[2], *values[:2]) if isinstance(values, tuple) else np.moveaxis(values, -1, 0)
+def _with_channels_first(shape: tuple[int, ...], axes: str) -> tuple[int, ...]:
+    """The shape of a page with channels before the image axes."""
+    return (shape[2], *shape[:2]) if axes == "YXS" else shape
 
 
 def _check_complete(complete: Sequence[bool], nbytes: int, size: int) -> None:
@@ -104,29 +101,20 @@ def _info(tif: Any, shape: tuple[int, ...], dtype: np.dtype, photometric: Any, *
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
     check_dtype(dtype)
-    metadata = json_description(tif)
-    bits = tif.pages.first.bitspersample
-    full_scale = None
-    if "full_scale" in metadata:
-        full_scale = float(metadata["full_scale"])
-    elif isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
-        full_scale = float(2**bits - 1)  # packed pixels, e.g. 4095 for 12 bits
+    metadata, bits = json_description(tif), tif.pages.first.bitspersample
+    full_scale = metadata.get("full_scale")
+    if full_scale is None and isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
+        full_scale = 2**bits - 1  # packed pixels, e.g. 4095 for 12 bits
     info = StackInfo(
         shape,
         dtype.name,
-        known_full_scale(dtype, full_scale),
+        known_full_scale(dtype, None if full_scale is None else float(full_scale)),
         resolution=_resolution(tif),
         channels_last=channels_last,
         orientation=orientation_of(tif.pages.first.tags.valueof("Orientation")),
         **tiff_times(tif, shape[0], metadata),
     )
     return replace(info, metadata=read_metadata(tif, info))
-
-
-def _all_series(tif: Any) -> Sequence[Any]:
-    """The series of pages of a file, with their axes of length 1: an option from tifffile 2026.5.2 on."""
-    series: Sequence[Any] = tif.series(squeeze=False) if callable(tif.series) else tif.series
-    return series
 
 
 def _axes_of(series: Any) -> tuple[str, tuple[int, ...]]:
@@ -155,31 +143,30 @@ def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
 def _page_reader(
     path: Path,
     info: StackInfo,
-    page: Callable[[int], Any],
-    complete: Sequence[bool],
+    pages: Sequence[Any],
+    of_frames: Sequence[Sequence[int]],
     shape: tuple[int, ...],
     order: tuple[int, ...],
     close: Callable[[], None],
 ) -> BlockReader:
-    """Reader of frames of equal numbers of pages, one frame after another.
+    """Reader of the frames that consist of the ``pages`` with the numbers ``of_frames``.
 
-    ``page`` returns a page by its number, ``complete`` states whether its stored pixels lie within the file. The pages
-    of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with leading
-    axes of length 1.
+    The pages of a frame have together a ``shape``, whose axes ``order`` permutes to (..., H, W) or (..., C, H, W) with
+    leading axes of length 1.
     """
-    count = len(complete) // info.shape[0]
+    size = path.stat().st_size
 
     def read(first: int, _: int) -> Array:
-        numbers = range(first * count, (first + 1) * count)
-        if not all(complete[number] for number in numbers):
+        of_frame = [pages[number] for number in of_frames[first]]
+        if not all(_is_complete(page, size) for page in of_frame):
             raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
-        stored = np.stack([page(number).asarray(maxworkers=1) for number in numbers]).reshape(shape)
+        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame]).reshape(shape)
         return stored.transpose(order).reshape(1, *info.shape[1:])
 
     return BlockReader(path, info, read, close=close)
 
 
-def _open_pages(path: Path, tif: Any, pages: Sequence[_Page], close: Callable[[], None]) -> BlockReader:
+def _open_pages(path: Path, tif: Any, pages: Sequence[_Page]) -> BlockReader:
     """Reader of a file in which every page is a frame, thumbnails and masks excepted."""
     frames = [page for page in pages if not page.secondary] or pages
     first = tif.pages[frames[0].number]
@@ -187,46 +174,38 @@ def _open_pages(path: Path, tif: Any, pages: Sequence[_Page], close: Callable[[]
         raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
     for page in frames:
         if page.kind != frames[0].kind:
-            raise ValueError(
-                f"frames of different size or kind: page {page.number} is {page.kind}, page {first.index} is "
-                f"{frames[0].kind}"
-            )
+            kinds = f"page {page.number} is {page.kind}, page {first.index} is {frames[0].kind}"
+            raise ValueError(f"frames of different size or kind: {kinds}")
     _check_complete([page.complete for page in frames], sum(page.nbytes for page in frames), path.stat().st_size)
     last, shape = first.axes == "YXS", _with_channels_first(first.shape, first.axes)
     info = _info(tif, (len(frames), *shape), first.dtype, first.photometric, channels_last=last)
     lost = {"thumbnails and masks": None} if len(frames) < len(pages) else {}
     info = replace(info, metadata={**info.metadata, **lost})
-    complete, order = [page.complete for page in frames], (2, 0, 1) if last else tuple(range(len(shape)))
-    return _page_reader(
-        path, info, lambda number: tif.pages[frames[number].number], complete, first.shape, order, close
-    )
+    order = (2, 0, 1) if last else tuple(range(len(shape)))
+    return _page_reader(path, info, tif.pages, [[page.number] for page in frames], first.shape, order, tif.close)
 
 
-def _open_series(path: Path, tif: Any, close: Callable[[], None]) -> BlockReader:
+def _open_series(path: Path, tif: Any) -> BlockReader:
     """Reader of a file whose pages are arranged as one array."""
-    series = _all_series(tif)[0]
+    # with axes of length 1, which is an option from tifffile 2026.5.2 on
+    series = (tif.series(squeeze=False) if callable(tif.series) else tif.series)[0]
     info, order = _series_info(tif, series)
     shape, pages, T = _axes_of(series)[1], series.pages, info.shape[0]
     in_order = tuple(sorted(order))
     frame_by_frame = order == in_order or (info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order)
     if series.dataoffset is not None and frame_by_frame:
-        close()
+        tif.close()
         return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
     size = path.stat().st_size
-    complete = [page is not None and _is_complete(page, size) for page in pages]
-    _check_complete(complete, math.prod(shape) * series.dtype.itemsize, size)
-    time = order[len(order) - len(info.shape)] if T > 1 else None
-    if len(pages) % T == 0 and (time is None or all(size == 1 for size in shape[:time])):
-        frame_shape = tuple(1 if i == time else size for i, size in enumerate(shape))
-        return _page_reader(path, info, lambda number: pages[number], complete, frame_shape, order, close)
-    if not all(complete):
-        raise ValueError("truncated: its pages are not in the order of the frames")
-
-    def read(*_: int) -> Array:
-        pixels: Array = series.asarray(maxworkers=1)
-        return pixels.reshape(shape).transpose(order).reshape(info.shape)
-
-    return BlockReader(path, info, read, T, T * info.frame_bytes, close)  # a copy if axes are reordered
+    _check_complete([_is_complete(page, size) for page in pages], math.prod(shape) * series.dtype.itemsize, size)
+    time = order[len(order) - len(info.shape)] if T > 1 else 0
+    of_pages = next(i for i in range(len(shape) + 1) if math.prod(shape[:i]) == len(pages))  # axes with one page each
+    if T > 1 and time >= of_pages:
+        raise ValueError(f"axes {series.axes}: a page has several frames; expected one frame per page")
+    numbers = np.arange(len(pages)).reshape(*shape[:of_pages], *[1] * (len(shape) - of_pages))
+    of_frames = np.moveaxis(numbers, time, 0).reshape(T, -1).tolist()
+    frame_shape = tuple(1 if T > 1 and i == time else size for i, size in enumerate(shape))
+    return _page_reader(path, info, pages, of_frames, frame_shape, order, tif.close)
 
 
 def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> None:
@@ -242,7 +221,6 @@ def _check_one_page_per_frame(shape: tuple[int, ...], axes: str, pages: int) -> 
 _PROGRAMS = (
     "shaped lsm mmstack ome imagej ndtiff fluoview stk sis svs scn qpi ndpi bif avs eer philips scanimage nih mdgel"
 )
-_ARRANGED = frozenset(_PROGRAMS.split())
 
 
 def _are_arranged(tif: Any, count: int) -> bool:
@@ -254,7 +232,7 @@ def _are_arranged(tif: Any, count: int) -> bool:
         if pages < count:
             _check_one_page_per_frame(shape, metadata.get("axes", ""), pages)
             return False
-    if not tif.flags & _ARRANGED:
+    if not tif.flags & set(_PROGRAMS.split()):
         return False  # the series of all pages takes 0.3 ms per page
     tif.pages.useframes = count > 1
     try:
@@ -274,7 +252,7 @@ def open_tiff(path: Path) -> BlockReader:
         tif = opened.enter_context(tifffile.TiffFile(path))
         pages = _pages(tif)
         arranged = _are_arranged(tif, len(pages))
-        reader = _open_series(path, tif, tif.close) if arranged else _open_pages(path, tif, pages, tif.close)
+        reader = _open_series(path, tif) if arranged else _open_pages(path, tif, pages)
         opened.pop_all()
         return reader
 

@@ -7,6 +7,7 @@ those that are not are named, so that the user learns what is lost.
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import tifffile
@@ -48,11 +49,10 @@ def json_description(tif: Any) -> Table:
 
 
 def _parsed(text: str) -> Table:
-    try:
+    with suppress(ValueError):
         values = json.loads(text)
-    except ValueError:
-        return {}
-    return values if isinstance(values, dict) else {}
+        return values if isinstance(values, dict) else {}
+    return {}
 
 
 def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
@@ -87,10 +87,9 @@ def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
 
 def _value(tag: Any) -> Any:
     """The value of a tag, None if it is missing, damaged or a structure of its own."""
-    try:
-        value = None if tag is None else tag.value
-    except Exception:  # any type, from a damaged file
-        return None
+    value = None
+    with suppress(Exception):  # any type, from a damaged file
+        value = tag.value
     parts = value if isinstance(value, tuple) else (value,)
     return value if all(isinstance(part, (int, float, str, bytes)) for part in parts) else None
 

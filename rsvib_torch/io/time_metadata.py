@@ -4,8 +4,10 @@ Functions return the fields of ``StackInfo`` that the metadata state, and none i
 frames can be read without them.
 """
 
+import math
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any
@@ -48,12 +50,7 @@ def orientation_of(value: object) -> int:
 
 
 def camera_name(make: object, model: object) -> str | None:
-    """Make and model of a camera as one name; None without a model.
-
-    Example:
-        >>> camera_name("Apple", "iPhone 12"), camera_name("Canon", "Canon EOS R5")
-        ('Apple iPhone 12', 'Canon EOS R5')
-    """
+    """Make and model of a camera as one name, with the make once (Canon, Canon EOS R5); None without a model."""
     maker, name = (one_line("" if text is None else str(text).replace("\0", " "), 60) for text in (make, model))
     repeated = name.casefold().startswith(maker.casefold())
     return None if not name else name if repeated else f"{maker} {name}"
@@ -75,15 +72,14 @@ def times_of_attributes(attributes: Mapping[str, Any], count: int) -> Table:
     otherwise the one of s, ms, us and ns that gives 1 to 1000 frames per second. Other attributes are ignored.
     """
     fields: Table = {}
-    for name, value in attributes.items():
-        if _RATE_NAME.fullmatch(name) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
-            rate = float(np.asarray(value).item())
-            if np.isfinite(rate) and rate > 0.0:
-                fields |= {"frame_rate": rate, "time_source": f"attribute {name}"}
-    for name, value in attributes.items():
+    numbers = {name: np.asarray(value).ravel() for name, value in attributes.items()}
+    numbers = {name: stored for name, stored in numbers.items() if stored.dtype.kind in "iuf"}
+    for name, stored in numbers.items():
+        if _RATE_NAME.fullmatch(name) and len(stored) == 1 and 0.0 < float(stored[0]) < math.inf:
+            fields |= {"frame_rate": float(stored[0]), "time_source": f"attribute {name}"}
+    for name, stored in numbers.items():
         match = _TIME_NAME.fullmatch(name)
-        stored = np.asarray(value).ravel()
-        if match is None or stored.dtype.kind not in "iuf" or len(stored) != count or count < 2:
+        if match is None or len(stored) != count or count < 2:
             continue
         # integers of 64 bits, e.g. nanoseconds since 1970, are subtracted before they are rounded to floats
         relative = (stored - stored[0]).astype(np.float64) if stored[0] <= stored.min() else np.zeros(count)
@@ -121,17 +117,11 @@ def exif_fields(data: bytes) -> Table:
         details = exif.get_ifd(ExifTags.IFD.Exif)
     except Exception:  # damaged metadata raise errors of many types
         return {}
-    taken, changed = (
-        _seconds_of_date(date, details.get(fraction, ""))
-        for date, fraction in (
-            (details.get(ExifTags.Base.DateTimeOriginal), ExifTags.Base.SubsecTimeOriginal),
-            (exif.get(ExifTags.Base.DateTime), ExifTags.Base.SubsecTime),
-        )
-    )
-    fields = {
-        "orientation": orientation_of(exif.get(ExifTags.Base.Orientation)),
-        "camera": camera_name(exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)),
-    }
+    tags = ExifTags.Base
+    taken = _seconds_of_date(details.get(tags.DateTimeOriginal), details.get(tags.SubsecTimeOriginal, ""))
+    changed = _seconds_of_date(exif.get(tags.DateTime), details.get(tags.SubsecTime, ""))
+    camera = camera_name(exif.get(tags.Make), exif.get(tags.Model))
+    fields = {"orientation": orientation_of(exif.get(tags.Orientation)), "camera": camera}
     return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 
@@ -180,10 +170,9 @@ def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> Table:
         return {"frame_times": tuple(float(time) for time in metadata["frame_times"])}
     if "frame_rate" in metadata:
         return {"frame_rate": float(metadata["frame_rate"]), "time_source": "frame_rate"}
-    try:
+    with suppress(Exception):  # damaged metadata raise errors of many types
         return _times_of_other_programs(tif, count)
-    except Exception:  # damaged metadata raise errors of many types
-        return {}
+    return {}
 
 
 def _times_of_other_programs(tif: Any, count: int) -> Table:

@@ -6,7 +6,7 @@ applied; the videos that are written state it.
 
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -42,6 +42,7 @@ _GOPRO_FIRMWARE = {
     "HD7.01": "GoPro HERO7 Black",
 }  # the first characters of its version
 _FRAMES = 8  # decoded frames of a decoder; each has at most 6 bytes per pixel
+_END: Any = object()  # of packets
 
 
 def _av() -> Any:
@@ -59,11 +60,9 @@ def open_container(video: Path | BinaryIO) -> Any:
 def _orientation(frame: Any) -> int:
     """Value of the orientation tag that corresponds to the display matrix of a frame."""
     data = frame.side_data.get("DISPLAYMATRIX")
-    if data is None:
-        return 1
-    a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-    signs = tuple(round(value / max(map(abs, (a, b, c, d, 1)))) for value in (a, b, c, d))
-    return next((tag for tag, matrix in _MATRICES.items() if matrix == signs), 1)
+    matrix = np.zeros(5) if data is None else np.frombuffer(bytes(data), np.int32)[:5][[0, 1, 3, 4]]
+    signs = tuple(np.rint(matrix / max(1, *np.abs(matrix))).tolist())
+    return next((tag for tag, stored in _MATRICES.items() if stored == signs), 1)
 
 
 def _conversion() -> Any:
@@ -91,17 +90,13 @@ def _pixels(frame: Any) -> NDArray[Any]:
 
 def _frames(container: Any) -> Generator[Any, None, None]:
     """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped."""
-    av, stream = _av(), container.streams.best("video")
+    av, stream, packet = _av(), container.streams.best("video"), None
     stream.thread_type = "AUTO"
     packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-            if packet is None:
-                return
-            yield from packet.decode()
-        except av.error.InvalidDataError:
-            continue
+    while packet is not _END:
+        with suppress(av.error.InvalidDataError):
+            packet = next(packets, _END)
+            yield from () if packet is _END else packet.decode()
 
 
 @dataclass(frozen=True)
@@ -142,11 +137,8 @@ def _listed_times(container: Any, stream: Any) -> list[Fraction | None] | None:
 
 def _camera(tags: dict[str, str]) -> str | None:
     """Make and model of the camera in the tags of a video: QuickTime, Android, or the firmware of GoPro."""
-    for make, model in (
-        ("com.apple.quicktime.make", "com.apple.quicktime.model"),
-        ("com.android.manufacturer", "com.android.model"),
-        ("make", "model"),
-    ):
+    makes = ("com.apple.quicktime.make", "com.android.manufacturer", "make")
+    for make, model in zip(makes, ("com.apple.quicktime.model", "com.android.model", "model"), strict=True):
         if tags.get(model):
             return camera_name(tags.get(make), tags[model])
     return _GOPRO_FIRMWARE.get(tags.get("firmware", "")[:6])
@@ -166,14 +158,12 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         size = stream.width * stream.height
         check_fits(f"{path}: frames of {stream.height} x {stream.width} px", _FRAMES * 6 * size, "free more memory")
         times = _listed_times(container, stream)
-        with open_container(path) as again:
-            frames = _frames(again)
+        with open_container(path) as again, closing(_frames(again)) as frames:
             first = next(frames, None)
             if first is None:
                 raise ValueError("no frame can be decoded")
             if times is None:
                 times = [_time_of(frame, stream) for frame in chain([first], frames)]
-            frames.close()
         known = [time for time in times if time is not None]
         rising = len(known) == len(times) > 1 and all(a < b for a, b in pairwise(known))
         pixels, rate = _pixels(first), stream.average_rate
@@ -181,9 +171,8 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         if not stream.frames and "matroska" in container.format.name and len(container.streams) == 1:
             duration = 1e-6 * (container.duration or 0)  # of the longest of several streams
         decoded = float(known[-1] - known[0] + (1 / rate if rate else 0)) if rising else duration
-        if (
-            len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration
-        ):  # .avi also counts empty frames
+        # .avi also counts empty frames
+        if len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration:
             raise ValueError(f"truncated: {len(times)} frames, {decoded:.3g} of {duration:.3g} s, can be decoded")
         info = StackInfo(
             (len(times), *pixels.shape),
@@ -254,16 +243,13 @@ class VideoReader:
     def _decode(self, expected: Fraction | None) -> Any:
         """The frame of an expected presentation time in s; None if it cannot be decoded."""
         while True:
-            frame = next(self._decoding, None) if self._early is None else self._early
-            self._early = None
-            if frame is None or frame.pts is None or expected is None:
+            frame, self._early = self._early or next(self._decoding, None), None
+            time = None if frame is None or expected is None else _time_of(frame, frame)
+            if time is None or expected is None or time == expected:
                 return frame
-            time = Fraction(frame.pts) * frame.time_base
             if time > expected:
                 self._early = frame
                 return None
-            if time == expected:
-                return frame
 
     def close(self) -> None:
         """Close the file."""
@@ -379,23 +365,18 @@ class Sound:
 
     def __init__(self, output: Any, source: Any) -> None:
         streams = source.streams.audio if source is not None else ()
-        added = {stream: output.add_stream_from_template(stream) for stream in streams}
-        self._output, self._packets = output, _packets(source, added)
+        self._output, self._added = output, {stream: output.add_stream_from_template(stream) for stream in streams}
+        packets = source.demux(*self._added) if self._added else ()
+        # the last packet of a stream is empty
+        self._packets = (packet for packet in packets if packet.dts is not None and packet.pts is not None)
         self._next = next(self._packets, None)
 
     def write(self, until: Fraction | None = None) -> None:
         """Write the packets up to a time in s, because players read sound and frames together; None for all."""
         while self._next is not None and (until is None or self._next.pts * self._next.time_base <= until):
+            self._next.stream = self._added[self._next.stream]
             self._output.mux(self._next)
             self._next = next(self._packets, None)
-
-
-def _packets(source: Any, streams: dict[Any, Any]) -> Iterator[Any]:
-    """Packets of the streams of ``source``, for the streams of the output that belong to them."""
-    for packet in source.demux(*streams) if streams else ():
-        if packet.dts is not None and packet.pts is not None:  # the last packet of a stream is empty
-            packet.stream = streams[packet.stream]
-            yield packet
 
 
 def open_source(info: StackInfo, opened: ExitStack) -> Any:
@@ -452,14 +433,8 @@ def part_of_video(
 ) -> Iterator[Callable[[NDArray[Any]], None]]:
     """Encode consecutive frames of a video into a new file; only ``join_parts`` gives them their times.
 
-    Args:
-        file: The file, which is complete when the block ends without an exception.
-        video: Name of the video, whose ending selects container and codec.
-        info: Content of the video.
-        picture: As in ``VideoEncoder``.
-
-    Yields:
-        Function that encodes a frame.
+    The ending of ``video`` selects container and codec. The block gets a function that encodes a frame; the file is
+    complete when it ends without an exception.
     """
     ending, numbers = video.suffix.lower(), count()
     with ExitStack() as opened:
@@ -479,6 +454,7 @@ def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
         source, output = open_source(info, opened), open_output(path, opened)
         if source is not None:
             output.metadata.update(source.metadata)
+        durations = np.diff(ticks, append=2 * ticks[-1] - ticks[-2] if len(ticks) > 1 else ticks[0] + 1).tolist()
         video: Any = None
         index = 0
         for part in parts:
@@ -488,15 +464,12 @@ def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
                     video.time_base = unit
                     sound = Sound(output, source)
                 for packet in container.demux(container.streams.video[0]):
-                    if packet.size == 0:  # the last packet of a stream
-                        continue
-                    sound.write(ticks[index] * unit)
-                    last = index + 1 == len(ticks)
-                    packet.stream, packet.time_base = video, unit
-                    packet.pts = packet.dts = ticks[index]
-                    packet.duration = ticks[index] - ticks[index - 1] if last else ticks[index + 1] - ticks[index]
-                    output.mux(packet)
-                    index += 1
+                    if packet.size > 0:  # not the last packet of a stream
+                        sound.write(ticks[index] * unit)
+                        packet.stream, packet.time_base, packet.duration = video, unit, durations[index]
+                        packet.pts = packet.dts = ticks[index]
+                        output.mux(packet)
+                        index += 1
         if index != len(ticks):
             raise ValueError(f"{path}: the parts have {index} frames, expected {len(ticks)}; delete them to start over")
         sound.write()

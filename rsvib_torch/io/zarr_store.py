@@ -44,10 +44,10 @@ def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
     chunk = int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize
     held = 0
     for file in folder.rglob("*"):
-        mode = file.lstat().st_mode
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        status = file.lstat()
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
             raise ValueError(f"it contains {file.name}, which is not a regular file")
-        held += file.lstat().st_size if stat.S_ISREG(mode) else 0
+        held += status.st_size if stat.S_ISREG(status.st_mode) else 0
     largest_chunk = 1 << 30  # bytes, also of a frame
     largest_ratio = 100_000  # of pixels to stored bytes; chunks of constant frames are very small
     if max(chunk, info.frame_bytes) > largest_chunk or info.shape[0] * info.frame_bytes > largest_ratio * held:
@@ -79,10 +79,7 @@ _DIMENSIONS = {"T": "frame", "C": "channel", "H": "y", "W": "x"}
 
 
 def write_zarr(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
-    """Write a group with the array ``frames``, one chunk per frame, as ``xarray.open_zarr`` reads it.
-
-    Arguments as in ``StackFormat.write``.
-    """
+    """Write a group with the array ``frames``, one chunk per frame, as ``xarray.open_zarr`` reads it."""
     group = _zarr().create_group(store=str(path), zarr_format=3)
     array = group.create_array(
         "frames",

@@ -35,8 +35,7 @@ from rsvib_torch.motion.vibration import Vibration, blind_frequencies
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
-from rsvib_torch.results.figures import FIGURES
-from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
+from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
 from rsvib_torch.results.result_files import figure_png, write_figure
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.text import measured_text
@@ -77,13 +76,7 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
 ) -> None:
-    """Write a figure as an image file, atomically.
-
-    Args:
-        figure: The figure.
-        path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
-        dpi: Pixels per inch.
-    """
+    """Write a figure as an image file, atomically; its ending selects the format (``.png``, ``.svg``, ``.pdf``)."""
     write_figure(figure, path, dpi)
 
 
@@ -105,10 +98,20 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
     return figure, figure.subplots(rows, columns, squeeze=False, **grid)
 
 
-def _two_panels() -> tuple[Figure, list[tuple[int, str, Axes]]]:
-    """A figure with a panel for x and y, each with the number and the name of its axis."""
-    figure, panels = _panels(13, 4.2, 1, 2, sharex=True)
-    return figure, list(zip(range(2), "xy", panels[0], strict=True))
+def _axes_figure(
+    times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]], labels: Sequence[str], **style: Any
+) -> Figure:
+    """A panel for x and y each with curves over times in s, and labels of x, of y, and before the name of the axis.
+
+    A curve has its label on both panels, values (N, 2), and a colour (None: that of the axis).
+    """
+    figure, (panels,) = _panels(13, 4.2, 1, 2, sharex=True)
+    for axis, (panel, (name, colour)) in enumerate(zip(panels, _AXIS_COLOURS.items(), strict=True)):
+        for texts, values, other in curves:
+            panel.plot(1e3 * times.cpu(), values[:, axis].cpu(), color=other or colour, label=texts[axis], **style)
+        panel.legend(**_LEGEND_ABOVE, ncols=len(curves))
+        plain_axes(panel, *labels[:2], heading=f"{labels[2]} {name}")
+    return figure
 
 
 def _plot_axes(
@@ -140,7 +143,7 @@ def _symbol(label: str, **style: Any) -> Line2D:
     return Line2D([], [], label=label, **{"marker": "o", "linewidth": 0, **style})
 
 
-def _legend_below(figure: Figure, symbols: list[Line2D]) -> None:
+def _legend_below(figure: Figure, *symbols: Line2D) -> None:
     figure.legend(handles=symbols, loc="outside lower center", ncols=len(symbols), fontsize=9.5, frameon=False)
 
 
@@ -199,12 +202,12 @@ def offset_panels(result: DetectionResult, axes: Sequence[int], width: float, he
     sharex = len(result.offsets.pairs) <= _MOST_PAIRS or "row"  # all pairs are shown, or only below
     figure, panels = _panels(width, height, 2, len(axes), sharex=sharex, height_ratios=(3, 1))
     points = [_draw_offsets(panels[0, column], panels[1, column], result, axis) for column, axis in enumerate(axes)]
-    symbols = [
+    _legend_below(
+        figure,
         _symbol("measured rows", color=_QUALITY_COLOURS(1.0), markersize=5),
         _symbol("detected vibration", color=_FIT_COLOUR, marker="", linewidth=1.3),
         _symbol("not measured", color=_GREY, marker="x", markersize=5),
-    ]
-    _legend_below(figure, symbols)
+    )
     bar = figure.colorbar(points[-1], ax=panels, fraction=0.025, pad=0.01)
     bar.set_label("quality (0: outlier)", color=_INK)
     bar.outline.set_visible(False)
@@ -221,10 +224,9 @@ def offset_figure(result: DetectionResult) -> Figure:
     13 frames, the upper panels have the 9 neighbouring frames with the largest residual, and the lower ones all.
 
     Example:
-        >>> from rsvib_torch.datasets import example_frames
-        >>> from rsvib_torch.detection import detect_vibration
-        >>> frames, timing, _ = example_frames()
-        >>> [panel.get_ylabel() for panel in offset_figure(detect_vibration(frames, timing, method="bands")).axes]
+        >>> import rsvib_torch as rsv
+        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> [panel.get_ylabel() for panel in offset_figure(rsv.detect_vibration(frames, timing, method="bands")).axes]
         ['offset (px)', 'offset (px)', 'residual (px)', 'residual (px)', 'quality (0: outlier)']
     """
     axes = result.vibration.num_axes
@@ -250,18 +252,13 @@ def windows_figure(
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 
-    Points of axes that are not reliable are hollow and do not determine the range of the axis.
-
-    Args:
-        times: Position of each window on the horizontal axis.
-        detections: The detection of each window (not a batch); None where it failed.
-        time_label: Label of the horizontal axis.
+    Points of axes that are not reliable are hollow and do not determine the range of the axis. There is a detection for
+    each of the ``times``, None where it failed.
 
     Example:
-        >>> from rsvib_torch.datasets import example_frames
-        >>> from rsvib_torch.detection import detect_vibration
-        >>> frames, timing, _ = example_frames(num_frames=4)
-        >>> parts = [detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> import rsvib_torch as rsv
+        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
+        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
         >>> len(windows_figure([0.0, 2 * timing.frame_period], parts).axes)
         4
     """
@@ -288,13 +285,13 @@ def windows_figure(
             first = quantity == "amplitude"
             label, heading = ("", f"Tones along {name}") if first else (time_label, "")
             plain_axes(panel, label, f"{quantity} ({unit})", heading=heading)
-    symbols = [
+    _legend_below(
+        figure,
         _symbol("strongest tone, reliable", color=_INK),
         _symbol("not reliable", color=_INK, markerfacecolor="white"),
         _symbol("weaker tone", color=_GREY),
         _symbol("detection failed", color=_GREY, marker="", linewidth=None, linestyle=":"),
-    ]
-    _legend_below(figure, symbols)
+    )
     return figure
 
 
@@ -309,12 +306,9 @@ def _batch_figure(results: DetectionResult) -> Figure:
 
 @checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
-    """Draw the displacement of a motion along both axes over time.
+    """Draw the displacement of a motion (not a batch) over time, from ``first`` to ``last`` in seconds.
 
-    Args:
-        motion: The motion (not a batch).
-        first: Start of the drawing in seconds.
-        last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
+    By default, all of a free motion is drawn, and four periods of the tone of lower frequency of others.
 
     Example:
         >>> motion_figure(Vibration([3.1, 5.2], [50.0, 30.0])).axes[0].get_xlabel()
@@ -339,51 +333,43 @@ def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None)
     return figure
 
 
-def _title_refusal(panel: Axes, result: detection.MotionDetection | detection.SweptTone) -> None:
-    """State above a figure which axes are not reliable, with the first reason."""
-    lines = [
+def _detected_motion_figure(result: detection.MotionDetection | detection.SweptTone) -> Figure:
+    """Draw a swept tone, or a free motion at the rows of the frames with a band of two standard deviations."""
+    if isinstance(result, detection.SweptTone):
+        figure = motion_figure(result.motion)
+        panel = figure.axes[0]
+    else:
+        figure, ((panel,),) = _panels(8, 3.6)
+        for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
+            _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
+        plain_axes(panel, "time (ms)", "displacement (px)")
+    lines = [  # which axes are not reliable, with the first reason
         textwrap.shorten(f"{name}: not reliable: {reasons[0]}", 100, placeholder=" …")
         for name, good, reasons in zip("xy", result.reliable, result.reasons, strict=True)
         if not bool(good)
     ]
     panel.set_title("\n".join(lines), **_TITLE)
-
-
-def _swept_figure(result: detection.SweptTone) -> Figure:
-    figure = motion_figure(result.motion)
-    _title_refusal(figure.axes[0], result)
     return figure
 
 
-def free_motion_figure(result: detection.MotionDetection) -> Figure:
-    """Draw a detected motion at the rows of the frames, with a band of two standard deviations."""
-    figure, ((panel,),) = _panels(8, 3.6)
-    for frame, (times, *values) in enumerate(zip(result.times, result.displacement, result.std, strict=True)):
-        _plot_axes(panel, 1e3 * times.cpu(), *values, legend=frame == 0)
-    plain_axes(panel, "time (ms)", "displacement (px)")
-    _title_refusal(panel, result)
-    return figure
-
-
-def verdict_figure(verdict: RestorationVerdict) -> Figure:
+def _verdict_figure(verdict: RestorationVerdict) -> Figure:
     """Draw the displacement between the frames of each pair before and after restoration, and the improvement."""
     figure, (panels,) = _panels(10, 3.4, 1, 3)
-    pairs = np.arange(len(verdict.outcome))
-    for axis in range(2):
-        for values, style, colour, label in (
-            (verdict.misfit_before, "o-", _X_COLOUR, "frames as taken"),
-            (verdict.misfit_after, "s-", _Y_COLOUR, "after restoration"),
-            (verdict.resolution, ":", _GREY, "smallest visible"),
-        ):
-            panels[axis].plot(pairs, values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
-        panels[axis].set_ylim(bottom=0)
-    panels[0].legend(**_LEGEND)
-    panels[2].plot(pairs, verdict.predicted_gain.cpu(), "o-", color=_X_COLOUR, markersize=4)
-    panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
+    curves = (
+        (verdict.misfit_before, "o-", _X_COLOUR, "frames as taken"),
+        (verdict.misfit_after, "s-", _Y_COLOUR, "after restoration"),
+        (verdict.resolution, ":", _GREY, "smallest visible"),
+    )
     titles = ("displacement along x (px rms)", "displacement along y (px rms)", "estimated improvement (dB)")
-    for panel, title in zip(panels, titles, strict=True):
+    for axis, (panel, title) in enumerate(zip(panels, titles, strict=True)):
+        for values, style, colour, label in curves if axis < 2 else ():
+            panel.plot(values[:, axis].cpu(), style, color=colour, markersize=4, label=label)
         panel.xaxis.get_major_locator().set_params(integer=True)
         plain_axes(panel, "pair of frames", title=title)
+        panel.set_ylim(bottom=0 if axis < 2 else None)
+    panels[0].legend(**_LEGEND)
+    panels[2].plot(verdict.predicted_gain.cpu(), "o-", color=_X_COLOUR, markersize=4)
+    panels[2].axhline(0.0, color=_GREY, linewidth=0.8)
     return figure
 
 
@@ -395,10 +381,9 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
     et al. 2023). Blind frequencies are dashed lines.
 
     Example:
-        >>> from rsvib_torch.datasets import example_frames
-        >>> from rsvib_torch.detection import detect_vibration
-        >>> frames, timing, _ = example_frames()
-        >>> gain_figure(detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
+        >>> import rsvib_torch as rsv
+        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> gain_figure(rsv.detect_vibration(frames, timing, method="bands"), timing).axes[-1].get_xlabel()
         'frequency (Hz)'
     """
     check_single("result", result)
@@ -412,15 +397,14 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         for blind in blind_frequencies(timing, highest).tolist():
             panel.axvline(blind, color=_GREY, linewidth=0.8, linestyle="--", zorder=0)
     labels: Table = {}
-    for axis, name in enumerate("xy"):
-        reliable = bool(result.reliable[axis])
+    for axis, tone in vibration.amplitude[:2].nonzero().tolist():
+        name, reliable = "xy"[axis], bool(result.reliable[axis])
         style = _marker(_AXIS_COLOURS[name], reliable) | {"markersize": 6}
-        for tone in vibration.amplitude[axis].nonzero()[:, 0].tolist():
-            at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
-            tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
-            labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
-            bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
-            lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
+        at, amplitude = float(vibration.frequency[axis, tone]), float(vibration.amplitude[axis, tone])
+        tone_gain = abs(float(result.gain[axis, tone])) * abs(float(np.sinc(at * timing.exposure_time)))
+        labels[name if reliable else f"{name} (not reliable)"] = upper.plot(at, tone_gain, **style)[0]
+        bars = [_error_bar(values[axis, tone]) for values in (std.amplitude, std.frequency)]
+        lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
     if labels:
         upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
     upper.set_ylim(0, 2.4)
@@ -452,13 +436,12 @@ def rows_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Fig
     check_single("vibration", vibration)
     vibration = vibration.detached()
     starts = timing.row_starts(1, num_rows)[0]
-    figure, panels = _panels(5.6, 4.6, 2, sharex=True)
-    curves = (vibration.mean_displacement(starts, timing.exposure_time), motion_blur(vibration, starts, timing))
-    for panel, values in zip(panels[:, 0], curves, strict=True):
-        _plot_axes(panel, np.arange(num_rows), values, legend=panel is panels[0, 0])
-    plain_axes(panels[0, 0], "", "displacement (px)")
-    plain_axes(panels[1, 0], "row (in readout order)", "motion blur (px)")
-    panels[1, 0].set_ylim(bottom=0)
+    figure, ((upper,), (lower,)) = _panels(5.6, 4.6, 2, sharex=True)
+    _plot_axes(upper, np.arange(num_rows), vibration.mean_displacement(starts, timing.exposure_time))
+    _plot_axes(lower, np.arange(num_rows), motion_blur(vibration, starts, timing), legend=False)
+    plain_axes(upper, "", "displacement (px)")
+    plain_axes(lower, "row (in readout order)", "motion blur (px)")
+    lower.set_ylim(bottom=0)
     return figure
 
 
@@ -486,16 +469,14 @@ def psf_figure(vibration: Motion, timing: SensorTiming, num_rows: Count) -> Figu
     height, width = psf.weights.shape[-2:]
     last = first + torch.tensor([width - 1, height - 1], device="cpu")
     reach = max(2, int(torch.maximum(first.abs(), last.abs()).max()))  # px around the centre
-    cells = np.zeros((len(rows), 2 * reach + 1, 2 * reach + 1))
-    for index, (left, top) in enumerate((first.long() + reach).tolist()):
-        cells[index, top : top + height, left : left + width] = psf.weights[index].numpy()
     figure, panels = _panels(11.4, 4.9, down, across)
-    extent = (-reach - 0.5, reach + 0.5, reach + 0.5, -reach - 0.5)
-    for index, panel in enumerate(panels.flat):
-        panel.imshow(cells[index], cmap="Greys", vmin=0, vmax=cells.max(), interpolation="nearest", extent=extent)
+    grey: Table = {"cmap": "Greys", "vmin": 0, "vmax": psf.weights.max(), "interpolation": "nearest"}
+    for index, (panel, (left, top)) in enumerate(zip(panels.flat, first.tolist(), strict=True)):
+        extent = (left - 0.5, left + width - 0.5, top + height - 0.5, top - 0.5)
+        panel.imshow(psf.weights[index].numpy(), **grey, extent=extent)
         panel.plot(*path[index].T, color=_Y_COLOUR, linewidth=1.6)
         panel.set_title(f"row {int(rows[index])}", fontsize=9, loc="left", pad=3)
-        panel.set(xticks=[], yticks=[])
+        panel.set(xticks=[], yticks=[], xlim=(-reach - 0.5, reach + 0.5), ylim=(reach + 0.5, -reach - 0.5))
         panel.spines[:].set_color(_GRID)
     panels[-1, 0].set_xlabel(f"{2 * reach + 1} px", fontsize=9)
     return figure
@@ -542,10 +523,7 @@ def _finish_mtf(panel: Axes, highest: float, label: str, legend: str | None = No
 
 
 def detailed_places(image: Tensor, size: int, count: int, rim: int = 0) -> list[tuple[int, int]]:
-    """Corners (row, column) of the ``count`` square windows with the strongest detail that do not overlap.
-
-    They avoid a border of ``rim`` px where the image (H, W) is large enough.
-    """
+    """Corners (row, column) of ``count`` windows with the strongest detail that do not overlap, ``rim`` px inside."""
     rim = min(rim, (min(image.shape) - size) // 2)
     image = image[rim : image.shape[0] - rim, rim : image.shape[1] - rim]
     down, right = (functional.pad(image.diff(dim=d), pad) for d, pad in ((0, (0, 0, 0, 1)), (1, (0, 1))))
@@ -573,12 +551,7 @@ def comparison_figure(
 ) -> Figure:
     """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
-    Args:
-        raw: (H, W) or (C, H, W), full scale 1.
-        restored: The same shape.
-        count: Number of crops.
-        size: Side of the crops in px.
-        names: Titles of the two rows of panels.
+    Both frames are (H, W) or (C, H, W) with full scale 1; there are ``count`` crops with a side of ``size`` px.
 
     Example:
         >>> frame = torch.rand(96, 128, generator=torch.Generator().manual_seed(0))
@@ -628,13 +601,13 @@ def _restoration_mtf_figure(result: RestorationMtf) -> Figure:
 
 def _measured_offsets_figure(curve: OffsetCurve) -> Figure:
     """Draw the measured offsets of each axis, with error bars of one standard deviation if they are known."""
-    figure, panels = _two_panels()
-    times, good = (values.cpu().numpy() for values in (1e3 * curve.times, curve.good))
-    for axis, name, panel in panels:
-        offsets = curve.offsets[..., axis].cpu().numpy()[good]
-        std = None if curve.std is None else curve.std[..., axis].cpu().numpy()[good]
-        panel.errorbar(times[good], offsets, std, fmt=".", color=_AXIS_COLOURS[name], ecolor=_GRID, zorder=2)
-        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
+    times, offsets = curve.times[curve.good], curve.offsets[curve.good]
+    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
+    figure = _axes_figure(times, [(("measured",) * 2, offsets, None)], labels, marker=".", linestyle="none")
+    for axis, panel in enumerate(figure.axes if curve.std is not None else ()):
+        assert curve.std is not None
+        x, y, std = (values.cpu() for values in (1e3 * times, offsets[:, axis], curve.std[curve.good][:, axis]))
+        panel.errorbar(x, y, std, fmt="none", ecolor=_GRID, zorder=1)
     return figure
 
 
@@ -689,45 +662,31 @@ def _spectrum_figure(result: detection.DisplacementSpectrum) -> Figure:
                 place = {"textcoords": "offset points", "fontsize": 8, "ha": "center"}
                 panels[0, axis].annotate(text, (at, amplitude), (0, 4), **place)
                 labelled.append(at)
-    symbols = [
+    _legend_below(
+        figure,
         _symbol("displacement", color=_X_COLOUR, marker="", linewidth=0.8),
         _symbol("noise (rms)", color=_INK, marker="", linewidth=0.9, linestyle="--"),
         _symbol("blind: the frames cannot show this frequency", color=_BLIND_COLOUR, marker="s", markersize=9),
-    ]
-    _legend_below(figure, symbols)
+    )
     return figure
 
 
 def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     """Draw the offsets of row bands of each axis, before and after a motion is subtracted."""
-    figure, panels = _two_panels()
-    for axis, name, panel in panels:
-        for what, rms, offsets, colour in (
-            ("offsets", result.before, result.offsets, _GREY),
-            ("without the motion", result.after, result.residual, _AXIS_COLOURS[name]),
-        ):
-            label = f"{what} {measured_text(rms[axis], digits=3)} px rms"
-            panel.plot(1e3 * result.times.cpu(), offsets[:, axis].cpu(), ".", color=colour, label=label)
-        panel.axhline(0.0, color=_INK, linewidth=0.8)
-        panel.legend(fontsize=9)
-        plain_axes(panel, _OFFSET_TIME, "offset (px)", heading=f"Offset along {name}")
-    return figure
+    before, after = ([measured_text(rms, digits=3) for rms in of_axes] for of_axes in (result.before, result.after))
+    before, after = [f"offsets {rms} px rms" for rms in before], [f"without the motion {rms} px rms" for rms in after]
+    curves = ((before, result.offsets, _GREY), (after, result.residual, None))
+    labels = (_OFFSET_TIME, "offset (px)", "Offset along")
+    return _axes_figure(result.times, curves, labels, marker=".", linestyle="none")
 
 
 def _accelerometer_figure(result: gyroscope.AccelerometerComparison) -> Figure:
     """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
-    figure, panels = _two_panels()
     times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
     shown = (times - middle).abs() < 4 / result.frequency.min()  # 8 periods of the slowest tone
-    for axis, name, panel in panels:
-        for label, values, colour in (
-            ("accelerometer", result.measured, _GREY),
-            ("frames", result.predicted, _AXIS_COLOURS[name]),
-        ):
-            panel.plot(1e3 * times[shown], values[shown, axis], color=colour, label=label, linewidth=1.2)
-        panel.legend(ncols=2, **_LEGEND_ABOVE)
-        plain_axes(panel, "time on the clock of the frames (ms)", "acceleration (m/s²)", heading=f"Along {name}")
-    return figure
+    curves = [(("accelerometer",) * 2, result.measured[shown], _GREY), (("frames",) * 2, result.predicted[shown], None)]
+    labels = ("time on the clock of the frames (ms)", "acceleration (m/s²)", "Along")
+    return _axes_figure(times[shown], curves, labels, linewidth=1.2)
 
 
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
@@ -755,8 +714,8 @@ FIGURES.update(
             followed.times.tolist(), [followed[index] for index in range(len(followed.times))]
         ),
         (detection.DisplacementSpectrum, 0): _spectrum_figure,
-        (detection.MotionDetection, 0): free_motion_figure,
-        (detection.SweptTone, 0): _swept_figure,
+        (detection.MotionDetection, 0): _detected_motion_figure,
+        (detection.SweptTone, 0): _detected_motion_figure,
         (RowTimeCalibration, 0): _calibration_figure,
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,
@@ -769,6 +728,6 @@ FIGURES.update(
         ),
         (RestorationMtf, 0): _restoration_mtf_figure,
         (OffsetCurve, 0): _measured_offsets_figure,
-        (RestorationVerdict, 0): verdict_figure,
+        (RestorationVerdict, 0): _verdict_figure,
     }
 )

@@ -26,13 +26,7 @@ from rsvib_torch.text import quoted
 
 @checks_arguments
 def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
-    """Write a detection as ``vibration.json``: vibration, standard deviations, verdict, offset curve and timing.
-
-    Args:
-        path: The file to write; an existing file is replaced.
-        result: A detection (not a batch).
-        timing: The sensor; by default ``result.timing``.
-    """
+    """Write a detection (not a batch) as ``vibration.json``, with the timing, by default ``result.timing``."""
     check_single("result", result)
     timing = timing or result.timing
     if timing is None:
@@ -44,18 +38,13 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
 def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = None) -> DetectedVibration:
     """Read a ``vibration.json``, as ``restore`` needs it; ``DetectionResult.load`` also reads its offset curve.
 
-    Args:
-        path: A file written by ``write_vibration``, ``DetectionResult.save`` or the program.
-        timing: The sensor of the frames to be restored, which must be that of the file; None not to compare them.
-
-    Raises:
-        ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
+    It was written by ``write_vibration``, ``DetectionResult.save`` or the program. The ``timing`` of the frames to be
+    restored must be that of the file; None does not compare them.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
+        >>> frames, timing, _ = rsv.datasets.example_frames()
         >>> path = tempfile.mkdtemp() + "/vibration.json"
         >>> rsv.write_vibration(path, rsv.detect_vibration(frames, timing))
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
@@ -102,24 +91,18 @@ def check_same_timing(source: str, stored: SensorTiming, timing: SensorTiming) -
 def write_offsets(path: str | os.PathLike[str], result: DetectionResult) -> None:
     """Write the measured and the fitted offset curve as CSV; offsets that were not measured are empty.
 
-    One line per band (or row, in the direct method) and pair of frames. Before correction, its rows are displaced
-    between the frames by ``offset``; the vibration predicts ``fitted``; ``residual = offset - fitted`` remains after
-    correction. All are the displacement in the later frame minus that in the earlier one, in px along x and y, in rad
-    for roll. ``std`` is the standard deviation of the offset and of the residual, if it is known.
+    One line per band (or row, in the direct method) and pair of frames, see docs/export.md: ``offset`` before
+    correction, ``fitted`` by the vibration, ``residual = offset - fitted`` after it, and ``std`` of both.
     """
     check_single("result", result)
     curve = result.offsets
-    count = curve.times.shape[-1]
-    columns = {
-        "earlier_frame": curve.pairs[:, :1].expand(-1, count),
-        "later_frame": curve.pairs[:, 1:].expand(-1, count),
-        "row": curve.rows.expand_as(curve.times),
-        "time_s": curve.times,
-    }
+    earlier, later = curve.pairs.T[..., None]
+    columns = {"earlier_frame": earlier, "later_frame": later, "row": curve.rows, "time_s": curve.times}
+    columns = {name: values.expand_as(curve.times) for name, values in columns.items()}
     axes = ("x_px", "y_px", "roll_rad", "zoom")[: result.vibration.num_axes]
     curves = {"offset": curve.offsets, "fitted": result.fitted, "residual": curve.offsets - result.fitted}
-    for kind, values_of_axes in curves.items():
-        columns |= {f"{kind}_{name}": values_of_axes[..., axis] for axis, name in enumerate(axes)}
+    for kind, values in curves.items():
+        columns |= {f"{kind}_{name}": values[..., axis] for axis, name in enumerate(axes)}
     columns["quality"] = curve.quality
     if curve.std is not None:
         columns |= {f"std_{name}": curve.std[..., axis] for axis, name in enumerate(axes)}
@@ -138,16 +121,12 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable[o
 def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: float | None = None) -> None:
     """Write ``result.table()`` as CSV: tones of a detection or of the windows of a manifest, or a spectrum.
 
-    Args:
-        path: The file to write; an existing file is replaced.
-        result: A result that has a table. Its unknown values are empty cells.
-        pixel_size: Size of a pixel in m, to add columns in um, um/s and m/s^2.
+    Unknown values are empty cells. The size of a pixel in m adds columns in um, um/s and m/s^2.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
+        >>> frames, timing, _ = rsv.datasets.example_frames()
         >>> path = tempfile.mkdtemp() + "/tones.csv"
         >>> rsv.write_table(path, rsv.detect_vibration(frames, timing, tones=1))
         >>> with open(path) as file:

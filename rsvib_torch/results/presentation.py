@@ -23,7 +23,7 @@ from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_met
 from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_number, described, needed_package
 from rsvib_torch.files.reading import Table
-from rsvib_torch.results.figures import FIGURES, figure_of
+from rsvib_torch.results.higher_packages import imported
 from rsvib_torch.results.reason import texts
 from rsvib_torch.results.result_files import figure_png, result_of, save_result, write_figure
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     import pandas
     import xarray
     from matplotlib.figure import Figure
+
+# The function that draws a result of this type with this number of leading dimensions (0: not a batch).
+FIGURES: "dict[tuple[type, int], Callable[[Any], Figure]]" = {}
 
 # Text
 
@@ -62,11 +65,9 @@ def verdict_table(
     head = [*axis_head(batch_shape), *head]
     if not batch_shape:
         return [text_table(head, rows), *verdict_lines(reliable, reasons)]
-    verdicts = {
-        tuple(labels): "reliable" if bool(reliable[at]) else "not reliable"
-        for at, labels in axis_rows(batch_shape, reliable.shape[-1])
-    }
-    return [text_table([*head, "verdict"], [[*row, verdicts[tuple(row[:2])]] for row in rows])]
+    good = {tuple(labels): bool(reliable[at]) for at, labels in axis_rows(batch_shape, reliable.shape[-1])}
+    verdicts = ["reliable" if good[tuple(row[:2])] else "not reliable" for row in rows]
+    return [text_table([*head, "verdict"], [[*row, text] for row, text in zip(rows, verdicts, strict=True)])]
 
 
 def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
@@ -82,12 +83,7 @@ def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
 
 
 def plain_values(value: object) -> Any:
-    """A value as JSON can store it: tensors as nested lists, None for numbers that are not finite, results as tables.
-
-    Example:
-        >>> plain_values({"amplitude": torch.tensor([1.5, float("nan")]), "reasons": ("blind",)})
-        {'amplitude': [1.5, None], 'reasons': ['blind']}
-    """
+    """A value as JSON can store it: tensors as nested lists, results as tables, None for NaN and infinity."""
     if isinstance(value, Tensor):
         return plain_values(value.detach().cpu().tolist())
     if hasattr(value, "to_dict"):
@@ -111,10 +107,7 @@ def joined_columns(lines: Sequence[Mapping[str, object]]) -> dict[str, list[obje
 
 
 def physical_tone(amplitude: float, frequency: float, pixel_size: float) -> dict[str, float]:
-    """Amplitude A in px, and those of velocity 2 pi f A and acceleration (2 pi f)^2 A, with units in the names.
-
-    The size of a pixel is in m.
-    """
+    """Amplitude A in px, and of velocity and acceleration, with units in the names; a pixel has a size in m."""
     angular, metres = 2 * math.pi * frequency, amplitude * pixel_size
     return {
         "amplitude_um": 1e6 * metres,
@@ -136,15 +129,6 @@ def check_pixel_size(pixel_size: float | None) -> float | None:
 
 _DIMENSIONS = {"A": "axis", "F": "frequency", "K": "tone", "N": "row", "P": "pair", "R": "row", "T": "frame"}
 Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dimensions, values, attributes
-
-
-def _dimensions(stated: str, count: int, name: str) -> tuple[str, ...]:
-    """Names of the ``count`` dimensions of a tensor, from its shape as in ``check_shapes``."""
-    symbols = [entry.partition("=")[0] for entry in stated.split() if "..." not in entry]
-    batch = count - len(symbols)
-    leading = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
-    named = [_DIMENSIONS.get(symbol, f"{name}_{symbol.lower()}") for symbol in symbols]
-    return (*leading, *named)
 
 
 # Results
@@ -276,22 +260,15 @@ class Result(Summarised):
     def table(self, *, pixel_size: float | None = None) -> dict[str, list[Any]]:
         """The result as columns by name, with the unit in each name; None for unknown values.
 
-        ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file.
-
-        Args:
-            pixel_size: Size of a pixel in m, in the plane in which the motion is wanted (sensor or object); columns in
-                um, um/s and m/s^2 are added then.
-
-        Raises:
-            TypeError: If this kind of result has no table.
+        ``to_pandas`` makes a frame of them, and ``write_table`` a CSV file. With the size of a pixel in m, in the plane
+        in which the motion is wanted (sensor or object), columns in um, um/s and m/s^2 are added.
         """
         raise TypeError(f"{type(self).__name__} has no table: use to_xarray(), which all results have, or to_dict()")
 
     def to_pandas(self, *, pixel_size: float | None = None) -> "pandas.DataFrame":
         """``table`` as a ``pandas.DataFrame``; missing values are NaN."""
-        frame: pandas.DataFrame = needed_package("pandas", "to_pandas", "tables").DataFrame(
-            self.table(pixel_size=pixel_size)
-        )
+        package = needed_package("pandas", "to_pandas", "tables")
+        frame: pandas.DataFrame = package.DataFrame(self.table(pixel_size=pixel_size))
         return frame
 
     def to_xarray(self) -> "xarray.Dataset":
@@ -321,7 +298,11 @@ class Result(Summarised):
             elif isinstance(value, Tensor) and name in self.shapes:
                 full = "_".join(dict.fromkeys((*inside, name)))  # offsets of the curve "offsets" are "offsets"
                 unit = {"units": self.units[name]} if name in self.units else {}
-                yield full, (_dimensions(self.shapes[name], value.ndim, full), value.detach().cpu().numpy(), unit)
+                symbols = [entry.partition("=")[0] for entry in self.shapes[name].split() if "..." not in entry]
+                batch = value.ndim - len(symbols)
+                dimensions = ["index"] if batch == 1 else [f"index_{number}" for number in range(batch)]
+                dimensions += [_DIMENSIONS.get(symbol, f"{full}_{symbol.lower()}") for symbol in symbols]
+                yield full, (tuple(dimensions), value.detach().cpu().numpy(), unit)
 
     def mapped(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The same result with ``function``, which must preserve values, applied to every tensor.
@@ -344,22 +325,25 @@ class Result(Summarised):
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> "Figure":
         """Draw the result, and write the picture (PNG, SVG, PDF) if a path is given; notebooks show the figure."""
-        draw = figure_of(type(self), len(self.batch_shape))
+        draw = self._figure_function()
         if draw is None:
             drawn = sorted({kind.__name__ for kind, _ in FIGURES})
             if type(self).__name__ in drawn:
-                raise ValueError(
-                    f"a batch of shape {tuple(self.batch_shape)} has no figure: select one, result[0].plot()"
-                )
+                shape = tuple(self.batch_shape)
+                raise ValueError(f"a batch of shape {shape} has no figure: select one, result[0].plot()")
             raise TypeError(f"{type(self).__name__} has no figure; these have one: {', '.join(drawn)}")
         figure = draw(self)
         if path is not None:
             write_figure(figure, path)
         return figure
 
+    def _figure_function(self) -> "Callable[[Any], Figure] | None":
+        imported("figures")  # adds to the table
+        return FIGURES.get((type(self), len(self.batch_shape)))
+
     def _repr_html_(self) -> str:
         text = super()._repr_html_()
-        if figure_of(type(self), len(self.batch_shape)) is None:
+        if self._figure_function() is None:
             return text
         return f'{text}<img src="{data_uri(figure_png(self.plot(), dpi=70), "image/png")}">'
 
@@ -385,7 +369,5 @@ class JudgedResult(Result):
         for name, (dimensions, values, attributes) in super()._variables(inside):
             yield name, (dimensions, values, attributes)
             if name == "reliable" and dimensions[-1:] == ("axis",):
-                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object).reshape(
-                    values.shape
-                )
-                yield "reasons", (dimensions, codes, {})
+                codes = np.array([self.codes(place) for place in np.ndindex(values.shape)], object)
+                yield "reasons", (dimensions, codes.reshape(values.shape), {})

@@ -54,9 +54,7 @@ class Reason:
         try:
             str(self)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"value, limit or details of the reason {quoted(self.code)} do not fit its text"
-            ) from error
+            raise ValueError(f"value, limit or details of {quoted(self.code)} do not fit its text") from error
 
     @property
     def kind(self) -> ReasonKind:
@@ -160,6 +158,10 @@ _TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
 _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2g} px"
 
+_px = partial(ReasonKind, unit="px")
+_of_result = partial(ReasonKind, refuses="the result")
+_px_of_result = partial(_px, refuses="the result")
+
 _TONES = {
     "rows_not_registered": ReasonKind(
         "only {value:.0%} of {what} can be registered, {limit:.0%} are needed: the motion is beyond the search range, "
@@ -183,18 +185,16 @@ _TONES = {
     "tone_uncertainty_unknown": ReasonKind(
         "the uncertainty of the tone of {frequency:.4g} Hz is unknown: too few rows were measured", _MORE_FRAMES
     ),
-    "tone_not_significant": ReasonKind(
+    "tone_not_significant": _px(
         "tone of {frequency:.4g} Hz is not significant: its amplitude is {value:.3g} ± {std:.2g} px, and 4 standard "
         "deviations, {limit:.3g} px, are needed",
         _MAY_BE_STILL,
         "amplitude of the only tone, below 4 standard deviations",
-        "px",
     ),
-    "tone_too_small": ReasonKind(
+    "tone_too_small": _px(
         "tone of {frequency:.4g} Hz is too small: its offsets of {value:.2g} px are below {limit:g} px, where errors "
         "of interpolation may cause them",
         compares="amplitude of the offsets of a tone, below 0.01 px",
-        unit="px",
     ),
     "tone_blind": ReasonKind(
         "tone of {frequency:.4g} Hz is nearly blind: its offset gain is {value:.3f}, {limit:g} is needed, because "
@@ -218,48 +218,42 @@ _TONES = {
         "frequency of a tone, above 1 / exposure time",
         "Hz",
     ),
-    "displacement_ambiguous": ReasonKind(
+    "displacement_ambiguous": _px(
         f"{_UNCERTAIN}, {{limit:.2g}} px are allowed, because the frames also agree with other tones",
         f"{_FOLLOW}, or use more frames",
         "standard deviation of the displacement of the rows, above 4 % of it and 0.01 px, with several tones or if it "
         "exceeds 1.5 times the one of the fit alone",
-        "px",
     ),
-    "displacement_uncertain": ReasonKind(
+    "displacement_uncertain": _px(
         f"{_UNCERTAIN}; the standard deviation must be at most 25 % of the displacement, {{limit:.2g}} px",
         _MORE_FRAMES,
         "standard deviation of the displacement of the rows, above 25 % of it",
-        "px",
     ),
-    "rows_unexplained": ReasonKind(
+    "rows_unexplained": _px(
         "rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
         f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
         "rms residual of the rows without their noise, above 0.05 px and 0.6 % of the rms offsets",
-        "px",
         free_model=True,
     ),
-    "neighbours_unexplained": ReasonKind(
+    "neighbours_unexplained": _px(
         "neighbouring rows move by {value:.3g} px that no tone explains, {limit:.2g} px are allowed",
         f"{_TONES_OR_FREE}, {_CHECK_TIMING}",
         "the part of the residual that neighbouring rows have in common, above 0.01 px and 0.25 % of the rms offsets, "
         "with 95 % confidence",
-        "px",
         free_model=True,
     ),
-    "halves_apart": ReasonKind(
+    "halves_apart": _px(
         "left and right halves of the rows move apart by {value:.3g} px along {other}, {limit:.2g} px are allowed: the "
         "camera rolls or zooms (pass roll={remedy}, zoom={remedy} and no columns), or the scene has parallax (select a "
         "part of the frame with one distance)",
         compares="rms difference between the halves of the rows along the other axis, above 0.035 px and 0.9 % of the "
         "rms offsets",
-        unit="px",
     ),
-    "strips_apart": ReasonKind(
+    "strips_apart": _px(
         "strips of columns move apart by {value:.3g} px that roll and zoom do not explain, {limit:.2g} px are allowed: "
         "the scene has parallax, or the lens is distorted",
         "select a part of the frame with one distance",
         "with roll or zoom: rms difference between strips of columns, above 0.035 px and 0.9 % of the rms offsets",
-        "px",
     ),
     "blur_contradicts_exposure": ReasonKind(
         "the difference of the blur between frames is {value:.3g} times the value expected for an exposure of "
@@ -269,20 +263,18 @@ _TONES = {
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
         refuses="all axes",
     ),
-    "bands_unexplained": ReasonKind(
+    "bands_unexplained": _px(
         "the fit does not explain the offset curve: mean residual {value:.3g} px, {limit:.3g} px are allowed for "
         "offsets of {size:.3g} px",
         _TONES_OR_FREE,
         "method='bands': mean residual of the best three quarters of the bands, above 0.05 px and 30 % of the offsets",
-        "px",
         free_model=True,
     ),
-    "motion_within_row_time": ReasonKind(
+    "motion_within_row_time": _px(
         "the image moves {value:.2g} px within a row time, condition (24) allows {limit:g} px: the camera does not "
         "move as a whole, or row_time is wrong",
         "check row_time",
         "method='bands': motion within a row time, above 0.1 px, condition (24) of the paper",
-        "px",
     ),
     "other_frame_rows": ReasonKind(
         "the frames agree with frame_rows={limit:.5g}, not with {value:g}: frame_rows counts the blanking rows and is "
@@ -308,12 +300,11 @@ _TONES = {
 }
 _FOLLOWED = {
     "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),
-    "directions_differ": ReasonKind(
+    "directions_differ": _px(
         "forwards and backwards in time, the displacement of the rows differs by {value:.2g} px, {limit:.2g} px are "
         "allowed",
         "use more frames, or frames at shorter intervals",
         "rms difference of the displacements that both trackers find, above 0.01 px, 3 % and 4 standard deviations",
-        "px",
     ),
     "tones_contradicted": ReasonKind(
         "in {value:.0%} of the frames the rows contradict the tones, {limit:.0%} are allowed: tones are missing",
@@ -327,20 +318,17 @@ _FOLLOWED = {
     ),
 }
 _SHAPES = {
-    "motion_unexplained": ReasonKind(
+    "motion_unexplained": _px(
         "rows move by {value:.3g} px that no {model} explains, {limit:.2g} px are allowed",
         compares="rms residual of the rows, above 15 % of their motion and 0.03 px",
-        unit="px",
     ),
-    "bands_contradict": ReasonKind(
+    "bands_contradict": _px(
         "the offsets of row bands differ by {value:.3g} px from it, {limit:.3g} px are allowed: noise hides the scene",
         compares="mean difference of the best three quarters of the row bands, above 0.1 px and 30 % of the offsets",
-        unit="px",
     ),
-    "motion_uncertain": ReasonKind(
+    "motion_uncertain": _px(
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
         compares="rms standard deviation of the visible part of the motion, above 0.3 px",
-        unit="px",
     ),
     "too_few_frames_for_sweep": ReasonKind(
         "{value:g} frames do not determine decay and sweep of a tone, {limit:g} are needed: several swept tones fit",
@@ -358,17 +346,14 @@ _SHAPES = {
         _MORE_FRAMES,
     ),
 }
-_of_result = partial(ReasonKind, refuses="the result")
 _RECORDED = {
-    "recorded_motion_too_small": _of_result(
+    "recorded_motion_too_small": _px_of_result(
         "the recorded motion moves rows by {value:.2g} px between frames, too little: {limit:g} px are needed",
         compares="rms motion of the rows between frames by the recording, below 0.05 px",
-        unit="px",
     ),
-    "recording_incomplete": _of_result(
+    "recording_incomplete": _px_of_result(
         "rows move by {value:.3g} px that the recording does not explain, {limit:.2g} px are allowed",
         compares="motion of the rows beside the recorded one, above 25 % of the recorded motion and 0.05 px",
-        unit="px",
     ),
     "recording_explains_nothing": _of_result("the recording does not explain the frames"),
     "motion_repeats": _of_result("an offset of {offset:.6g} s explains the frames as well: the motion repeats"),
@@ -382,11 +367,10 @@ _RECORDED = {
         "left-handed axes"
     ),
     "axes_ambiguous": _of_result("the axes {axes} explain the frames as well", "rotate the camera about all axes"),
-    "focal_length_uncertain": _of_result(
+    "focal_length_uncertain": _px_of_result(
         "the focal length is not determined, {focal_length:.4g} ± {value:.2g} px, at most ± {limit:.2g} px is allowed",
         "give camera=",
         "standard deviation of the focal length, above 5 % of it",
-        "px",
     ),
     "fit_not_converged": _of_result("the fit does not converge"),
     "gap_in_recording": _of_result(
@@ -399,22 +383,19 @@ _RECORDED = {
         compares="duration of the readout, above the shortest interval between frames",
         unit="s",
     ),
-    "motion_enlarges_offsets": ReasonKind(
+    "motion_enlarges_offsets": _px(
         "rows are further apart without the motion: {value:.3g} px instead of {moved:.3g} px, at most {limit:.3g} px",
         compares="offsets of the rows without the motion, above those with it by 0.05 px",
-        unit="px",
         refuses="the motion, if it does not reduce the offsets of both axes together",
     ),
-    "motion_leaves_offsets": ReasonKind(
+    "motion_leaves_offsets": _px(
         "the motion leaves {value:.3g} px of the {moved:.3g} px that rows move, {limit:.3g} px are allowed",
         compares="offsets of the rows without the motion, above half of those with it and 0.05 px",
-        unit="px",
         refuses="the motion, if it does not reduce the offsets of both axes together",
     ),
-    "offsets_not_reduced": ReasonKind(
+    "offsets_not_reduced": _px(
         "the motion does not reduce the offsets of rows between frames: {value:.3g} px remain of {limit:.3g} px",
         compares="offsets of both axes together without the motion, not below those with it",
-        unit="px",
         refuses="the motion",
     ),
 }
@@ -450,18 +431,16 @@ _RESTORATION = {
         "standard deviation of the displacement of the rows, above its rms over the square root of 2",
         "px; roll: rad; zoom: 1",
     ),
-    "motion_remains": ReasonKind(
+    "motion_remains": _px(
         "frames lie {before:.2g} px apart, {value:.2g} px remain unexplained, {limit:.2g} px are allowed",
         compares="displacement between the prediction from a restored frame and the next raw frame, above 0.35 "
         "(partly) or 0.8 (worse) of that of the raw frames",
-        unit="px",
         refuses="the pair: partly or worse",
     ),
     "no_contrast": ReasonKind("the frames have no contrast", refuses="the pair: unknown"),
-    "displaced_alike": ReasonKind(
+    "displaced_alike": _px(
         "frames lie {value:.2g} px apart, less than {limit:.2g} px: all are displaced alike",
         compares="displacement between the raw frames, at most 0.03 px or what can be distinguished from zero",
-        unit="px",
         refuses="the pair: unknown",
     ),
     "nothing_undone": ReasonKind("no vibration was undone", refuses="the pair: unknown"),

@@ -64,16 +64,15 @@ def _dataclass(kind: Any, value: object, path: str) -> Any:
     hints, start, missing = hints_of(kind), f"{path}." if path else "", getattr(kind, "_MISSING", math.nan)
     values: Table = {}
     for field in fields(kind):
-        if field.name in value:
-            stated, hint = value[field.name], hints[field.name]
-            if field.name in ("findings", "left_alone"):
-                values[field.name] = read_findings(stated)
-            elif stated is not None or types.NoneType not in get_args(hint):
-                values[field.name] = decode(hint, stated, start + field.name, missing)
-            else:
-                values[field.name] = None
-        elif field.default is MISSING and field.default_factory is MISSING:
-            raise ValueError(f"{start}{field.name}: missing key")
+        name, hint = field.name, hints[field.name]
+        if name not in value:
+            if field.default is MISSING and field.default_factory is MISSING:
+                raise ValueError(f"{start}{name}: missing key")
+        elif name in ("findings", "left_alone"):
+            values[name] = read_findings(value[name])
+        else:
+            is_none = value[name] is None and types.NoneType in get_args(hint)
+            values[name] = None if is_none else decode(hint, value[name], start + name, missing)
     try:
         made = kind(**values)
         check_fields(made)

@@ -1,30 +1,18 @@
-from .corrector import CorrectedFrames, VibrationCorrector
-from .job import WindowResult, restore_block
-from .manifest import StackManifest, read_manifest
-from .process import detect_stack, iterate_stack, process_stack
-from .recorded_motion import align_stack, check_stack_motion
-from .run_folder import StackReport
-from .window_restoration import RestoredFrames, may_change, restore_followed, restore_trusted, without_data
-from .windows import Window, cut_windows
-
-__all__ = [
-    "CorrectedFrames",
-    "RestoredFrames",
-    "StackManifest",
-    "StackReport",
-    "VibrationCorrector",
-    "Window",
-    "WindowResult",
-    "align_stack",
-    "check_stack_motion",
-    "cut_windows",
-    "detect_stack",
-    "iterate_stack",
-    "may_change",
-    "process_stack",
-    "read_manifest",
-    "restore_block",
-    "restore_followed",
-    "restore_trusted",
-    "without_data",
-]
+from .corrector import CorrectedFrames as CorrectedFrames
+from .corrector import VibrationCorrector as VibrationCorrector
+from .job import WindowResult as WindowResult
+from .job import restore_block as restore_block
+from .manifest import StackManifest as StackManifest
+from .manifest import read_manifest as read_manifest
+from .process import detect_stack as detect_stack
+from .process import iterate_stack as iterate_stack
+from .process import process_stack as process_stack
+from .recorded_motion import align_stack as align_stack
+from .recorded_motion import check_stack_motion as check_stack_motion
+from .run_folder import StackReport as StackReport
+from .window_restoration import RestoredFrames as RestoredFrames
+from .window_restoration import may_change as may_change
+from .window_restoration import restore_trusted as restore_trusted
+from .window_restoration import without_data as without_data
+from .windows import Window as Window
+from .windows import cut_windows as cut_windows

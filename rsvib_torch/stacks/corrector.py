@@ -12,12 +12,7 @@ from rsvib_torch.restoration import VibrationRestorer
 
 
 class CorrectedFrames(NamedTuple):
-    """Result of ``VibrationCorrector``.
-
-    Attributes:
-        frames: The restored frames, in the shape of the input.
-        detection: The vibration of each stack with its verdict; axes that are not reliable are not corrected.
-    """
+    """Restored frames in the shape of the input, and the detections; axes that are not reliable are not corrected."""
 
     frames: Tensor
     detection: DetectionResult
@@ -28,17 +23,11 @@ class VibrationCorrector(nn.Module):
 
     Gradients flow to the frames through the restoration; the detected vibration is constant for them. The module has no
     weights. What ``torch.export`` and ONNX accept is the restoration with a given vibration, ``FixedDewarp``: the
-    number of steps of a detection depends on the frames.
-
-    Args:
-        timing: The sensor.
-        detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``.
+    number of steps of a detection depends on the frames. ``detection`` and ``restoration`` are their options.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames()
+        >>> frames, timing, _ = rsv.datasets.example_frames()
         >>> corrector = rsv.VibrationCorrector(timing, restoration={"method": "dewarp"})
         >>> corrector
         VibrationCorrector(

@@ -39,6 +39,10 @@ def compute_here(
     return in_threads(compute, read_windows(job, windows), at_once=at_once, threads=threads)
 
 
+def _distributed() -> Any:
+    return needed_package("distributed", "the Dask engine", "distributed")
+
+
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
     """Read and compute one window on a Dask worker."""
     share_one_heap(keep_freed=True)
@@ -46,8 +50,11 @@ def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> Store
     if one_thread:
         torch.set_num_threads(1)
     try:
-        if job.device.startswith("cuda"):
-            job = replace(job, device=_device_of_worker())
+        if job.device.startswith("cuda"):  # workers with a number as their name use the GPUs in turn
+            count, name = torch.cuda.device_count(), _distributed().get_worker().name
+            if count == 0:
+                raise RuntimeError("this worker has no CUDA device; use device='cpu'")
+            job = replace(job, device=f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0")
         with closing(read_windows(job, [window])) as read:
             _, pixels = next(read)
         return job.stored(job.compute(window, pixels), pixels)
@@ -55,24 +62,14 @@ def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> Store
         torch.set_num_threads(default_threads)
 
 
-def _device_of_worker() -> str:
-    """The GPU of this worker: workers with a number as their name use the GPUs in turn."""
-    count = torch.cuda.device_count()
-    if count == 0:
-        raise RuntimeError("this worker has no CUDA device; use device='cpu'")
-    name = needed_package("distributed", "the Dask engine", "distributed").get_worker().name
-    return f"cuda:{int(name) % count}" if str(name).isdecimal() else "cuda:0"
-
-
 def _dask_client(scheduler: str, workers: int) -> Any:
     """A client of the scheduler at an address, or of a number of workers on this machine, which end with it."""
-    distributed = needed_package("distributed", "the Dask engine", "distributed")
     options: dict[str, Any] = {"address": scheduler, "timeout": 30}
     if scheduler == "local":
         options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
         options |= {"dashboard_address": None, "silence_logs": logging.ERROR}
     try:
-        return distributed.Client(**options, set_as_default=False)
+        return _distributed().Client(**options, set_as_default=False)
     except (OSError, ValueError, RuntimeError) as error:
         failed = f"no Dask scheduler answers at {scheduler}"
         failed = "Dask workers cannot be started" if scheduler == "local" else failed
@@ -81,7 +78,7 @@ def _dask_client(scheduler: str, workers: int) -> Any:
 
 def _wait(client: Any, future: Any, window: Window) -> Any:
     """The result of a window that Dask workers compute, as long as there are workers and a scheduler."""
-    distributed = needed_package("distributed", "the Dask engine", "distributed")
+    distributed = _distributed()
     last_seen = time.monotonic()
     while True:
         try:
@@ -92,9 +89,8 @@ def _wait(client: Any, future: Any, window: Window) -> Any:
             if client.scheduler_info(n_workers=-1)["workers"]:
                 last_seen = time.monotonic()
             elif time.monotonic() - last_seen > NO_WORKERS_SECONDS:
-                raise OSError(
-                    f"no Dask workers for {NO_WORKERS_SECONDS:g} s; start workers, and resume the run"
-                ) from None
+                gone = f"no Dask workers for {NO_WORKERS_SECONDS:g} s"
+                raise OSError(f"{gone}; start workers, and resume the run") from None
         except distributed.KilledWorker as error:
             raise OSError(
                 f"Dask workers died {error.allowed_failures + 1} times while they computed window {window.index} "
@@ -122,11 +118,11 @@ def compute_with_dask(
             task = client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
             return task, window
 
-        def two_per_worker() -> int:
+        def capacity() -> int:
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
         try:
-            yield from in_order(windows, submit, two_per_worker, lambda pair: _wait(client, *pair), waiting)
+            yield from in_order(windows, submit, capacity, lambda pair: _wait(client, *pair), waiting)
         finally:
             with suppress(Exception):
                 client.cancel([task for task, _ in waiting])

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,14 +19,9 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import DetectionResult, detect_vibration
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
+from rsvib_torch.io import full_scale as scales
 from rsvib_torch.io.frame_times import exposure_times, timing_of_stack
-from rsvib_torch.io.full_scale import (
-    check_dtype,
-    counts_to_frames,
-    frames_to_counts,
-    known_full_scale,
-    required_full_scale,
-)
+from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.stack_info import FrameError, FrameReader, StackInfo
 from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
@@ -60,31 +56,19 @@ WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cann
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WindowResult(Summarised):
-    """One window of a stack, restored.
-
-    Attributes:
-        window: Its position in the stack.
-        indices: Indices of ``frames`` in the stack; empty if all frames were restored jointly as one image.
-        frames: Frames whose full scale is 1, (T, H, W) or (T, C, H, W): restored, or as taken.
-        restored: Whether they are restored.
-        detection: The detection, with the time origin at the window's first frame; a ``FollowedVibration`` of the
-            frames ``indices`` if it was followed from frame to frame; None if it failed.
-        restoration: Details of the restoration; None without a detection.
-        error: Why detection or restoration failed.
-        unchanged: Indices of ``frames`` that are as taken, in a window that is restored: those of a vibration that was
-            followed, whose motion is not known.
-        bad_frames: Frames of ``window.written`` that could not be used, with the reason; they are not in ``frames``.
-    """
+    """One window of a stack, restored."""
 
     window: Window
-    indices: tuple[int, ...]
-    frames: Tensor
+    indices: tuple[int, ...]  # of ``frames`` in the stack; empty if all frames were restored jointly as one image
+    frames: Tensor  # with full scale 1, (T, H, W) or (T, C, H, W): restored, or as taken
     restored: bool
+    # with the time origin at the window's first frame; a ``FollowedVibration`` of the frames ``indices`` if it was
+    # followed from frame to frame; None if it failed
     detection: DetectionResult | DetectedVibration | None
-    restoration: RestoredFrames | None
-    error: str | None
-    bad_frames: Mapping[int, str]
-    unchanged: tuple[int, ...] = ()
+    restoration: RestoredFrames | None  # None without a detection
+    error: str | None  # why detection or restoration failed
+    bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
+    unchanged: tuple[int, ...] = ()  # indices of frames of a restored window that are as taken: unknown motion
 
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
@@ -135,24 +119,15 @@ class StackJob:
             raise ValueError(f"{self.source} has changed since it was first opened; start again")
         return reader
 
-    @property
-    def joined(self) -> bool:
-        """Whether the frames of a window become one image."""
-        return self.restoration is not None and self.restoration.get("joint", False) is True
-
-    @property
-    def scale(self) -> int:
-        """Points of the result per pixel."""
-        return 1 if self.restoration is None else int(self.restoration.get("scale", 1))
-
-    @property
-    def mosaic(self) -> str | None:
-        """Pattern of raw frames; None for others."""
-        return None if self.restoration is None else self.restoration.get("mosaic")
+    @cached_property
+    def chosen(self) -> RestorationOptions:
+        """All options of ``restore``; ``joint=True`` makes one image of a window."""
+        return RestorationOptions(**(self.restoration or {}))
 
     def _unchanged(self, frames: Tensor) -> Tensor:
         """Frames that were not restored, in the shape of restored ones."""
-        return enlarged(frames if self.mosaic is None else colour_frames(frames, self.mosaic), self.scale)
+        mosaic = self.chosen.mosaic
+        return enlarged(frames if mosaic is None else colour_frames(frames, mosaic), self.chosen.scale)
 
     def content(self, out: StackInfo, timing: SensorTiming) -> StackInfo:
         """The output ``out`` with full scale, times and frame rate; ``timing`` is that of the caller."""
@@ -187,25 +162,21 @@ class StackJob:
                 found = detection = self.given[window.index]
             else:
                 found = detection = detect_vibration(frames, timing, **self.detection)
-                followed = self._followed_instead(as_taken, usable, detection)
-                if followed is not None:
-                    return followed
+                if self.follow == "auto" and may_change(detection, len(usable)):
+                    followed = self._followed(as_taken, usable)
+                    reliable = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
+                    if reliable > detection.reliable.sum():
+                        return followed
             if found is None or self.restoration is None:
                 missing = "no detection was given for this window" if found is None else None
                 return replace(as_taken, detection=detection, error=missing)
-            joint = bool(self.restoration.get("joint", False))
-            restoration = restore_trusted(
-                frames,
-                timing,
-                found,
-                self.restoration,
-                force=self.force,
-                first_frames=len(kept) if len(kept) > 1 and not joint else None,
-                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
-            )
+            first_frames = len(kept) if len(kept) > 1 and not self.chosen.joint else None
+            most_pairs = 8 if window.alone else 2  # limits the time of the verdict
+            limits = {"first_frames": first_frames, "most_pairs": most_pairs}
+            restoration = restore_trusted(frames, timing, found, self.restoration, force=self.force, **limits)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
-        one_image = self.joined and restoration.restored
+        one_image = self.chosen.joint is True and restoration.restored
         restored = restoration.frames if one_image else restoration.frames[: len(kept)]
         if self.info.nodata is not None:
             restored = without_data(restored, frames if one_image else frames[: len(kept)])
@@ -231,14 +202,11 @@ class StackJob:
         usable: dict[int, NDArray[Any]] = {}
         faults: dict[int, str] = {}
         for index, frame in zip(window.frames, pixels, strict=True):
-            if isinstance(frame, str):
-                faults[index] = frame
-                continue
-            fault = frame_fault(frame, index, self.full_scale, nodata=self.info.nodata)
-            if fault is None:
-                usable[index] = frame
-            else:
+            fault = frame_fault(frame, index, self.full_scale, self.info.nodata)
+            if fault is not None:
                 faults[index] = fault
+            elif not isinstance(frame, str):
+                usable[index] = frame
         return usable, faults
 
     def _images(self, frames: Mapping[int, NDArray[Any]]) -> Tensor:
@@ -247,16 +215,6 @@ class StackJob:
             return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
         stored = np.stack(list(frames.values()))
         return counts_to_frames(stored, self.full_scale, str(self.source), self.info.nodata).to(self.device)
-
-    def _followed_instead(
-        self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]], steady: DetectedVibration
-    ) -> WindowResult | None:
-        """The result of a window whose tones may change, if more of its axes are reliable than of a steady one."""
-        if self.follow != "auto" or not may_change(steady, len(usable)):
-            return None
-        followed = self._followed(as_taken, usable)
-        better = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
-        return followed if better > steady.reliable.sum() else None
 
     def _followed(self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]]) -> WindowResult:
         """The result of a window whose vibration is followed, from its usable frames and those around it."""
@@ -294,7 +252,7 @@ class StackJob:
         dtype = np.dtype(self.info.dtype)
 
         def counts(images: Tensor) -> NDArray[Any]:
-            return frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
+            return scales.frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
 
         if result.restored and not result.indices:
             frames = list(counts(result.frames))
@@ -302,14 +260,14 @@ class StackJob:
         written = list(result.window.written)
         restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
         frames = []
-        for index in [written[len(written) // 2]] if self.joined else written:
+        for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
             if index in restored and index not in result.unchanged:
                 frames.append(counts(restored[index]))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.frames.start]
                 if isinstance(frame, str):
                     frame = np.full(self.info.shape[1:], np.nan if dtype.kind == "f" else 0, dtype)
-                if self.scale != 1 or self.mosaic is not None:  # the shape of restored ones
+                if self.chosen.scale != 1 or self.chosen.mosaic is not None:  # the shape of restored ones
                     taken = counts_to_frames(frame[None], self.full_scale, str(self.source), self.info.nodata)
                     frame = counts(self._unchanged(taken)[0])
                 frames.append(frame)
@@ -346,10 +304,7 @@ def stored_frame(read: Callable[[int], NDArray[Any]], index: int) -> NDArray[Any
 
 
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
-    """Windows with the pixels of their frames as stored, or why they cannot be read.
-
-    The frames that neighbours share are read once.
-    """
+    """Windows with the pixels of their frames, or why they cannot be read; frames that two share are read once."""
     with closing(job.open()) as reader:
         last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
         shared = 1 + (2 * MARGIN if job.follow else 0)
@@ -362,30 +317,29 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 
 
+def _together(restoration: OptionTable) -> list[str]:
+    """Those of ``_TOGETHER`` that change something."""
+    given = restoration or {}
+    return [name for name in _TOGETHER if given.get(name) is True or given.get(name) not in (None, False, 1)]
+
+
 def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
     """Options of ``restore`` without those that frames which are restored one by one do not have."""
-    given = dict(restoration or {})
-    for name in _TOGETHER:
-        if given.pop(name, None) not in (None, False, 1):
-            raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
-    return given
+    for name in _together(restoration):
+        raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
+    return {name: value for name, value in (restoration or {}).items() if name not in _TOGETHER}
 
 
 def _follows(
     options: StackDetectionOptions, restoration: OptionTable, detection: OptionTable, given: object
 ) -> bool | Literal["auto"]:
-    """Whether the vibration is followed; ``"auto"`` is not where options are given that frames one by one do not have.
-
-    Raises:
-        ValueError: If it is requested with such an option.
-    """
+    """Whether it is followed; ``"auto"`` is not where options are given that frames one by one do not have."""
     if options.follow is True:
         if detection or given is not None:
             raise ValueError("follow=True has no options of detection, and no given detections")
         single_frame_options(restoration)
     elif options.follow == "auto":
-        together = any((restoration or {}).get(name) not in (None, False, 1) for name in _TOGETHER)
-        return False if detection or given is not None or together else "auto"
+        return False if detection or given is not None or _together(restoration) else "auto"
     return options.follow
 
 
@@ -401,7 +355,7 @@ def plan_job(
     full_scale = None
     if info.is_integer:
         stated = info.full_scale if options.full_scale is None else options.full_scale
-        full_scale = required_full_scale(stated, np.dtype(info.dtype), source)
+        full_scale = scales.required_full_scale(stated, np.dtype(info.dtype), source)
     timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
@@ -410,47 +364,29 @@ def plan_job(
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
+    on_gpu = device != "cpu"
     restored = options if isinstance(options, StackOptions) else None
     run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
     restoration = None if restored is None else dict(restored.restoration or {})
     follow = _follows(options, restoration, detection, run.given if run.motion is None else run.motion)
-    job = StackJob(
-        Path(source),
-        info,
-        timing,
-        full_scale,
-        detection,
-        restoration,
-        None if run.given is None else dict(enumerate(run.given)),
-        run.motion,
-        run.bad_frames,
-        restored is not None and restored.force,
-        device,
-        options.window,
-        follow,
-    )
-    if job.mosaic is not None:
-        check_mosaic(job.mosaic, info.shape, str(source))
-    if job.restoration is not None:
-        check_optics(RestorationOptions(**job.restoration).optics)
+    given, force = None if run.given is None else dict(enumerate(run.given)), restored is not None and restored.force
+    of_run = (given, run.motion, run.bad_frames, force, device, options.window, follow)
+    job = StackJob(Path(source), info, timing, full_scale, detection, restoration, *of_run)
+    if job.chosen.mosaic is not None:
+        check_mosaic(job.chosen.mosaic, info.shape, str(source))
+    check_optics(job.chosen.optics)
     margin = MARGIN if job.follow else 0
     windows = cut_windows(info.shape[0], job.window, margin)
     if options.workers is not None:
         most = options.workers
-    elif device != "cpu":
+    elif on_gpu:
         most = 1
     else:
         most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not here:  # the memory of other machines is not known
         return job, windows, most
     at_once = windows_at_once(
-        info,
-        job.window,
-        memory=options.memory,
-        most=most,
-        restoration=job.restoration,
-        on_gpu=device != "cpu",
-        margin=margin,
+        info, job.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
     )
     return job, windows, at_once
 
@@ -476,18 +412,11 @@ def restore_block(
         frames: (T, H, W) or (T, C, H, W), as stored.
         timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
         detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
+        restoration: Options of ``restore`` that keep the size, for frames whose full scale is 1.
         full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
         channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
-
-    Returns:
-        Restored frames.
-
-    Raises:
-        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
-            to have their channels last.
 
     Example:
         >>> restored = array.map_overlap(  # doctest: +SKIP
@@ -500,17 +429,17 @@ def restore_block(
             "timing must not have frame_start_times: the position of a block in the stack is unknown; use process_stack"
         )
     options = dict(restoration or {})
-    if options.get("joint", False) is True:
+    if options.get("joint") is True:
         raise ValueError("joint=True makes one image of a block; restore_block keeps its shape")
     for name in ("scale", "mosaic"):
         if options.get(name) not in (None, 1):
             raise ValueError(f"{name}={options[name]!r} changes the size of the frames; restore_block keeps it")
-    check_dtype(frames.dtype)
+    scales.check_dtype(frames.dtype)
     axis = channel_axis("frames", frames.shape, channels)
     stored = np.moveaxis(frames.astype(frames.dtype.newbyteorder("="), copy=False), axis, -3)
-    scale = known_full_scale(frames.dtype, full_scale)
+    scale = scales.known_full_scale(frames.dtype, full_scale)
     if frames.dtype.kind != "f":
-        scale = required_full_scale(scale, frames.dtype, "frames")
+        scale = scales.required_full_scale(scale, frames.dtype, "frames")
     info = StackInfo(stored.shape, stored.dtype.name, scale)
     job = StackJob(Path("frames"), info, timing, scale, detection or {}, options, force=force, device=device)
     window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)

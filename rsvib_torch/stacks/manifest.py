@@ -41,29 +41,17 @@ def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[st
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StackManifest(Result, file_format="rsvib stack"):
-    """Content of ``manifest.json``.
+    """Content of ``manifest.json``."""
 
-    Attributes:
-        input: Name, size and hash of the stack.
-        settings: Sensor and options.
-        versions: Versions of the packages that computed it.
-        output: Name of the output; None for detection only.
-        bad_frames: Index of each frame that could not be used, with the reason.
-        not_kept: Metadata of the input that the output does not contain.
-        margins: px that were cut off the sides of the frames of a video.
-        gyroscope: Of a video whose path is that of a gyroscope: its axes, clock and bias (rad/s), and the focal length
-            (px), as in ``RotationAlignment``.
-        windows: Result of every window.
-    """
-
-    input: dict[str, Any]
-    settings: dict[str, Any]
-    versions: dict[str, Any]
-    output: dict[str, Any] | None
-    bad_frames: dict[str, str]
+    input: dict[str, Any]  # name, size and hash of the stack
+    settings: dict[str, Any]  # sensor and options
+    versions: dict[str, Any]  # of the packages that computed it
+    output: dict[str, Any] | None  # name of the output; None for detection only
+    bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
     windows: tuple[WindowRecord, ...]
-    not_kept: tuple[str, ...] = ()
-    margins: dict[str, int] | None = None
+    not_kept: tuple[str, ...] = ()  # metadata of the input that the output does not contain
+    margins: dict[str, int] | None = None  # px that were cut off the sides of the frames of a video
+    # of a video with the path of a gyroscope: its axes, clock and bias (rad/s), and the focal length (px)
     gyroscope: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -87,13 +75,9 @@ class StackManifest(Result, file_format="rsvib stack"):
             ends = (record.first, record.last) if frame is None else (frame, frame)
             first: dict[str, Any] = {"window": record.window, "first_frame": ends[0], "last_frame": ends[1]}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
-            note = record.error or "; ".join(map(str, record.left_alone))
-            last = {
-                "frames": record.frames,
-                "outcome": record.outcome,
-                "bad_frames": len(record.bad_frames),
-                "note": note,
-            }
+            last: dict[str, Any] = {"frames": record.frames, "outcome": record.outcome}
+            last["bad_frames"] = len(record.bad_frames)
+            last["note"] = record.error or "; ".join(map(str, record.left_alone))
             last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
             tones = [{}] if found is None else found.tone_lines(pixel_size)
             lines += [{**first, **tone, **last} for tone in tones]
@@ -112,8 +96,8 @@ class StackManifest(Result, file_format="rsvib stack"):
             if record.followed is not None and record.detection is not None:
                 found = [(frame, record.detection[number]) for number, frame in enumerate(record.followed)]
             for frame, detection in found:
-                ends = (record.first, record.last) if record.middle is None else (record.middle, record.middle)
-                ends = ends if frame is None else (frame, frame)
+                one = record.middle if frame is None else frame
+                ends = (record.first, record.last) if one is None else (one, one)
                 middle = None if starts is None else 0.5 * (starts[ends[0]] + starts[ends[1]]) + half_frame
                 yield record, frame, detection, middle
 
@@ -131,10 +115,8 @@ class StackManifest(Result, file_format="rsvib stack"):
 
     def times(self) -> list[float]:
         """Time of each of the ``detections`` in s: start of the window, or middle of the frame."""
-        return [
-            record.start_time if frame is None or middle is None else middle
-            for record, frame, _, middle in self._results()
-        ]
+        found = ((record.start_time, frame, middle) for record, frame, _, middle in self._results())
+        return [start if frame is None or middle is None else middle for start, frame, middle in found]
 
     @property
     def shaking(self) -> dict[str, tuple[float, ...]] | None:
@@ -197,16 +179,9 @@ class StackManifest(Result, file_format="rsvib stack"):
         vibration = [text_table(*self.tone_table(pixel_size)), spread]
         followed = [record for record in self.windows if record.followed is not None]
         if followed and self.settings.get("follow") == "auto":
-            which = (
-                "all windows"
-                if len(followed) == len(self.windows)
-                else f"{len(followed)} of {len(self.windows)} windows"
-            )
-            vibration.append(
-                wrapped(
-                    f"the tones change within {which}, which were therefore followed from frame to frame (--follow)"
-                )
-            )
+            which = "all" if len(followed) == len(self.windows) else f"{len(followed)} of {len(self.windows)}"
+            text = f"the tones change within {which} windows, which were therefore followed from frame to frame"
+            vibration.append(wrapped(f"{text} (--follow)"))
         if self.gyroscope is not None:
             found = self.gyroscope
             axes = ", ".join(letter.lower() if letter.isupper() else f"-{letter}" for letter in found["orientation"])
@@ -223,18 +198,21 @@ class StackManifest(Result, file_format="rsvib stack"):
         if data["predicted_gain_db"] is not None:
             gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
             restoration.append(f"estimated improvement {' … '.join(gains)} dB")
-        still = self._has_no_tone()
+        # All windows were measured, and nothing else than missing tones is stated against any axis.
+        codes = {
+            "failed" if one is None else one.codes((axis,))
+            for one in self.detections()
+            for axis in range(2 if one is None else one.vibration.num_axes)
+        }
+        still = codes == {"no_tone"}
         if still:
             text = "the camera stands still, or moves uniformly or by less than the noise"
             vibration.append(wrapped(f"no window has a significant tone: {text}"))
         for name, notes in data["left_alone"].items():
             if notes and not still:
                 window, note = next(iter(notes.items()))
-                restoration.append(
-                    wrapped(
-                        f"{name} unchanged in {number_of(len(notes), 'window')}; in window {window}: {note['text']}"
-                    )
-                )
+                where = number_of(len(notes), "window")
+                restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
         if data["errors"]:
             window, error = next(iter(data["errors"].items()))
             failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
@@ -247,19 +225,9 @@ class StackManifest(Result, file_format="rsvib stack"):
         return "video" in self.settings or self._unit == "frames"
 
     @property
-    def _unit(self) -> str:
-        """What has a detection."""
+    def _unit(self) -> str:  # what has a detection
         followed = [record.followed is not None for record in self.windows]
         return "frames" if all(followed) else "windows or frames" if any(followed) else "windows"
-
-    def _has_no_tone(self) -> bool:
-        """Whether all windows were measured, and nothing else than missing tones is stated against any axis."""
-        codes = [
-            one.codes((axis,)) if one is not None else "failed"
-            for one in self.detections()
-            for axis in range(2 if one is None else one.vibration.num_axes)
-        ]
-        return bool(codes) and set(codes) == {"no_tone"}
 
     def detections(self) -> list[DetectedVibration | None]:
         """The detection of every window, or of every frame of a window that was followed; None where it failed."""
@@ -290,13 +258,11 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
             if i not in pairs:
                 tones.append([])
             tones[pairs.get(i, -1)].append((amplitude, frequency))
-    described = []
+    described: list[dict[str, Any]] = []
     for tone in tones:
-        entry: dict[str, Any] = {"windows": len(tone)}
+        described.append({"windows": len(tone), "first": tone[0][0], "last": tone[-1][0]})
         for name, values in zip(("amplitude", "frequency"), zip(*tone, strict=True), strict=True):
-            entry |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
-        entry |= {"first": tone[0][0], "last": tone[-1][0]}
-        described.append(entry)
+            described[-1] |= {name: median(values), f"{name}_spread": stdev(values) if len(values) > 1 else None}
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 
 
@@ -328,11 +294,9 @@ def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> dict[str
 def manifest_header(job: StackJob, output: str | None, compression: str | None) -> dict[str, Any]:
     """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
     given = None
-    if job.given is not None:
-        records = plain_values([detected and DetectedVibration.of(detected) for detected in job.given.values()])
-        given = hashlib.sha256(json.dumps(records).encode()).hexdigest()
-    elif job.motion is not None:
-        given = hashlib.sha256(json.dumps(plain_values(job.motion)).encode()).hexdigest()
+    if job.given is not None or job.motion is not None:
+        detected = [one and DetectedVibration.of(one) for one in (job.given or {}).values()]
+        given = hashlib.sha256(json.dumps(plain_values([*detected, job.motion])).encode()).hexdigest()
     header = {
         "input": {**fingerprint(job.source), "shape": list(job.info.shape), "dtype": job.info.dtype},
         "settings": {
@@ -379,17 +343,5 @@ def manifest_text(
 
 @checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
-    """Read the manifest of a complete run.
-
-    Args:
-        path: The ``manifest.json``.
-
-    Raises:
-        ValueError: If it is not a complete manifest.
-
-    Example:
-        >>> manifest = read_manifest("restored.tif.manifest.json")  # doctest: +SKIP
-        >>> manifest.detections()[0].vibration.frequency[:, 0].tolist()  # Hz, first window  # doctest: +SKIP
-        [110.0, 90.0]
-    """
+    """Read the ``manifest.json`` of a complete run."""
     return StackManifest.load(path)

@@ -22,17 +22,10 @@ _FINER = 4  # times that with scale=2; 3.5 measured for windows of 4 frames of 5
 
 
 def parse_memory(text: str | float) -> int:
-    """Number of bytes of a text like ``"2GB"``, ``"500 MB"`` or ``"1.5GiB"``.
-
-    Example:
-        >>> parse_memory("2GB"), parse_memory("1.5 GiB"), parse_memory(4096)
-        (2000000000, 1610612736, 4096)
-    """
+    """Number of bytes of a text like ``"2GB"``, ``"500 MB"`` or ``"1.5GiB"``."""
     match = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:([KMGT])(I?))?B?\s*", str(text).upper())
-    size = 0
-    if match is not None:
-        number, prefix, binary = match.groups()
-        size = int(float(number) * (1024 if binary else 1000) ** (" KMGT".index(prefix) if prefix else 0))
+    number, prefix, binary = ("0", None, None) if match is None else match.groups()
+    size = int(float(number) * (1024 if binary else 1000) ** (" KMGT".index(prefix or " ")))
     if size <= 0:
         raise ValueError(f"memory must be like '2GB' or '500MB', got {quoted(text)}")
     return size
@@ -97,18 +90,15 @@ def windows_at_once(
         origin = "" if memory is not None else " (three quarters of the memory that is free or used by this process)"
         frames = min(window, info.shape[0])
         fitting = next((smaller for smaller in range(frames - 1, 1, -1) if needed(smaller) <= limit), None)
+        remedy = "process smaller frames"
         if fitting is not None:
-            remedy = f"allow more (--memory), or process at most {fitting} frames at once (--window)"
+            remedy = f"process at most {fitting} frames at once (--window)"
         elif info.decoding_bytes > info.frame_bytes:
-            remedy = (
-                f"allow more (--memory), or store each frame separately: {size_text(info.decoding_bytes)} are needed "
-                "to decode frames that the file stores together"
-            )
-        else:
-            remedy = "allow more (--memory), or process smaller frames"
+            decoding = f"{size_text(info.decoding_bytes)} are needed to decode frames that the file stores together"
+            remedy = f"store each frame separately: {decoding}"
         raise ValueError(
             f"memory of {size_text(limit)}{origin} is too little: a window of {frames} frames of {info.shape[-2]} x "
-            f"{info.shape[-1]} px takes about {size_text(one)}; {remedy}"
+            f"{info.shape[-1]} px takes about {size_text(one)}; allow more (--memory), or {remedy}"
         )
     return int(min(most, count))
 

@@ -43,9 +43,6 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
     Yields:
         One ``WindowResult`` per window, in order.
 
-    Raises:
-        ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
-
     Example:
         >>> for result in iterate_stack("frames.tif", timing, window=3):  # doctest: +SKIP
         ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
@@ -67,12 +64,7 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
         options: Options.
 
     Raises:
-        OSError: If the stack cannot be read, or the manifest cannot be written.
-        ValueError: If a value is out of range, the stack is not readable, detection fails in all first windows, or
-            ``sink`` is a file of the stack.
-
-    Example:
-        >>> detect_stack("frames.tif", "manifest.json", timing)  # doctest: +SKIP
+        ValueError: If detection fails in all first windows, or ``sink`` is a file of the stack.
     """
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
@@ -87,10 +79,9 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
 def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessStackOptions) -> StackReport:
     """Restore a stack of any length from file to file.
 
-    The stack is cut into windows as in ``iterate_stack``. They depend only on the number of frames and ``window``, and
-    each is computed on one thread: results do not depend on memory, workers and scheduler. The output gets its name
-    when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from which an interrupted run
-    can be resumed. Memory does not grow with the number of frames.
+    The stack is cut into windows as in ``iterate_stack``; results do not depend on memory, workers and scheduler. The
+    output gets its name when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from
+    which an interrupted run can be resumed. Memory does not grow with the number of frames.
 
     Frames that cannot be read or used (constant, infinite, beyond full scale) are listed in the manifest; the other
     frames of their window are restored without them. A window in which the detection fails is written unchanged.
@@ -102,22 +93,16 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         timing: As in ``iterate_stack``.
         options: Options.
 
-    Returns:
-        Summary of the run.
-
     Raises:
         FileExistsError: If there is an interrupted run and ``resume`` is False.
-        ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
-        ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
-            detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
-            or versions differ from those of the run to resume, or its journal is damaged.
+        ValueError: If a window does not fit into the memory, detection fails in all first windows, an output is or
+            contains the input or lies inside it, or input, settings or versions differ from those of the run to resume.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, _ = example_frames(num_frames=4)
+        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
         >>> rsv.write_stack(f"{folder}/frames.npy", frames)
         >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}
@@ -138,7 +123,9 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             f"given has {len(given)} detections for {len(windows)} windows of at most {job.window} frames; "
             "pass one for each window"
         )
-    out = job.info.with_frames(len(windows) if job.joined else job.info.shape[0]).restored_as(job.scale, job.mosaic)
+    joined = job.chosen.joint is True
+    out = job.info.with_frames(len(windows) if joined else job.info.shape[0])
+    out = out.restored_as(job.chosen.scale, job.chosen.mosaic)
     out = job.content(out, timing)
     form = check_info_target(sink, out, compression, check_folder=False)
     first: WindowResult | None = None
@@ -151,7 +138,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
 
     def compute(folder: RunFolder) -> dict[str, Any]:
         remaining = [window for window in windows if window.index not in folder]
-        frames = len(remaining) if job.joined else sum(window.kept for window in remaining)
+        frames = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
         frames += out.shape[0] if compression is None and form.name in _UNCOMPRESSED else 0
         check_space(sink, frames * out.frame_bytes)
@@ -165,8 +152,13 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
         return {"not_kept": metadata_not_kept(job.info, sink, (folder.written, *out.shape[1:]))}
 
+    def stored(folder: RunFolder) -> Iterator[NDArray[Any]]:
+        for name in folder.files():
+            with folder.open(name) as file:
+                yield from np.load(file, allow_pickle=False)
+
     def write(folder: RunFolder) -> None:
-        write_frames(form, sink, out.with_frames(folder.written), _stored_frames(folder), compression)
+        write_frames(form, sink, out.with_frames(folder.written), stored(folder), compression)
 
     report = run_to_file(
         sink,
@@ -190,8 +182,7 @@ def _watched(
 ) -> Iterator[StoredWindow]:
     """The results of the remaining windows, while their frames are counted.
 
-    Raises:
-        ValueError: If detection has failed in every window so far (``errors`` before these); ``fail`` is called before.
+    If detection has failed in every window so far (``errors`` before these), ``fail`` is called, and it is an error.
     """
     total = windows[-1].last + 1
     done = total - sum(window.kept for window in remaining)
@@ -207,10 +198,3 @@ def _watched(
             done += window.kept
             if progress is not None:
                 progress(done, total)
-
-
-def _stored_frames(folder: RunFolder) -> Iterator[NDArray[Any]]:
-    """The frames of all windows in order."""
-    for name in folder.files():
-        with folder.open(name) as file:
-            yield from np.load(file, allow_pickle=False)

@@ -33,22 +33,12 @@ _CLOCK_ERROR = 1e-3  # of the ratio of two clocks; oscillators are within 1e-4
 
 
 def compared_pairs(count: int) -> list[int]:
-    """First frames of the pairs of neighbouring frames, of ``count``, by which a gyroscope is aligned.
-
-    Example:
-        >>> compared_pairs(4), len(compared_pairs(1000))
-        ([0, 1, 2], 48)
-    """
+    """First frames of the pairs of neighbouring frames, of ``count``, by which a gyroscope is aligned."""
     return sorted({int(index) for index in np.linspace(0, count - 2, _COMPARED_PAIRS)}) if count > 1 else []
 
 
 def compared_runs(count: int) -> list[slice]:
-    """Frames, of ``count``, by which a motion is aligned: all of a short stack, or several runs.
-
-    Example:
-        >>> compared_runs(40), compared_runs(1000)
-        ([slice(0, 40, None)], [slice(0, 16, None), slice(492, 508, None), slice(984, 1000, None)])
-    """
+    """Frames, of ``count``, by which a motion is aligned: all of a short stack, or several runs."""
     if count <= _RUNS * _RUN_FRAMES:
         return [slice(0, count)]
     firsts = np.linspace(0, count - _RUN_FRAMES, _RUNS).astype(int).tolist()
@@ -56,10 +46,7 @@ def compared_runs(count: int) -> list[slice]:
 
 
 def part_of_stack(source: Path, info: StackInfo, timing: SensorTiming, part: slice) -> tuple[Tensor, SensorTiming]:
-    """Some frames of a stack, as ``read_stack`` returns them, and the timing from the start of its first frame.
-
-    The full scale is that of ``info``.
-    """
+    """Some frames of a stack with the full scale of ``info``, and the timing from the start of its first frame."""
     check_stack_fits(info.with_frames(part.stop - part.start))
     starts = timing.frame_starts(info.shape[0])
     times = (starts[part] - starts[0]).tolist()
@@ -85,10 +72,6 @@ def align_stack(
     Angular rates are compared with 48 pairs of neighbouring frames over the whole stack, a motion with three runs of 16
     frames; of stacks that are not longer, all frames are used. ``info`` describes the stack, with its full scale;
     ``timing`` is that of the caller.
-
-    Raises:
-        OSError: If the stack cannot be read.
-        ValueError: As ``align_motion``.
     """
     timing = timing_from_first_frame(timing, info)
     if isinstance(recorded, AngularRates):

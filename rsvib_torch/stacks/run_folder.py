@@ -30,15 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.checks.arguments import check_fields
-from rsvib_torch.files.atomic import (
-    PART,
-    error_of_full_disk,
-    make_folder,
-    nearest_folder,
-    remove_abandoned,
-    sync,
-    whole_file,
-)
+from rsvib_torch.files import atomic
+from rsvib_torch.files.atomic import nearest_folder, sync
 from rsvib_torch.files.free_memory import size_text
 from rsvib_torch.files.outputs import check_outputs
 from rsvib_torch.io.stack_writing import stack_files
@@ -90,7 +83,7 @@ class RunFolder:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
         self._windows: dict[int, tuple[int, int, int]] = {}  # finished: place and size of the line; frames
         self._digest = b""  # of the last line of the journal
-        make_folder(self.path.parent)
+        atomic.make_folder(self.path.parent)
         while not self._open():
             pass
         with ExitStack() as opened:
@@ -121,17 +114,14 @@ class RunFolder:
             except OSError as error:
                 if error.errno in (errno.ELOOP, errno.ENOTDIR):
                     raise self._refusal("it is a link" if self.path.is_symlink() else "it is not a folder") from error
-                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # as those of some clusters
                     raise
-                warnings.warn(  # as those of some clusters
-                    f"{self.path}: the file system has no locks ({error.strerror}): start no other run with this "
-                    "output",
-                    stacklevel=2,
-                )
-            if self._has_its_name():
+                text = f"the file system has no locks ({error.strerror}): start no other run with this output"
+                warnings.warn(f"{self.path}: {text}", stacklevel=2)
+            keeps = self._has_its_name()  # otherwise another process has removed it
+            if keeps:
                 opened.pop_all()
-                return True
-            return False  # another process has removed it
+            return keeps
 
     def _has_its_name(self) -> bool:
         with suppress(FileNotFoundError):
@@ -190,15 +180,11 @@ class RunFolder:
             self._append(header)
             os.fsync(self._folder)
         for window in list(self._windows):
-            if not self._is_whole(window):
+            whole = False  # whether its files are those that were written
+            with suppress(OSError):
+                whole = all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
+            if not whole:
                 del self._windows[window]
-
-    def _is_whole(self, window: int) -> bool:
-        """Whether the files of a window are those that were written."""
-        try:
-            return all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
-        except OSError:
-            return False
 
     def _entry(self, window: int) -> dict[str, Any]:
         """The line of a window, which is not kept in memory."""
@@ -275,7 +261,7 @@ class RunFolder:
 
         It is renamed first: if the process is killed meanwhile, ``temporary_folder`` removes the rest later.
         """
-        hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{PART}")
+        hidden = self.path.with_name(f".{self.sink.name}.{secrets.token_hex(4)}{atomic.PART}")
         self._windows.clear()
         if self._has_its_name():
             self.path.rename(hidden)
@@ -305,7 +291,7 @@ def disk_errors_named(folder: RunFolder) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError) as error:
-        number = error_of_full_disk(error) or getattr(error, "errno", None)
+        number = atomic.error_of_full_disk(error) or getattr(error, "errno", None)
         if number is None and not isinstance(error, OSError):
             raise
         kept = f"; {folder.count} windows are complete, resume the run to continue" if folder.count else ""
@@ -329,12 +315,6 @@ class StackReport(Summarised):
         first: Result of the first window, if it was computed in this process.
         manifest: Path of the manifest.
         not_kept: Metadata of the input that the output does not contain.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> report = rsv.process_stack("frames.tif", "restored.tif", timing)  # doctest: +SKIP
-        >>> report.frames, report.windows, report.restored, report.failed  # doctest: +SKIP
-        (200, 28, 28, 0)
     """
 
     frames: int
@@ -358,12 +338,11 @@ class StackReport(Summarised):
             lines[0] += f", {self.seconds / self.frames:.2g} s per frame"
         if self.resumed:
             lines.append(f"windows complete before this run: {self.resumed}")
+        see = f"see {self.manifest.name}"
         if self.failed:
-            lines.append(
-                f"detection or restoration failed in {number_of(self.failed, 'window')}: see {self.manifest.name}"
-            )
+            lines.append(f"detection or restoration failed in {number_of(self.failed, 'window')}: {see}")
         if self.bad_frames:
-            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: see {self.manifest.name}")
+            lines.append(f"{number_of(self.bad_frames, 'frame')} could not be used: {see}")
         return "\n".join(lines)
 
 
@@ -407,15 +386,15 @@ def run_to_file(
         if difference:
             raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
         for path in (sink, manifest):
-            remove_abandoned(path)
+            atomic.remove_abandoned(path)
         return report(map(vars, complete.windows), windows, complete.not_kept)
     folder = RunFolder(sink, header, resume=options.resume)
     try:
         resumed = folder.count
         results = compute(folder)
         with disk_errors_named(folder):
-            make_folder(manifest.parent)
-            with whole_file(manifest) as part:
+            atomic.make_folder(manifest.parent)
+            with atomic.whole_file(manifest) as part:
                 part.write_text(manifest_text(header, folder.records(), **results), encoding="utf-8")
                 write(folder)
             sync(manifest.absolute().parent)  # the temporary folder is gone as well

@@ -33,23 +33,14 @@ _JUDGED_COLUMNS = 320  # with the most detail; the verdict itself takes 160 of t
 
 @dataclass(frozen=True, eq=False)
 class RestoredFrames:
-    """Result of ``restore_trusted``.
+    """Result of ``restore_trusted``."""
 
-    Attributes:
-        frames: Frames to write: restored, or as taken.
-        restored: Whether they are restored.
-        left_alone: A reason for each axis that was not restored.
-        verdict: Whether restoration helps; None if frames could not be compared.
-        moves: Whether there was a vibration to remove.
-        axes: Number of components of the motion: 2, 3 with roll, 4 with roll and zoom.
-    """
-
-    frames: Tensor
-    restored: bool
-    left_alone: tuple[Reason, ...]
-    verdict: RestorationVerdict | None
-    moves: bool
-    axes: int = 2
+    frames: Tensor  # to write: restored, or as taken
+    restored: bool  # whether they are restored
+    left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
+    verdict: RestorationVerdict | None  # whether restoration helps; None if frames could not be compared
+    moves: bool  # whether there was a vibration to remove
+    axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
 
     def restored_axes(self) -> list[str]:
         """Names of the axes that were restored."""
@@ -69,17 +60,9 @@ def restore_trusted(
 ) -> RestoredFrames:
     """Restore frames with a motion, or the reliable part of a detection, and judge whether that helps.
 
-    Args:
-        frames: Stack (T, H, W) or (T, C, H, W) whose full scale is 1; raw frames with option ``mosaic``.
-        timing: The sensor.
-        motion: The motion in image axes, or a detection in these frames.
-        options: Options of ``restore``.
-        force: Whether to return restored frames even if they are judged worse than the raw ones.
-        first_frames: Number of frames to restore; None for all.
-        most_pairs: Maximum number of pairs of frames to compare; None for all.
-
-    Returns:
-        Restored frames; the frames as taken if nothing moves, or if restoration makes them worse.
+    The full scale of the frames is 1; ``options`` are those of ``restore``. Only the ``first_frames`` are restored, and
+    at most ``most_pairs`` are compared. They are returned as taken if nothing moves, or, without ``force``, if
+    restoration makes them worse.
     """
     rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
     vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
@@ -128,19 +111,14 @@ def without_data(frames: Tensor, taken: Tensor) -> Tensor:
     return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
 
 
-def frame_fault(
-    frame: NDArray[Any],
-    index: int,
-    full_scale: float | None,
-    *,
-    nodata: float | None = None,
-    valid_fraction: float = 0.1,
-) -> str | None:
-    """Why a frame as stored cannot be used, or None; the fraction ``valid_fraction`` of its pixels must have data."""
+def frame_fault(frame: NDArray[Any] | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
+    """Why a frame as stored, or the error of reading it, cannot be used; None if it can be."""
+    if isinstance(frame, str):
+        return frame
     is_float = frame.dtype.kind == "f"
     valued = frame if nodata is None else frame[frame != frame.dtype.type(nodata)]
     valid = (valued.size - (int(np.isnan(valued).sum()) if is_float else 0)) / frame.size
-    if valid < valid_fraction:
+    if valid < 0.1:
         return f"frame {index} has only {valid:.1%} of pixels that count"
     if is_float and len(infinite := np.argwhere(np.isinf(frame))):
         place = tuple(int(i) for i in infinite[0])
@@ -178,11 +156,7 @@ def restore_followed(
     *,
     force: bool = False,
 ) -> tuple[RestoredFrames, tuple[int, ...]]:
-    """Restore the frames of a window, each with its own vibration, and judge whether that helps.
-
-    Returns:
-        The frames, and the numbers of those that are as taken.
-    """
+    """``restore_trusted`` of frames that each have their own vibration, and the numbers of those that are as taken."""
     chosen = RestorationOptions(**options)
     prepared = prepare_frames(frames, timing, saturation=chosen.saturation)
     restored, undone, left_alone = restore_each(prepared, followed, chosen)

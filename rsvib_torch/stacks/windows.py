@@ -49,15 +49,7 @@ class Window:
 def cut_windows(num_frames: int, window: int, margin: int = 0) -> list[Window]:
     """Cut a stack into windows of at most ``window`` frames, of equal length to within one frame.
 
-    They depend only on the arguments.
-
-    Args:
-        num_frames: Number of frames of the stack.
-        window: Maximum number of frames of a window, at least 2.
-        margin: Number of frames before and after each window that are read as well, if there are so many.
-
-    Returns:
-        Windows in order; a stack of up to ``window`` frames is one window.
+    As many frames as ``margin`` before and after each window are read as well, if there are so many.
 
     Example:
         >>> [(w.first, w.last, w.kept) for w in cut_windows(8, 4)]
@@ -68,17 +60,11 @@ def cut_windows(num_frames: int, window: int, margin: int = 0) -> list[Window]:
     count = -(-pairs // (window - 1))
     borders = [index * pairs // count for index in range(count + 1)]
     borders[-1] = num_frames - 1
-    return [
-        Window(
-            index,
-            first,
-            last,
-            last - first + (index == count - 1),
-            min(margin, first),
-            min(margin, num_frames - 1 - last),
-        )
-        for index, (first, last) in enumerate(itertools.pairwise(borders))
-    ]
+    windows = []
+    for index, (first, last) in enumerate(itertools.pairwise(borders)):
+        kept, around = last - first + (index == count - 1), (min(margin, first), min(margin, num_frames - 1 - last))
+        windows.append(Window(index, first, last, kept, *around))
+    return windows
 
 
 def window_timing(timing: SensorTiming, window: Window, frames: list[int]) -> SensorTiming:
@@ -119,13 +105,10 @@ def window_record(
     verdict: RestorationVerdict | None, bad_frames: Mapping[int, str], *, restored: bool, **known: Any
 ) -> dict[str, Any]:
     """Content of a ``WindowRecord`` as JSON, from a verdict and the other fields."""
-    record = {
-        **known,
-        "frames": "restored" if restored else "as taken",
-        "outcome": None if verdict is None else verdict.overall,
-        "summary": None if verdict is None else verdict.sentence,
-        "predicted_gain": None if verdict is None else verdict.predicted_gain.nanmean(),
-        "bad_frames": bad_frames,
-    }
+    record = {**known, "frames": "restored" if restored else "as taken", "bad_frames": bad_frames}
+    record |= {"outcome": None, "summary": None, "predicted_gain": None}
+    if verdict is not None:
+        gain = verdict.predicted_gain.nanmean()
+        record |= {"outcome": verdict.overall, "summary": verdict.sentence, "predicted_gain": gain}
     plain: dict[str, Any] = plain_values(record)
     return plain

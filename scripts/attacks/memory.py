@@ -34,10 +34,6 @@ tones = 1
 """
 
 
-def _write_yxt(path: Path, counts: Counts, **options: Any) -> None:
-    write_tiff(path, np.ascontiguousarray(np.moveaxis(counts, 0, -1)), metadata={"axes": "YXT"}, **options)
-
-
 def _write_fortran(path: Path, counts: Counts) -> None:
     np.save(path, np.asfortranarray(counts))
 
@@ -47,8 +43,6 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Counts], None]]] = {
     "TIFF, contiguous": ("a.tif", partial(write_tiff, contiguous=True)),
     "TIFF, pages, zlib": ("b.tif", partial(write_tiff, metadata={}, compression="zlib")),
     "TIFF, tiled, zlib": ("c.tif", partial(write_tiff, metadata={}, compression="zlib", tile=(64, 64))),
-    "TIFF, axes YXT": ("d.tif", _write_yxt),
-    "TIFF, axes YXT, zlib": ("e.tif", partial(_write_yxt, compression="zlib")),
     "npy, C order": ("f.npy", np.save),
     "npy, Fortran order": ("g.npy", _write_fortran),
     "HDF5, contiguous": ("h.h5", write_hdf5),

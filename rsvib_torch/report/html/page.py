@@ -76,6 +76,12 @@ class Edge:
         """Direction in which the edge measures sharpness: across it."""
         return "horizontal" if self.after.near_vertical else "vertical"
 
+    def row(self, restored: bool) -> list[str]:
+        """Line of the table of edges."""
+        before = "not measured" if self.before is None else measured_text(self.before.mtf50, self.before.mtf50_std)
+        after = measured_text(self.points * self.after.mtf50, self.points * self.after.mtf50_std)
+        return [_region(*self.box), self.direction, f"{self.after.angle:.1f}°", before, *([after] if restored else [])]
+
 
 def _grey(frame: Tensor) -> Tensor:
     """Frame (H, W) or (C, H, W) as grey (H, W), float64 on the CPU."""
@@ -106,10 +112,8 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
     points = after.shape[-1] // columns
     for top, left, height, width in boxes or ():
         if min(top, left) < 0 or min(height, width) < 1 or top + height > rows or left + width > columns:
-            raise ValueError(
-                f"edge {top},{left},{height},{width} (top, left, height, width) must be inside the frame of {rows} x "
-                f"{columns} px"
-            )
+            place = f"{top},{left},{height},{width} (top, left, height, width)"
+            raise ValueError(f"edge {place} must be inside the frame of {rows} x {columns} px")
     edges, notes = [], []
 
     def measured(frame: Tensor, box: Box, scale: int, where: str) -> MtfCurve | None:
@@ -127,24 +131,6 @@ def measure_edges(before: Tensor, after: Tensor, boxes: Sequence[Box] | None = N
         elif boxes is None:  # nobody asked for this edge
             notes.pop()
     return edges, notes
-
-
-def _edge_row(edge: Edge, restored: bool) -> list[str]:
-    """Line of the table of edges."""
-    before = "not measured" if edge.before is None else measured_text(edge.before.mtf50, edge.before.mtf50_std)
-    after = measured_text(edge.points * edge.after.mtf50, edge.points * edge.after.mtf50_std)
-    return [_region(*edge.box), edge.direction, f"{edge.after.angle:.1f}°", before, *([after] if restored else [])]
-
-
-def _mtf_drawings(edges: list[Edge], names: tuple[str, ...]) -> dict[str, Drawing]:
-    """Figures of the edges of each direction, by the name of their file."""
-    drawings = {}
-    for direction in sorted({edge.direction for edge in edges}):
-        chosen = [edge for edge in edges if edge.direction == direction]
-        before, after = [edge.before for edge in chosen if edge.before is not None], [edge.after for edge in chosen]
-        curves = dict(zip(names, (before, after), strict=False))
-        drawings[f"mtf_{direction}"] = drawing(plots.mtf_figure(curves, points={names[-1]: chosen[0].points}))
-    return drawings
 
 
 def _details(before: Tensor, after: Tensor, names: tuple[str, ...]) -> list[BeforeAfter]:
@@ -175,15 +161,12 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
         caption += ", and one image restored jointly from all frames"
     if pair.scale < 1:
         caption += f", reduced to {100 * pair.scale:.2g} %"
-    if pair.full is not None:
-        part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
-        caption += f". The magnifier shows {part}"
+    if (full := pair.full) is not None:
+        caption += f". The magnifier shows {_region(full.top, full.left, full.height, full.width)}"
     (black, white), (low, high) = pair.levels, PERCENTILES
-    caption += (
-        f". Grey levels are stretched: black is {black:.3f} and white {white:.3f} of full scale, the percentiles "
-        f"{low:g} and {high:g}{' of both images' if len(frames) > 1 else ''}."
-    )
-    return replace(pair, caption=caption)
+    levels = f"black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} and {high:g}"
+    both = " of both images" if len(frames) > 1 else ""
+    return replace(pair, caption=f"{caption}. Grey levels are stretched: {levels}{both}.")
 
 
 def frames_in_turn(report: Report, index: int, image_motion: Tensor, size: int = 480) -> Blink | None:
@@ -221,10 +204,8 @@ def frames_in_turn(report: Report, index: int, image_motion: Tensor, size: int =
         shift = f"{-moved[0]} px along x and {-moved[1]} px along y"
         caption += f" Frame {number + 1} is moved by {shift}, the uniform motion."
     if len(frames) > 1:
-        caption += (
-            " The motion between the input frames is the vibration; it is absent from the restored frames where "
-            "restoration is right."
-        )
+        caption += " The motion between the input frames is the vibration"
+        caption += "; it is absent from the restored frames where restoration is right."
     return blink(pairs, names=names, frames=(number, number + 1), caption=caption)
 
 
@@ -259,8 +240,13 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     shown = (before,) if after is None else (before, after)
     names = ("input", "restored")[: len(shown)]
     measured, notes = measure_edges(_grey(before), _grey(detail), edges)
-    figures = _mtf_drawings(measured, names)
+    figures: dict[str, Drawing] = {}
     detected: dict[str, Any] = {"tried": [], "residuals": []}
+    for direction in sorted({edge.direction for edge in measured}):
+        chosen = [edge for edge in measured if edge.direction == direction]
+        curves = [[one.before for one in chosen if one.before is not None], [one.after for one in chosen]]
+        of_names = dict(zip(names, curves, strict=False))
+        figures[f"mtf_{direction}"] = drawing(plots.mtf_figure(of_names, points={names[-1]: points}))
     restored = report.was_restored
     shape = report.frames.shape
     if result is None:
@@ -294,7 +280,6 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         windows = {"lines": lines, "table": report.windows.tone_table()}
         if report.windows.gyroscope is None:  # no tones are searched for otherwise
             figures["windows"] = drawing(plots.windows_figure(report.windows.times(), report.windows.detections()))
-    mtf_head = ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)]
     content = {
         "report": report,
         "title": report.title,
@@ -307,8 +292,8 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "details": [] if after is None else _details(before, detail, names),
         "figures": figures,
         "windows": windows,
-        "mtf_head": mtf_head,
-        "mtf_rows": [_edge_row(edge, restored) for edge in measured],
+        "mtf_head": ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)],
+        "mtf_rows": [edge.row(restored) for edge in measured],
         "mtf_notes": notes,
         "camera": words.camera_rows(timing, shape),
         "about": words.about_rows(report.created, report.version, report.command, report.options if restored else {}),

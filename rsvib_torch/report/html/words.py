@@ -168,12 +168,10 @@ def tried_sentences(
 
 def about_rows(created: datetime, version: str, command: str | None, options: Table) -> list[list[str]]:
     """Lines of the table of the report itself: when and how it was made."""
-    rows = [["created", created.isoformat(" ", "seconds")], ["program", f"rsvib_torch {version}"]]
-    if command is not None:
-        rows.append(["command", command])
-    if options:
-        rows.append(["restored with", ", ".join(f"{name} = {value}" for name, value in options.items())])
-    return rows
+    chosen = ", ".join(f"{name} = {value}" for name, value in options.items())
+    rows = {"created": created.isoformat(" ", "seconds"), "program": f"rsvib_torch {version}"}
+    rows |= {"command": command or "", "restored with": chosen}
+    return [[name, text] for name, text in rows.items() if text]
 
 
 def _sentence(text: str) -> str:
