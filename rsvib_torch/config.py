@@ -29,7 +29,7 @@ class Config:
     detection: dict[str, Any]  # options of ``detect_vibration`` that are in the file
     restoration: dict[str, Any]  # options of ``restore`` that are in the file
     simulation: Any  # ``[simulation]``, of the class ``simulation_section``; None if it is not in the file
-    stack: dict[str, Any]  # options ``window`` and ``bad_frames`` of ``process_stack`` that are in the file
+    stack: dict[str, Any]  # options ``window``, ``follow`` and ``bad_frames`` of ``process_stack`` that are in the file
     # options of the program that describe the camera, for the commands that it suggests
     arguments: tuple[str, ...] = ()
     path: Path | None = None  # the file; None if the camera is described by options only
@@ -113,7 +113,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     * ``[restoration]``: options of ``restore``, with ``saturation`` in the unit of the frames' file.
     * ``[simulation]``: ``num_frames``, ``frame_size``, ``seed``, ``[simulation.vibration]`` (fields of ``Vibration``)
       and ``[simulation.noise]`` (fields of ``SensorNoise``).
-    * ``[stack]``: ``window`` and ``bad_frames`` of ``process_stack``.
+    * ``[stack]``: ``window``, ``follow`` and ``bad_frames`` of ``process_stack``.
 
     Args:
         path: The TOML file; None if ``sensor`` describes the camera.

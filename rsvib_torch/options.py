@@ -1,11 +1,11 @@
-"""All options of detection, restoration and stacks, in groups.
+"""Options of detection, restoration and stacks, in groups.
 
 A field of a group, with the text below it, is the only statement of an option: arguments of public functions, keys of
 configuration files, options of the commands, their checks, help texts and reference pages follow from it. To add an
 option, add a field, and use it where the group is used.
 
 Configuration files and command lines are checked before torch is imported, which takes seconds. This module therefore
-imports no other part of the package. The tables of the packages hold the functions that belong to the names.
+imports only their checks. The tables of the packages hold the functions that belong to the names.
 """
 
 import os

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rsvib_torch import detection, stacks
+from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
@@ -105,6 +105,12 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
 def next_step(sentence: str, *command: object) -> str:
     """A step: a sentence, and the command that does it, which can be copied into a shell."""
     return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
+
+
+def run_step(frames: Path, out: Path, arguments: Sequence[str]) -> str:
+    """The step to detect and restore; a video is followed frame by frame."""
+    video = ["--video"] * io.is_video(frames)
+    return next_step("detect the vibration and restore the frames", "run", frames, out, *arguments, *video)
 
 
 def steps_after_detection(

@@ -10,8 +10,8 @@ Only ``diagnosis``, which it calls, makes further attempts, with other timings.
 4. If the tones of the translation do not explain the rows: another timing (``diagnosis``), which then is the reason
    against the axes. The vibration is that of the stated timing.
 
-The findings of an attempt (``pipeline``) decide whether the next hypothesis is tried, and its status whether it is
-accepted.
+The findings of an attempt (``pipeline``) decide whether the next hypothesis is tried, and whether it was abandoned,
+whether it is accepted.
 """
 
 from dataclasses import dataclass, replace
@@ -76,7 +76,7 @@ def detect_tones(
             translation=translation.fit,
         )
         rotation = attempt(stacks, row_timing, options, hypothesis)
-        if requested or any(status != "abandoned" for status in rotation.statuses):  # parallax otherwise
+        if requested or not rotation.abandoned.all():  # parallax otherwise
             axes = _moving_axes(rotation, field.least_axes)
             if requested or axes > 2:
                 return assembled_attempt(rotation, timing, num_frames).with_axes(axes)

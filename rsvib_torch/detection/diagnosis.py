@@ -165,7 +165,7 @@ def _diagnosis(
         other = attempt(turned, candidate.in_row_order(), found.options, hypothesis)
         concerned = axes if candidate.scan_axis == timing.scan_axis else axes[::-1]
         refused = any(against and axis for against, axis in zip(other.findings[0], concerned, strict=True))
-        if other.statuses[0] != "abandoned" and not refused:
+        if not other.abandoned[0] and not refused:
             return _between(timing, candidate)
     return None
 

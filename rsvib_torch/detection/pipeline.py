@@ -1,7 +1,7 @@
 """One attempt to detect the vibration of B stacks, under one hypothesis on the motion and the timing.
 
 ``attempt`` reads from top to bottom: start, fit, uncertainty, verdict. It works in row order, with all components of
-the motion in px. It does not raise an error if the hypothesis is wrong, but returns a status for each stack.
+the motion in px. It does not raise an error if the hypothesis is wrong, but states for which stacks.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -9,7 +9,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -40,8 +39,6 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequenc
 from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
-
-Status = Literal["converged", "not converged", "abandoned", "not visible"]
 
 
 @dataclass(frozen=True)
@@ -89,10 +86,6 @@ class Fitted:
 class Attempt:
     """What an attempt found, for B stacks in row order."""
 
-    # for each stack, ``"converged"`` (always for bands); ``"not converged"``: the rounds ended before, and what the
-    # last ones changed counts as an error; ``"abandoned"``: the hypothesis is wrong; ``"not visible"``: no row was
-    # measured
-    statuses: tuple[Status, ...]
     options: DetectionOptions  # the options
     scale: FieldScale  # components of the motion
     start: BandStart  # offsets of the row bands
@@ -108,6 +101,18 @@ class Attempt:
     def has_pattern(self) -> bool:
         """Whether a pattern of columns was subtracted."""
         return self.fitted.refined is not None and self.fitted.refined.has_pattern
+
+    @property
+    def abandoned(self) -> Array:
+        """(B,) bool, stacks for which the hypothesis is wrong."""
+        refined = self.fitted.refined
+        return np.zeros_like(self.fit.centre, dtype=bool) if refined is None else refined.abandoned
+
+    @property
+    def visible(self) -> Array:
+        """(B,) bool, stacks of which rows or bands were measured."""
+        refined = self.fitted.refined
+        return np.ones_like(self.fit.centre, dtype=bool) if refined is None else refined.other_motion.measured > 0
 
 
 def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hypothesis: Hypothesis) -> Attempt:
@@ -168,7 +173,6 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         against = zip(scene_reasons(start.curve, scale.width), findings, strict=True)
         findings = tuple(with_reasons_of_all(of_scene, of_stack) for of_scene, of_stack in against)
     return Attempt(
-        statuses=_statuses(fitted),
         options=options,
         scale=scale,
         start=start,
@@ -180,23 +184,6 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         findings=findings,
         interval=float(intervals[0]),
     )
-
-
-def _statuses(fitted: Fitted) -> tuple[Status, ...]:
-    """Status of each stack."""
-    refined = fitted.refined
-    statuses: list[Status] = ["converged"] * len(fitted.fit.centre)
-    if refined is None:
-        return tuple(statuses)
-    of_stacks = zip(refined.converged, refined.other_motion.measured > 0, refined.abandoned, strict=True)
-    for index, (converged, measured, abandoned) in enumerate(of_stacks):
-        if abandoned:
-            statuses[index] = "abandoned"
-        elif not measured:
-            statuses[index] = "not visible"
-        elif not converged:
-            statuses[index] = "not converged"
-    return tuple(statuses)
 
 
 def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:

@@ -87,9 +87,12 @@ def assumptions(
         return ()
     sentences = []
     if timing.frame_start_times is None:
+        # two frames show frequencies relative to the row time, more frames relative to the frame rate
+        row, rate = f"row_time={timing.row_time:g} s", f"{timing.frame_rate:.4g}"
         sentences.append(
-            f"row_time={timing.row_time:g} s; frequencies scale inversely with it, or differ by multiples of "
-            f"{timing.frame_rate:.4g} Hz"
+            f"{row}; frequencies scale inversely with it, or differ by multiples of {rate} Hz"
+            if num_frames == 2
+            else f"{rate} frames/s; frequencies scale with it; a wrong {row} adds multiples of it"
         )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
         sentences.append(

@@ -152,6 +152,7 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
+_MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
 _FOLLOW = "use follow_vibration if the vibration changes"
 _TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
@@ -172,7 +173,7 @@ _TONES = {
     ),
     "no_tone": ReasonKind(
         "no significant tone: the offsets are those of a uniform motion, or below their noise",
-        "use more frames if a vibration is expected",
+        _MAY_BE_STILL,
     ),
     "too_many_tones": ReasonKind(
         "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
@@ -187,7 +188,7 @@ _TONES = {
     "tone_not_significant": _px(
         "tone of {frequency:.4g} Hz is not significant: its amplitude is {value:.3g} ± {std:.2g} px, and 4 standard "
         "deviations, {limit:.3g} px, are needed",
-        _MORE_FRAMES,
+        _MAY_BE_STILL,
         "amplitude of the only tone, below 4 standard deviations",
     ),
     "tone_too_small": _px(
@@ -255,10 +256,10 @@ _TONES = {
         "with roll or zoom: rms difference between strips of columns, above 0.035 px and 0.9 % of the rms offsets",
     ),
     "blur_contradicts_exposure": _of_all_axes(
-        "the difference of the blur between frames is {value:.2g} times the value expected for an exposure of "
+        "the difference of the blur between frames is {value:.3g} times the value expected for an exposure of "
         "{exposure_rows:g} rows, the limit is {limit:g}",
         "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
-        "determine the motion",
+        "determine the motion[; the compression of a {compressed}, which makes frames alike, is another cause]",
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
     ),
     "bands_unexplained": _px(

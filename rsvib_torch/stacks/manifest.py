@@ -155,7 +155,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         for name, of_axis in self.totals()["tones"].items():
             for tone in of_axis["tones"] or [{"windows": 0}]:
                 texts = [
-                    measured_text(tone[quantity], tone[f"{quantity}_spread"]) if tone["windows"] else ""
+                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None) if tone["windows"] else ""
                     for quantity in ("amplitude", "frequency")
                 ]
                 if unit != "windows" and tone["windows"]:
@@ -194,8 +194,8 @@ class StackManifest(Result, file_format="rsvib stack"):
             which = "" if len(followed) == len(self.windows) else " of the windows that were followed"
             restoration.append(f"{count} of {sum(record.written for record in followed)} frames{which} restored")
         if data["predicted_gain_db"] is not None:
-            low, high = data["predicted_gain_db"].values()
-            restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
+            gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
+            restoration.append(f"estimated improvement {' … '.join(gains)} dB")
         # All windows were measured, and nothing else than missing tones is stated against any axis.
         codes = {
             "failed" if one is None else one.codes((axis,))
@@ -216,6 +216,11 @@ class StackManifest(Result, file_format="rsvib stack"):
             failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
             vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether the vibration was followed from frame to frame in all windows, or in a video."""
+        return "video" in self.settings or self._unit == "frames"
 
     @property
     def _unit(self) -> str:  # what has a detection

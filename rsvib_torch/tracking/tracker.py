@@ -411,7 +411,7 @@ class VibrationTracker:
         started = state
         for method, number in _STARTS[:1] if only_bands else _STARTS:
             found = attempt(stacks, timing, DetectionOptions(method, number, model, _BANDS), hypothesis)
-            if scene_reasons(found.start.curve, stacks.images.shape[-1])[0] or found.statuses[0] == "not visible":
+            if scene_reasons(found.start.curve, stacks.images.shape[-1])[0] or not found.visible[0]:
                 break
             # Tones that the last frame contradicts are not used: without tones, the path is followed at least.
             plausible = _plausible(found)
