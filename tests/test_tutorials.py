@@ -48,9 +48,10 @@ def test_satellite(pages, tmp_path):
 def test_video(pages, tmp_path):
     names = run(pages, "video.md", tmp_path)
     assert not rsv.read_vibration(tmp_path / "blind" / "vibration.json", names["timing"]).reliable[1]
-    assert rsv.psnr(names["restored"][:, 1], names["still"], 1.0, rim=16).mean() > 33
-    found = rsv.read_vibration(tmp_path / "results" / "vibration.json", names["timing"])
-    torch.testing.assert_close(found.vibration.amplitude[:, 0], torch.tensor([2.4, 1.7]).double(), rtol=0, atol=0.03)
+    manifest = rsv.read_manifest(tmp_path / "results" / "manifest.json")
+    assert all(after < 0.1 * before for before, after in manifest.shaking.values())
+    found = manifest.detections()[0]
+    torch.testing.assert_close(found.vibration.amplitude[:, 0], torch.tensor([2.4, 1.7]).double(), rtol=0, atol=0.1)
     torch.testing.assert_close(found.vibration.frequency[:, 0], torch.tensor([47.0, 73.0]).double(), rtol=0, atol=0.1)
     for name, reliable in (("wrong", [False, False]), ("blind", [True, False])):
         assert json.loads((tmp_path / name / "vibration.json").read_text())["reliable"] == reliable

@@ -65,8 +65,7 @@ class ImageMotion:
             motion = ColumnMotion.of_columns(motion, last, self.timing, 1, self.size[0])
         count = gauss_node_count(motion, float(self.exposure_time.amax()))
         nodes, weights = (tensor.to(starts.device) for tensor in gauss_legendre(count))
-        times = starts[..., None] + nodes * self.exposure_time[:, None, None]
-        return self.vibration.displacement(times), weights
+        return self.vibration.displacement(starts[..., None] + nodes * self.exposure_time[:, None, None]), weights
 
     def mean_displacement(self, rows: Tensor) -> Tensor:
         """Mean components (B, S, 4) over the exposures of frame rows (B, S) (Eq. 2); missing ones are 0."""
@@ -115,8 +114,7 @@ class ImageMotion:
         x = strips.columns.to(components.device).repeat(len(self.starts))[:, None, None]
         rows = torch.arange(self.size[0], dtype=torch.float64, device=components.device)[:, None]
         across, roll, zoom = components[..., 1:].unbind(-1)
-        y = (rows - 0.5 * (self.size[0] - 1) - across - roll * x) / (1.0 + zoom)
-        return displacement_at(components, x, y)
+        return displacement_at(components, x, (rows - 0.5 * (self.size[0] - 1) - across - roll * x) / (1.0 + zoom))
 
     def move_masks(self, masks: Tensor) -> Tensor:
         """Labels (B, C, R, W) moved by the mean displacement of their rows, to the nearest pixel."""

@@ -232,8 +232,7 @@ def _adapter(kind: object, finite: bool) -> tuple[TypeAdapter[Any] | None, tuple
     made_by_function = any(np.ndarray in (member, get_origin(member)) for member in members) and len(members) > 1
     if made_by_function or any(getattr(member, "_is_protocol", False) for member in members):
         return None, members
-    config = ConfigDict(strict=True, allow_inf_nan=not finite)
-    return TypeAdapter(_bounded(kind, finite), config=config), members
+    return TypeAdapter(_bounded(kind, finite), config=ConfigDict(strict=True, allow_inf_nan=not finite)), members
 
 
 def _bounded(kind: Any, finite: bool) -> Any:  # noqa: PLR0911

@@ -242,8 +242,7 @@ class _Mistake:
         """The exception."""
         if self.known:
             return TypeError(f"unknown option {quoted(self.path)}; the options are {', '.join(self.known)}")
-        error = self.kind(self.text or f"{self.path} {self._problem} {described(self.value)}")
-        return self.named(error)
+        return self.named(self.kind(self.text or f"{self.path} {self._problem} {described(self.value)}"))
 
     def named(self, error: Error) -> Error:
         """An error with the argument that this mistake is about, for the options of commands."""
@@ -337,8 +336,7 @@ def _items(annotation: object, index: int) -> Iterator[object]:
     """Types that an entry of a list or tuple may have."""
     for member in members_of(annotation):
         if get_origin(member) in (list, tuple, Sequence):
-            several = get_origin(member) is tuple and ... not in get_args(member)
-            yield get_args(member)[index if several else 0]
+            yield get_args(member)[index if get_origin(member) is tuple and ... not in get_args(member) else 0]
 
 
 def _keys(annotation: object) -> dict[str, object]:
@@ -380,8 +378,7 @@ def read_json(path: Path, what: str) -> Table:
         raise ValueError(f"{name} is not a JSON number")
 
     try:
-        text = read_text(path, at_most=_MAX_JSON_BYTES)
-        data = json.loads(text, parse_constant=refuse)
+        data = json.loads(read_text(path, at_most=_MAX_JSON_BYTES), parse_constant=refuse)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a {what}: {error}") from error
     if not isinstance(data, dict):

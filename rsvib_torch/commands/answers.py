@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rsvib_torch import detection, stacks
+from rsvib_torch import detection, io, stacks
 from rsvib_torch import report as reports
 from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.reading import Table
@@ -107,14 +107,19 @@ def next_step(sentence: str, *command: object) -> str:
     return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
 
 
+def run_step(frames: Path, out: Path, arguments: Sequence[str]) -> str:
+    """The step to detect and restore; a video is followed frame by frame."""
+    video = ["--video"] * io.is_video(frames)
+    return next_step("detect the vibration and restore the frames", "run", frames, out, *arguments, *video)
+
+
 def steps_after_detection(
     result: detection.DetectionResult | None, frames: Path, settings: Config, vibration: Path | None = None
 ) -> list[str]:
     """What to do after a detection (None for windows): restore with the file ``vibration``, or try another model."""
     steps = []
     if vibration is not None and (result is None or bool(result.reliable.any())):
-        target = frames.with_name("restored.tif")
-        restore = ("restore", frames, target, *settings.arguments, "--vibration", vibration)
+        restore = ("restore", frames, frames.with_name("restored.tif"), *settings.arguments, "--vibration", vibration)
         steps.append(next_step("restore the frames", *restore))
     reasons = [] if result is None else [reason for of_axis in result.findings for reason in of_axis]
     if any(reason.kind.free_model for reason in reasons):

@@ -14,7 +14,7 @@ import typer
 
 from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
-from rsvib_torch.commands.answers import next_step
+from rsvib_torch.commands.answers import run_step
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_exposure, stated_rate
 from rsvib_torch.commands.terminal import Answer, note, warn, working
@@ -90,8 +90,7 @@ def init(given: InitOptions) -> Answer:
     text = presets()[preset] if preset is not None else _describe_camera(Path(frames or ""), sensor, camera)
     with whole_file(out) as file:
         file.write_text(text, encoding="utf-8")
-    run = ("run", frames or "FRAMES", "results", "--config", out)
-    return Answer({}, {}, [out], [next_step("detect the vibration and restore the frames", *run)])
+    return Answer({}, {}, [out], [run_step(frames or Path("FRAMES"), Path("results"), ["--config", str(out)])])
 
 
 @options

@@ -129,10 +129,8 @@ def live_session(given: LiveOptions) -> Answer:
         steadied: Table = {"steady": given.steady, "wobble": given.steady > 0}
         tracker = tracking.VibrationTracker(settings.timing, **chosen, **steadied, full_scale=scale)
         limits: Table = {"drops": drops, "waiting": given.waiting, "max_frames": given.num_frames}
-        progress = _state_text(shown[0]) if shown else None
-        sinks: Table = {"spectrogram": spectrogram, "progress": progress, "save": save}
-        border = video.VideoBorder(given.border)
-        report = video.run_live(source, tracker, outputs, border=border, **limits, **sinks)
+        sinks: Table = {"spectrogram": spectrogram, "progress": _state_text(shown[0]) if shown else None, "save": save}
+        report = video.run_live(source, tracker, outputs, border=video.VideoBorder(given.border), **limits, **sinks)
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
     slow = "dropped, because processing was too slow (fewer --columns)"

@@ -185,9 +185,8 @@ def known(given: KnownOptions) -> Answer:
     else:
         placed = recorded.retimed(given.offset)
         starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
-        last = (
-            float(starts[-1] - starts[0]) + info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-        )
+        readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
+        last = float(starts[-1] - starts[0]) + readout
         if placed.start > 1e-9 or placed.end < last - 1e-9:  # s; rounding of the offset
             needed = f"the frames need {given.offset:.6g} to {given.offset + last:.6g} s"
             raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
@@ -201,8 +200,7 @@ def known(given: KnownOptions) -> Answer:
     of_run = given.of_stack(scale, options) | {"force": given.force, "motion": placed, "manifest": manifest}
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
-        show = progress if counts else None
-        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=show)
+        run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=progress if counts else None)
     note_lost(given.restored, run.not_kept)
     stored, first = stacks.read_manifest(manifest), None if run.first is None else run.first.restoration
     if run.windows == 1 and first is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +12,7 @@ from rsvib_torch.commands import answers
 from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
-from rsvib_torch.commands.stack_commands import print_notes
+from rsvib_torch.commands.stack_commands import print_notes, read_frame
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.files.reading import Table
@@ -22,7 +21,6 @@ from rsvib_torch.text import number_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from torch import Tensor
 
 
 _RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
@@ -87,28 +85,24 @@ def run(given: RunOptions) -> Answer:
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
     if given.require_reliable and "gyroscope" in given.moved:
-        raise ValueError(
-            "--require-reliable does not go with --gyroscope, which searches for no tones; leave one of them out"
-        )
-    is_video = False
+        problem = "does not go with --gyroscope, which searches for no tones; leave one of them out"
+        raise ValueError(f"--require-reliable {problem}")
     if given.video:
-        from rsvib_torch.io.stack_info import H264, VIDEO, split_range  # noqa: PLC0415 - loads PyTorch
+        from rsvib_torch.io.stack_info import H264, split_range  # noqa: PLC0415 - loads PyTorch
 
         if output != "restored.tif":
             raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
         ending = split_range(frames)[0].suffix.lower()
-        is_video = ending in VIDEO
         output = f"restored{ending if ending in H264 else '.mkv'}"
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    replaces = given.overwrite or "resume" in given.processing
-    written.check_folder(out, _RESULTS, replaces, given.inputs, out / output)
+    written.check_folder(out, _RESULTS, given.overwrite or "resume" in given.processing, given.inputs, out / output)
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
     common = given.of_stack(scale, restoration)
     # videos of more than one window are followed from frame to frame
-    if given.moved or (is_video and info.shape[0] > chosen.window):
+    if given.moved or (given.video and io.is_video(frames) and info.shape[0] > chosen.window):
         answer = _run_followed(given, out / output, common)
     else:
         answer = _run_windows(given, out / output, info, common, chosen)
@@ -156,6 +150,8 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
             answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     if result.restored:
         steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
+    if not given.video and io.is_video(frames) and result.restored < result.windows:
+        steps.insert(0, answers.run_step(frames, out / "followed", settings.arguments))
     answer.next_steps += steps
     answer.files += [out / name for name in names]
     return answer
@@ -167,22 +163,13 @@ def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) ->
     from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
 
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
-    raw = _frame(given.stack, index, common["full_scale"])
+    raw = read_frame(given.stack, index, common["full_scale"])
     pattern = common["restoration"].get("mosaic")
     if pattern is not None:
         raw = colour_frames(raw[None], pattern)[0]
     raw = enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
     names = ("input", "restored" if first.restored else "unchanged")
     return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
-
-
-def _frame(path: Path, index: int, full_scale: float | None) -> Tensor:
-    """A frame of a stack, with 0 for missing pixels."""
-    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
-
-    with closing(io.open_stack(path)) as reader:
-        scale, pixels = full_scale or reader.info.full_scale, reader.frame(index)[None]
-    return counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
 
 
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
@@ -193,10 +180,8 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     changed = [name for name in of_windows if stated.get(name) is True or stated.get(name) not in _USUAL]
     refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
     if refused:
-        raise ValueError(
-            f"{refused} cannot be used with --video, which follows the frames one by one; give --output restored.mp4 "
-            "instead of --video, which processes windows"
-        )
+        remedy = "give --output restored.mp4 instead of --video, which processes windows"
+        raise ValueError(f"{refused} cannot be used with --video, which follows the frames one by one; {remedy}")
     if {**settings.restoration, **given.restoration}.get("saturation") is None:
         restoration.pop("saturation", None)  # that of integer formats
     manifest = out / "manifest.json"
@@ -207,9 +192,9 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     index = min(8, io.read_stack_info(frames).shape[0] // 2)  # earlier ones must be decoded as well
 
     def comparison() -> Figure:
-        raw = _frame(frames, index, stored.settings["full_scale"])
+        raw = read_frame(frames, index, stored.settings["full_scale"])
         raw = raw if stored.margins is None else video.Margins(**stored.margins).cut(raw)
-        return reports.comparison_figure(raw, _frame(restored, index, None))
+        return reports.comparison_figure(raw, read_frame(restored, index, None))
 
     drawn = written.draw_safely(out / "before_after.png", comparison)
     with whole_folder(out) as folder:

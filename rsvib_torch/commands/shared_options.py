@@ -158,9 +158,8 @@ class CameraOptions:
             if "exposure_time" in sensor and "frame_rate" not in sensor:
                 frame_rate = stated_rate(io.read_stack_info(frames))
                 if frame_rate is not None:
-                    note(
-                        f"frame rate {frame_rate:.6g} per second, from the times in {frames}; --frame-rate replaces it"
-                    )
+                    source = f"from the times in {frames}; --frame-rate replaces it"
+                    note(f"frame rate {frame_rate:.6g} per second, {source}")
                     sensor = sensor | {"frame_rate": frame_rate}
         missing = [option for name, option in _TIMES.items() if name not in sensor]
         if self.config is None and missing:
@@ -314,10 +313,8 @@ def full_scale_of(path: Path, info: "StackInfo", config: Config, option: float |
     if info.full_scale is None:
         return config.full_scale
     if info.dtype != "uint8" and config.full_scale not in (None, info.full_scale):
-        raise ValueError(
-            f"{path}: the full scale is {info.full_scale:g} in the file and {config.full_scale:g} in the "
-            "configuration; choose one with --full-scale"
-        )
+        stated = f"{info.full_scale:g} in the file and {config.full_scale:g} in the configuration"
+        raise ValueError(f"{path}: the full scale is {stated}; choose one with --full-scale")
     return info.full_scale
 
 

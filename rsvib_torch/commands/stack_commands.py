@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
@@ -57,6 +58,15 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     times = io.exposure_times(info, config.timing)
     info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
     return Stack(frames.to(given.torch_device), info, timing)
+
+
+def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
+    """A frame of a stack, with 0 for missing pixels."""
+    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
+
+    with closing(io.open_stack(path)) as reader:
+        scale, pixels = full_scale or reader.info.full_scale, reader.frame(index)[None]
+    return counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -122,12 +132,11 @@ def simulate(given: SimulateOptions) -> Answer:
         stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
     line = f"{len(simulated)} frames of {simulated.shape[-2]} x {simulated.shape[-1]} px, {dtype}"
-    run = ("run", frames, frames.with_name("results"), *settings.arguments)
     return Answer(
         {"Simulated frames": [line, f"vibration:\n{vibration}"]},
         {"shape": list(simulated.shape), "dtype": dtype, "vibration": vibration.to_dict()},
         [frames],
-        [answers.next_step("detect the vibration and restore the frames", *run)],
+        [answers.run_step(frames, frames.with_name("results"), settings.arguments)],
     )
 
 
@@ -300,7 +309,8 @@ class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
     edge: list[str] | None = option(None, metavar="EDGE", show_default="edges are searched for")
     """Slanted edge to measure: TOP,LEFT,HEIGHT,WIDTH in px; may be given several times."""
     manifest: Path | None = None
-    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows."""
+    """The manifest.json of rsvib run or detect with windows: draw amplitude and frequency over the windows. The page of
+    a run that followed the vibration shows the frames of that run, and detects nothing anew."""
     force: bool = False
     """Show the restored frames even if they are judged no better than the input."""
 
@@ -308,23 +318,21 @@ class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
 def report(given: ReportOptions) -> Answer:
     """Detect, restore, and write an HTML page with all figures.
 
-    Detection, restoration and verdict are those of rsvib run. The page is one file that needs no network. The
-    figures are also written as PNG files.
+    Detection, restoration and verdict are those of rsvib run. The page needs no network; figures are also PNG files.
     """
     settings, frames, out = given.settings, given.stack, given.out
-    boxes = [_edge_box(text) for text in given.edge or []]
+    list(map(_edge_box, given.edge or ()))  # errors before anything is computed
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
     written.check_folder(out, ["report.html"], given.overwrite, inputs)
     _, _, options = given.planned_restoration(given.restoration)
+    if given.manifest is not None and windows is not None and windows.output is not None and windows.is_followed:
+        made = given.manifest.with_name(windows.output["name"])
+        if windows.totals()["restored"] and made.exists():
+            return _report_of_run(given, windows, made)
     stack = load(given, options)
     detection = _detect(stack, settings)
-    followed = None if windows is None else windows.followed()
-    if followed is not None and len(followed.times) == len(stack.frames):
-        with working("restoring and judging"):
-            result = stacks.restore_followed(stack.frames, stack.timing, followed, options, force=given.force)[0]
-    else:
-        result = _restore(stack, detection, options, given.force, "page")
+    result = _restore(stack, detection, options, given.force, "page")
     pattern = options.get("mosaic")
     steps = []
     if result.restored:
@@ -332,12 +340,19 @@ def report(given: ReportOptions) -> Answer:
     elif result.moves:
         forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
         steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
-    steps += [] if followed is not None else answers.steps_after_detection(detection, frames, settings)
+    steps += answers.steps_after_detection(detection, frames, settings)
     from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
 
-    content = reports.Report(
-        title=printable(f"Vibration in {frames.name}"),
-        subtitle=printable(f"{frames}, camera of {settings.source}"),
+    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
+    if windows is not None and windows.output is not None:  # restored by windows, here as a whole
+        title = "Restoration of the page, of one vibration in all frames"
+        answer.results[title] = answer.results.pop("Restoration")
+        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
+    answer.next_steps += steps
+    return _write_page(
+        given,
+        windows,
+        answer,
         frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
         restored=result.frames,
         was_restored=result.restored,
@@ -346,27 +361,48 @@ def report(given: ReportOptions) -> Answer:
         verdict=result.verdict,
         left_alone=result.left_alone,
         options=options,
-        version=rsvib_torch.__version__,
         next_steps=tuple(answers.step_parts(step) for step in steps),
+    )
+
+
+def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Path) -> Answer:
+    """The page of a run that followed the vibration: two frames in the middle, before and after it."""
+    import torch  # noqa: PLC0415
+
+    from rsvib_torch.video import Margins  # noqa: PLC0415
+
+    first, scale = max(windows.input["shape"][0] // 2 - 1, 0), windows.settings["full_scale"]
+    of_both = ((given.stack, scale), (made, None if io.is_video(made) else scale))
+    before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
+    answer = answers.windows_answer(f"Vibration in {given.stack.name}", windows)
+    answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
+    return _write_page(
+        given,
+        windows,
+        answer,
+        frames=before if windows.margins is None else Margins(**windows.margins).cut(before),
+        restored=after,
+        was_restored=True,
+        timing=given.settings.timing,
+        first=first,
+    )
+
+
+def _write_page(given: ReportOptions, windows: stacks.StackManifest | None, answer: Answer, **content: Any) -> Answer:
+    """Write the page of this content, and add its files to the answer."""
+    inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
+    page = reports.Report(
+        title=printable(f"Vibration in {given.stack.name}"),
+        subtitle=printable(f"{given.stack}, camera of {given.settings.source}"),
+        version=rsvib_torch.__version__,
         command=current_output().command,
         windows=windows,
+        **content,
     )
-    with whole_folder(out) as folder, working("writing the page"):
-        files = reports.write_report_page(folder, content, boxes or None)
-        shared.check_new([out / name for name in files], overwrite=True, inputs=inputs)
-    if windows is not None and followed is not None:
-        answer = answers.windows_answer(f"Vibration in {frames.name}", windows)
-        answer.results["Restoration of the page"] = answers.restoration_lines(result, len(stack.frames))
-        answer.data["restoration"] = reports.restoration_data(result)
-    else:
-        answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
-    if windows is not None and windows.output is not None:  # restored by windows or frames, here as a whole
-        if followed is None:
-            title = "Restoration of the page, of one vibration in all frames"
-            answer.results[title] = answer.results.pop("Restoration")
-        answer.results[f"Restoration according to {given.manifest}"] = windows.lines()[1]
-    answer.files += [out / name for name in files]
-    answer.next_steps += steps
+    with whole_folder(given.out) as folder, working("writing the page"):
+        files = reports.write_report_page(folder, page, list(map(_edge_box, given.edge or ())) or None)
+        shared.check_new([given.out / name for name in files], overwrite=True, inputs=inputs)
+    answer.files += [given.out / name for name in files]
     return answer
 
 

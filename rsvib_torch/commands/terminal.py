@@ -171,8 +171,7 @@ def working(description: str, *, counts: bool = False) -> Iterator[Callable[[int
     """
     begun, console, quiet = time.monotonic(), Console(stderr=True), _outputs[-1].quiet
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(bar_width=10), _StateColumn())
-    disable = quiet or not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=disable) as progress:
+    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as progress:
         task = progress.add_task(printable(description), total=None, begun=begun)
 
         def show(done: int, total: int, unit: str = "frames") -> None:

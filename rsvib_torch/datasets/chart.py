@@ -59,8 +59,7 @@ def resolution_chart(
             _draw_wedge(board, centre, side, begin=0.55 * step, length=(min(2, count // 2) - 0.1) * step)
     _draw_border(canvas, rim)
     # grain and texture are proportional to the tone
-    image = canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)
-    return image.clamp(0.0, 1.0)
+    return (canvas.image * (1.0 + relief[0] * grain + relief[1] * texture)).clamp(0.0, 1.0)
 
 
 def _draw_field(canvas: Canvas, relief: Tensor, centre: _Centre, size: float, steps: tuple[int, int]) -> None:
@@ -137,9 +136,8 @@ def _draw_bar_groups(canvas: Canvas, relief: Tensor, centre: _Centre, size: floa
             (canvas, (centre[0] - 0.23 * size, down), reach),
             (canvas.transposed(), (down, centre[0] + 0.23 * size), length * share),
         ):
-            frequency = 0.5 * (count - 0.5) / half
 
-            def coverage(x: Tensor, y: Tensor, f: float = frequency) -> Tensor:
+            def coverage(x: Tensor, y: Tensor, f: float = 0.5 * (count - 0.5) / half) -> Tensor:
                 return bars(x * f + 0.5 * (count - 0.5), f, count, sigma) * _between(y, length, sigma)
 
             board.paint(middle, (reach, length), _INK, coverage)

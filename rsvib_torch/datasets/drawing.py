@@ -61,8 +61,7 @@ def sectors(x: Tensor, y: Tensor, count: int, sigma: float) -> Tensor:
 
 def smoothed(image: Tensor, sigma: float) -> Tensor:
     """Image blurred by a Gaussian, periodic at its borders (a product of Fourier transforms)."""
-    squared = _squared_frequencies(*image.shape[-2:])
-    transfer = torch.exp(-2 * (math.pi * sigma) ** 2 * squared)
+    transfer = torch.exp(-2 * (math.pi * sigma) ** 2 * _squared_frequencies(*image.shape[-2:]))
     blurred: Tensor = torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=image.shape[-2:])
     return blurred
 

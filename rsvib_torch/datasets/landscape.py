@@ -74,8 +74,7 @@ def city_and_fields(height: Size, width: Size, seed: _Seed, *, sigma: Blur = 0.6
     # the mean over a pixel is a blur of variance 1/12 px^2
     ground, wildness = smoothed(torch.cat(strips, dim=1), math.sqrt(sigma**2 - 1 / 12))
     image = ground * (1.0 + 0.09 * relief + (0.025 + 0.2 * wildness) * detail)
-    buildings = _plan_buildings(districts, lines, height, width, generator)
-    return _draw_buildings(image, buildings, sigma).clamp(0.0, 1.0)
+    return _draw_buildings(image, _plan_buildings(districts, lines, height, width, generator), sigma).clamp(0.0, 1.0)
 
 
 def _lay_out_districts(height: int, width: int, generator: torch.Generator) -> _Districts:
@@ -127,8 +126,7 @@ def _two_nearest_districts(x: Tensor, y: Tensor, districts: _Districts) -> tuple
     column = ((x / districts.pitch).floor().long() + 1).clamp(1, columns - 2)
     indices = torch.stack([(row + down) * columns + (column + right) for down in (-1, 0, 1) for right in (-1, 0, 1)])
     squared = (x - place_x[indices]).square_() + (y - place_y[indices]).square_()
-    order = squared.topk(2, dim=0, largest=False).indices
-    first, second = indices.gather(0, order)
+    first, second = indices.gather(0, squared.topk(2, dim=0, largest=False).indices)
     return first, second
 
 
@@ -169,8 +167,7 @@ def _lay_out_ground(
     u, v = right * cosine + down * sine, down * cosine - right * sine
     lot_v = (v / size_v).floor()
     # rows of fields are shifted against each other, streets are straight
-    shifted = (kind == _FIELDS) * table[(lot_v.long() * 37 + nearest).remainder(len(table)), 0]
-    u = u + shifted * size_u
+    u = u + ((kind == _FIELDS) * table[(lot_v.long() * 37 + nearest).remainder(len(table)), 0]) * size_u
     lot_u = (u / size_u).floor()
     lot = (lot_u * 73 + lot_v * 179 + nearest * 283).long() * 2654435761
     draw = table[lot.remainder(len(table))].movedim(-1, 0)
@@ -217,8 +214,7 @@ def _plan_buildings(
     kinds = enumerate(districts.kind.view(-1).tolist())
     plans = [_plan_district(index, kind, districts, lines, generator) for index, kind in kinds if kind != _WOOD]
     plan = torch.cat([torch.zeros(0, 8, **FLOAT), *plans])
-    inside = (plan[:, :2] > -40).all(-1) & (plan[:, 0] < width + 40) & (plan[:, 1] < height + 40)
-    return plan[inside]
+    return plan[(plan[:, :2] > -40).all(-1) & (plan[:, 0] < width + 40) & (plan[:, 1] < height + 40)]
 
 
 def _plan_district(
@@ -274,12 +270,10 @@ def _draw_buildings(image: Tensor, plan: Tensor, sigma: float) -> Tensor:
         corner = part[:, :2].round().long()
         fraction = corner - part[:, :2]
         x = (steps + fraction[:, :1])[:, None, :]
-        y = (steps + fraction[:, 1:])[:, :, None]
-        windows = _draw_windows(x, y, part, sigma)
+        windows = _draw_windows(x, (steps + fraction[:, 1:])[:, :, None], part, sigma)
         rows = corner[:, 1, None, None] + steps[:, None] + pad
         columns = corner[:, 0, None, None] + steps + pad
-        index = (rows * layers.shape[-1] + columns).flatten()
-        layers.view(3, -1).index_add_(1, index, windows.flatten(1))
+        layers.view(3, -1).index_add_(1, (rows * layers.shape[-1] + columns).flatten(), windows.flatten(1))
     light, roofs, coverage = layers[:, pad : pad + height, pad : pad + width]
     drawn: Tensor = image * light.exp() * (1.0 - coverage) + roofs
     return drawn
@@ -296,6 +290,5 @@ def _draw_windows(x: Tensor, y: Tensor, plan: Tensor, sigma: float) -> Tensor:
     u, v = rotated(x, y, angle)
     coverage = rectangle(u, v, half_u, half_v, sigma)
     # the side of the roof that faces away from the light is darker
-    facing = torch.sin(sun - angle)
-    tones = tone * (1.0 - 0.45 * gabled * facing * (edge(v, sigma) - 0.5))
+    tones = tone * (1.0 - 0.45 * gabled * torch.sin(sun - angle) * (edge(v, sigma) - 0.5))
     return torch.stack([torch.log1p(-0.62 * shadow), coverage * tones, coverage])  # 38 % of the light in a shadow

@@ -110,10 +110,13 @@ def assumptions(
         return ()
     sentences = []
     if timing.frame_start_times is None:
+        # two frames show frequencies relative to the row time, more frames relative to the frame rate
         uncertain = f" ± {timing.row_time_std:.2g}" if timing.row_time_std else ""
+        row, rate = f"row_time={timing.row_time:g}{uncertain} s", f"{timing.frame_rate:.4g}"
         sentences.append(
-            f"row_time={timing.row_time:g}{uncertain} s; frequencies scale inversely with it, or differ by multiples "
-            f"of {timing.frame_rate:.4g} Hz"
+            f"{row}; frequencies scale inversely with it, or differ by multiples of {rate} Hz"
+            if num_frames == 2
+            else f"{rate} frames/s; frequencies scale with it; a wrong {row} adds multiples of it"
         )
     if timing.frame_start_times is None and timing.frame_rows == num_rows:
         sentences.append(

@@ -77,6 +77,9 @@ def camera_isd(
         radii: Semi-major and semi-minor axis of the body in km; by default those of the Earth.
         ephemeris_time: Time of the middle of the frame in s.
 
+    Returns:
+        The ISD, which ``json.dump`` can write.
+
     Example:
         >>> isd = camera_isd(Camera(2e5), (1024, 1024), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
         >>> isd["focal_length_model"], isd["detector_center"]
@@ -136,22 +139,37 @@ def write_isd(
 ) -> Literal["frame", "line-scan"]:
     """Write the ISD of one frame of a vibrating camera, for the Community Sensor Model.
 
-    The given ISD describes the camera at rest. The pixel at p of the frame, whose row is displaced by D (mean over its
-    exposure), has the ray of the camera at rest at p - D. Two models are available (docs/export.md):
+    The given ISD describes the camera at rest: without the motion, pixel and ray belong together as it states. The
+    pixel at p of the frame, whose row is displaced by D (mean over its exposure), has the ray of the camera at rest at
+    p - D. Two models are available:
 
-    * ``"frame"``: the ISD with polynomials ``jitter`` of the lowest degree up to 12 that suffices. They hold for all
-      columns, and the exposure times have a step at every line, so that this model is for slow motion without roll.
-    * ``"line-scan"``: a line scanner with one quaternion per row, whose rows have the rays of one line of the sensor:
-      for narrow fields of view, and for rows read from top to bottom.
+    * ``"frame"``: the ISD with polynomials ``jitter`` for lines (the displacement along y) and samples (along x), of
+      the lowest degree up to 12 that suffices. They hold for all columns, and the exposure times have a step at every
+      line, so that this model is for slow motion without roll. ``lineExposureTimes`` are seconds since one readout
+      duration before the exposure of the first row, since the polynomials are zero at time 0.
+    * ``"line-scan"``: a line scanner with one quaternion per row. All rows have the rays of one line of the sensor,
+      which a rotation takes to their place: a row at y px from the principal point is wider by the factor
+      ``sqrt(1 + y^2 / f^2)``, so that this model is for narrow fields of view, and for rows read from top to bottom.
+      The position is constant during the frame; uniform image motion is part of the quaternions.
 
-    The motion, in image axes, needs no camera; if it has one, its focal length must be that of the ISD. ``isd`` is that
-    of the camera as a mapping or JSON file, or that of ``camera_isd``; fields that do not concern the motion are kept.
-    Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used, which becomes the middle
-    of the frame. ``model="auto"`` is the first that is accurate enough; ``tolerance`` is the largest error of a
-    position in px, in both directions between image and ground.
+    Args:
+        path: The file to write; an existing file is replaced, but not that of ``isd``.
+        motion: One motion, in image axes. A camera is not required; if it has one, its focal length must be that of
+            the ISD.
+        timing: The sensor, with image rows as rows.
+        isd: The ISD of the camera as a mapping or JSON file, or that of ``camera_isd``. Fields that do not concern the
+            motion are kept. Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used,
+            which becomes the middle of the frame.
+        frame: Number of the frame.
+        model: ``"frame"``, ``"line-scan"``, or ``"auto"`` for the first of them that is accurate enough.
+        tolerance: Largest error of a position in px, in both directions between image and ground.
 
     Returns:
-        The model that was written. An error states why no permitted model is accurate enough.
+        The model that was written.
+
+    Raises:
+        ValueError: If the motion is a batch, the ISD lacks a field or has another focal length, columns are exposed one
+            after another, or no permitted model is accurate enough; the message states the errors and their reasons.
 
     Example:
         >>> import tempfile
@@ -216,8 +234,7 @@ def _displacements(motion: Motion, timing: SensorTiming, size: tuple[int, int], 
     moved = torch.zeros(len(line), _COLUMNS, 2, dtype=torch.float64, device=motion.device)
     for _ in range(_FIXED_POINT_STEPS):  # D belongs to the position at rest, p - D
         moved = displacement_at(components, x - moved[..., 0], y - moved[..., 1], motion.camera).expand_as(moved)
-    times = row * timing.row_time + 0.5 * timing.exposure_time
-    return times.cpu().numpy(), moved.detach().cpu().numpy()
+    return (row * timing.row_time + 0.5 * timing.exposure_time).cpu().numpy(), moved.detach().cpu().numpy()
 
 
 class _Camera:
@@ -230,9 +247,8 @@ class _Camera:
         matrix = np.array([self.value(_Row, f"focal2pixel_{name}") for name in ("lines", "samples")])
         self.offset, self.matrix = matrix[:, 0], matrix[:, 1:]
         if abs(np.linalg.det(self.matrix)) < 1e-12 * np.abs(self.matrix).max() ** 2 or not self.focal_length > 0:
-            raise ValueError(
-                f"{source}: focal2pixel_lines and focal2pixel_samples must be independent, and focal_length positive"
-            )
+            problem = "focal2pixel_lines and focal2pixel_samples must be independent, and focal_length positive"
+            raise ValueError(f"{source}: {problem}")
         self.summing = np.array([self.value(Number, f"detector_{n}_summing") for n in ("line", "sample")])
         self.start = np.array([self.value(Number, f"starting_detector_{n}") for n in ("line", "sample")])
         self.centre = np.array([self.value(Number, "detector_center", n) for n in ("line", "sample")])
@@ -309,8 +325,7 @@ def _with_jitter(
     rows, target = len(times), 0.5 * (low + high)
     columns = 0.5 * float((high - low).max())  # error of one value for all columns
     step = float(np.abs(np.diff(target, axis=0)).max()) if rows > 1 else 0.0
-    duration = rows * timing.row_time
-    shown = times - 0.5 * timing.exposure_time + duration
+    shown = times - 0.5 * timing.exposure_time + rows * timing.row_time
     power, rest = np.zeros((1, 2)), np.inf
     for degree in range(1, min(_MAX_DEGREE, rows) + 1):
         # the time times a Chebyshev series, which is zero at time 0, as powers of the time from the highest on
@@ -359,8 +374,7 @@ def _as_line_scan(
         return None, reason
     still = Rotation.from_quat(camera.state("instrument_pointing", "quaternions", 4), scalar_first=True)
     if "constant_rotation" in camera.isd["instrument_pointing"]:
-        constant = camera.state("instrument_pointing", "constant_rotation", 9)
-        still = Rotation.from_matrix(constant.reshape(3, 3)) * still
+        still = Rotation.from_matrix(camera.state("instrument_pointing", "constant_rotation", 9).reshape(3, 3)) * still
     # a ray e of row r has the direction still^-1 turned e in the reference frame, and pointing^-1 e in the file
     pointing = (turned.inv() * still).as_quat(scalar_first=True)
     same_side = np.sign((pointing[1:] * pointing[:-1]).sum(1))

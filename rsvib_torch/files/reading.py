@@ -16,9 +16,8 @@ _KINDS = {stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket", stat.S_ISCHR: "a d
 
 def check_regular(path: Path) -> None:
     """Raise an error if a path is neither a regular file nor a folder: reading others can wait or go on forever."""
-    mode = path.stat().st_mode
     for is_kind, name in _KINDS.items():
-        if is_kind(mode):
+        if is_kind(path.stat().st_mode):
             raise ValueError(f"{path}: expected a regular file, this is {name}")
 
 

@@ -7,6 +7,7 @@ from .frame_times import timing_from_first_frame as timing_from_first_frame
 from .stack_info import FrameError as FrameError
 from .stack_info import FrameReader as FrameReader
 from .stack_info import StackInfo as StackInfo
+from .stack_info import is_video as is_video
 from .stack_reading import open_stack as open_stack
 from .stack_reading import read_stack as read_stack
 from .stack_reading import read_stack_info as read_stack_info

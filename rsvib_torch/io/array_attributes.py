@@ -44,8 +44,7 @@ def info_from_attributes(attributes: Mapping[str, Any], shape: tuple[int, ...], 
     elif axes == "THWC":
         shape = (shape[0], shape[3], shape[1], shape[2])
     if attributes.get("frame_times") is not None:
-        times = np.asarray(attributes["frame_times"], dtype=np.float64)
-        stated: Table = {"frame_times": tuple(times.ravel().tolist())}
+        stated: Table = {"frame_times": tuple(np.asarray(attributes["frame_times"], dtype=np.float64).ravel().tolist())}
     else:
         stated = times_of_attributes(attributes, shape[0])
     resolution = attributes.get("resolution")

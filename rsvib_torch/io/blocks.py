@@ -40,9 +40,8 @@ class BlockReader(FrameReader):
         if self._block is None or not self._first <= index < self._first + len(self._block):
             self._block = None  # before the next block is allocated
             self._first = index - index % self._together
-            last = min(self._first + self._together, self.info.shape[0])
             with readable_frame(self._path, index):
-                self._block = self._read(self._first, last)
+                self._block = self._read(self._first, min(self._first + self._together, self.info.shape[0]))
         alone = self._together == 1  # otherwise a view would keep the block in memory
         frame = np.array(self._block[index - self._first], self.info.dtype, order="C", copy=None if alone else True)
         if index == self._first + len(self._block) - 1:
@@ -80,8 +79,7 @@ def contiguous_reader(path: Path, info: StackInfo, offset: int, dtype: np.dtype)
     """
     size, held = info.frame_bytes, max(0, path.stat().st_size - offset)
     if held // size < 0.5 * info.shape[0]:
-        needed = size * info.shape[0]
-        raise ValueError(f"truncated: the header states {needed} bytes of pixels, the file holds {held}")
+        raise ValueError(f"truncated: the header states {size * info.shape[0]} bytes of pixels, the file holds {held}")
     file = path.open("rb")
 
     def read(first: int, _: int) -> Array:

@@ -153,8 +153,7 @@ def find_format(path: Path) -> StackFormat:
     by_ending = FORMATS.get(path.suffix.lower())
     if by_ending is not None and by_ending.kind != "file":
         return by_ending
-    marked = (form for form in FORMATS.values() if form.marker and (path / form.marker).is_file())
-    return next(marked, FORMATS[""])
+    return next((form for form in FORMATS.values() if form.marker and (path / form.marker).is_file()), FORMATS[""])
 
 
 def target_format(path: Path) -> StackFormat:
@@ -162,6 +161,5 @@ def target_format(path: Path) -> StackFormat:
     if path.suffix.lower() in FORMATS:
         return FORMATS[path.suffix.lower()]
     known = ", ".join(ending for ending in FORMATS if ending)
-    raise ValueError(
-        f"{path}: unknown file ending {quoted(path.suffix)}; expected {known} or a folder of PNG, TIFF or JPEG files"
-    )
+    known += " or a folder of PNG, TIFF or JPEG files"
+    raise ValueError(f"{path}: unknown file ending {quoted(path.suffix)}; expected {known}")

@@ -238,8 +238,7 @@ def write_image(path: Path, info: StackInfo, frames: Iterator[Array], compressio
 def write_folder(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a folder with one file per frame; arguments as in ``StackFormat.write``."""
     path.mkdir()
-    sources = info.files or [None] * info.shape[0]
-    for name, source, frame in zip(_frame_names(info), sources, frames, strict=True):
+    for name, source, frame in zip(_frame_names(info), info.files or [None] * info.shape[0], frames, strict=True):
         _write_file(path / name, info, frame, source)
 
 

@@ -222,6 +222,11 @@ def split_range(path: Path) -> tuple[Path, tuple[int, int | None] | None]:
     return path.with_name(name), (int(start or 0), int(end) if end else None)
 
 
+def is_video(path: Path) -> bool:
+    """Whether a stack, or frames of it, is a video by its name."""
+    return split_range(path)[0].suffix.lower() in VIDEO
+
+
 @contextmanager
 def readable_stack(path: Path, kind: str) -> Iterator[None]:
     """Convert any exception of a decoder of a ``kind`` of files into a ``ValueError``, except a missing permission."""

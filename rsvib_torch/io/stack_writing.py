@@ -35,9 +35,8 @@ def check_info_target(
     form = target_format(path)
     check_target(path, form.kind, parent_exists=False)
     if form.write is None:
-        raise ValueError(
-            f"{path}: {form.name} files can only be read; write .tif, .png, .npy, .mkv or a folder of PNG files"
-        )
+        remedy = "write .tif, .png, .npy, .mkv or a folder of PNG files"
+        raise ValueError(f"{path}: {form.name} files can only be read; {remedy}")
     if info.dtype not in form.dtypes:
         raise ValueError(f"{path}: {form.name} files hold {', '.join(form.dtypes)}; got dtype {info.dtype}")
     if compression is not None:
@@ -161,6 +160,10 @@ def write_stack(
             metadata and, if the number of frames is the same, frame times are stored if the format supports them, and
             NaN as its nodata value; ``metadata_not_kept`` lists those that are not. If both files are videos, the
             presentation times of the frames and the audio are copied. Its file must not be ``path``.
+
+    Raises:
+        OSError: If the file cannot be written.
+        ValueError: If the format does not support them, the full scale is unknown, or ``path`` is the file of ``like``.
 
     Example:
         >>> import tempfile

@@ -61,8 +61,7 @@ def _pages(tif: Any) -> list[_Page]:
             meaning = "" if page.photometric in _PHOTOMETRIC else f" {_name(page.photometric)}"
             kinds[key] = f"{' x '.join(map(str, shape[-2:]))} px{channels} {page.dtype}{meaning}"
         complete = _is_complete(page, file.size)
-        secondary = bool(page.subfiletype & 0b101)
-        pages.append(_Page(len(pages), kinds[key], int(page.nbytes), complete, secondary))
+        pages.append(_Page(len(pages), kinds[key], int(page.nbytes), complete, bool(page.subfiletype & 0b101)))
     file.seek(tif.pages.next_page_offset)
     if not pages or file.read(tif.tiff.offsetsize) != bytes(tif.tiff.offsetsize):
         raise ValueError(f"truncated: the header of page {len(pages)} lies beyond the end of the file")
@@ -251,8 +250,7 @@ def open_tiff(path: Path) -> BlockReader:
     with readable_stack(path, "TIFF"), ExitStack() as opened:
         tif = opened.enter_context(tifffile.TiffFile(path))
         pages = _pages(tif)
-        arranged = _are_arranged(tif, len(pages))
-        reader = _open_series(path, tif) if arranged else _open_pages(path, tif, pages)
+        reader = _open_series(path, tif) if _are_arranged(tif, len(pages)) else _open_pages(path, tif, pages)
         opened.pop_all()
         return reader
 

@@ -74,10 +74,8 @@ def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
         elif any(value not in (None, values[0]) for value in values[1:]):
             found[f"{name} (differs between pages)"] = None
         else:
-            once = None in values[1:]
-            found[name] = Tag(tag.code, int(tag.dtype), tag.count, values[0], once, _COPIED[tag.code])
-    tags = tif.pages.first.tags
-    x, y, unit = (_value(tags.get(code)) for code in (282, 283, 296))
+            found[name] = Tag(tag.code, int(tag.dtype), tag.count, values[0], None in values[1:], _COPIED[tag.code])
+    x, y, unit = (_value(tif.pages.first.tags.get(code)) for code in (282, 283, 296))
     rational = all(isinstance(scale, tuple) and len(scale) == 2 and min(scale) > 0 for scale in (x, y))
     if rational and unit == 1 and (x, y) != ((1, 1), (1, 1)):
         found[_RESOLUTION] = Tag(282, 5, 2, (x, y), False, "image")

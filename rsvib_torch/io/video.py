@@ -83,8 +83,7 @@ def _pixels(frame: Any) -> NDArray[Any]:
     """Pixels (H, W) or (3, H, W) of a decoded frame."""
     unspecified, untagged_height = 2, 576  # players assume the colours of HDTV for taller videos without a tag
     matrix = "ITU709" if frame.colorspace == unspecified and frame.height > untagged_height else None
-    layout = _decoded_as(frame.format)[0]
-    pixels = frame.to_ndarray(format=layout, src_colorspace=matrix, interpolation=_conversion())
+    pixels = frame.to_ndarray(format=_decoded_as(frame.format)[0], src_colorspace=matrix, interpolation=_conversion())
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0))
 
 
@@ -441,8 +440,7 @@ def part_of_video(
         opened.enter_context(file)
         source = open_source(info, opened)
         output = opened.enter_context(_av().open(file, "w", format=CONTAINERS[ending]))
-        options = _PART_OPTIONS if ending in H264 else {}
-        encoder = VideoEncoder(output, video, info, source, picture, options)
+        encoder = VideoEncoder(output, video, info, source, picture, _PART_OPTIONS if ending in H264 else {})
         yield lambda frame: encoder.write(frame, next(numbers) * encoder.step)
         encoder.finish()
 

@@ -51,10 +51,8 @@ def _check_sizes(array: Any, info: StackInfo, folder: Path) -> None:
     largest_chunk = 1 << 30  # bytes, also of a frame
     largest_ratio = 100_000  # of pixels to stored bytes; chunks of constant frames are very small
     if max(chunk, info.frame_bytes) > largest_chunk or info.shape[0] * info.frame_bytes > largest_ratio * held:
-        raise ValueError(
-            f"its header states {info.shape[0]} frames of {info.frame_bytes} bytes in chunks of {chunk}, "
-            f"the folder holds {held} bytes"
-        )
+        stated = f"{info.shape[0]} frames of {info.frame_bytes} bytes in chunks of {chunk}"
+        raise ValueError(f"its header states {stated}, the folder holds {held} bytes")
 
 
 def open_zarr(path: Path) -> BlockReader:

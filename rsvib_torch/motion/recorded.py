@@ -107,7 +107,8 @@ def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
             lines = text_lines(path, file)
-            names = [name.strip().lower() for name in next(csv.reader(lines, skipinitialspace=True), [])]
+            head = next(csv.reader(lines, skipinitialspace=True), [])
+            names = [name.partition("(")[0].strip().lower() for name in head]  # without units
             missing = [name for name in _COLUMNS if name not in names]
             if missing:
                 present = ", ".join(names) or "nothing"

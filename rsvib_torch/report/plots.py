@@ -76,7 +76,13 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
 ) -> None:
-    """Write a figure as an image file, atomically; its ending selects the format (``.png``, ``.svg``, ``.pdf``)."""
+    """Write a figure as an image file, atomically.
+
+    Args:
+        figure: The figure.
+        path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
+        dpi: Pixels per inch.
+    """
     write_figure(figure, path, dpi)
 
 
@@ -232,8 +238,7 @@ def offset_figure(result: DetectionResult) -> Figure:
     axes = result.vibration.num_axes
     figure, panels = offset_panels(result, range(axes), 6.5 * axes, 6.4)
     for axis, (name, upper) in enumerate(zip(AXIS_NAMES, panels[0], strict=False)):
-        heading = f"Offset along {name}" if axis < 2 else f"Offset of {name}"
-        upper.set_title(heading, **_HEADING, pad=36)
+        upper.set_title(f"Offset along {name}" if axis < 2 else f"Offset of {name}", **_HEADING, pad=36)
         text = ",  ".join(tones_text(result, axis))
         if not bool(result.reliable[axis]):
             text = "not reliable: " + "; ".join(str(reason) for reason in result.reasons[axis])
@@ -252,13 +257,18 @@ def windows_figure(
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 
-    Points of axes that are not reliable are hollow and do not determine the range of the axis. There is a detection for
-    each of the ``times``, None where it failed.
+    Points of axes that are not reliable are hollow and do not determine the range of the axis.
+
+    Args:
+        times: Position of each window on the horizontal axis.
+        detections: The detection of each window (not a batch); None where it failed.
+        time_label: Label of the horizontal axis.
 
     Example:
-        >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
-        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> from rsvib_torch.datasets import example_frames
+        >>> from rsvib_torch.detection import detect_vibration
+        >>> frames, timing, _ = example_frames(num_frames=4)
+        >>> parts = [detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
         >>> len(windows_figure([0.0, 2 * timing.frame_period], parts).axes)
         4
     """
@@ -282,8 +292,7 @@ def windows_figure(
                 margin = max(0.15 * (high - low), 0.002 * abs(high))
                 panel.set_ylim(low - margin, high + margin)
             panel.ticklabel_format(axis="y", useOffset=False)
-            first = quantity == "amplitude"
-            label, heading = ("", f"Tones along {name}") if first else (time_label, "")
+            label, heading = ("", f"Tones along {name}") if quantity == "amplitude" else (time_label, "")
             plain_axes(panel, label, f"{quantity} ({unit})", heading=heading)
     _legend_below(
         figure,
@@ -306,9 +315,12 @@ def _batch_figure(results: DetectionResult) -> Figure:
 
 @checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
-    """Draw the displacement of a motion (not a batch) over time, from ``first`` to ``last`` in seconds.
+    """Draw the displacement of a motion along both axes over time.
 
-    By default, all of a free motion is drawn, and four periods of the tone of lower frequency of others.
+    Args:
+        motion: The motion (not a batch).
+        first: Start of the drawing in seconds.
+        last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
 
     Example:
         >>> motion_figure(Vibration([3.1, 5.2], [50.0, 30.0])).axes[0].get_xlabel()
@@ -407,9 +419,8 @@ def gain_figure(result: DetectionResult, timing: SensorTiming) -> Figure:
         lower.errorbar(at, amplitude, *bars, capsize=3, elinewidth=1.4, **style)
     if labels:
         upper.legend(list(labels.values()), list(labels), **_LEGEND, loc="upper right", ncols=2)
-    upper.set_ylim(0, 2.4)
+    upper.set(xlim=(0, highest), ylim=(0, 2.4))
     lower.set_ylim(0, 1.15 * lower.get_ylim()[1])
-    upper.set_xlim(0, highest)
     plain_axes(upper, y="offset gain (px per px)")
     plain_axes(lower, "frequency (Hz)", "amplitude (px)")
     return figure
@@ -498,8 +509,7 @@ def mtf_figure(curves: Mapping[str, Sequence[MtfCurve]], *, points: Mapping[str,
     points = points or {}
     highest = 0.5 * max([1, *points.values()])
     frequency = torch.linspace(0, highest, 101, dtype=torch.float64, device="cpu")
-    colours = (_GREY, _X_COLOUR)[-len(curves) :]
-    for colour, (name, edges) in zip(colours, curves.items(), strict=True):
+    for colour, (name, edges) in zip((_GREY, _X_COLOUR)[-len(curves) :], curves.items(), strict=True):
         values = [edge.at(frequency.to(edge.lsf.device) / points.get(name, 1)).cpu() for edge in edges]
         for value in values:
             panel.plot(frequency, value, color=colour, linewidth=0.7, alpha=0.5)
@@ -551,7 +561,12 @@ def comparison_figure(
 ) -> Figure:
     """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
-    Both frames are (H, W) or (C, H, W) with full scale 1; there are ``count`` crops with a side of ``size`` px.
+    Args:
+        raw: (H, W) or (C, H, W), full scale 1.
+        restored: The same shape.
+        count: Number of crops.
+        size: Side of the crops in px.
+        names: Titles of the two rows of panels.
 
     Example:
         >>> frame = torch.rand(96, 128, generator=torch.Generator().manual_seed(0))

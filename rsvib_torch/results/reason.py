@@ -152,6 +152,7 @@ def read_findings(values: Any) -> Any:
 
 
 _MORE_FRAMES = "use more frames"
+_MAY_BE_STILL = "the camera may stand still along this axis; use more frames if a vibration is expected"
 _FOLLOW = "use follow_vibration if the vibration changes"
 _TONES_OR_FREE = f"{_FOLLOW}, try more tones or detect_motion"
 _CHECK_TIMING = "and check frame_rows, row_time and the start times of the frames"
@@ -160,19 +161,19 @@ _UNCERTAIN = "the displacement of the rows is uncertain: {size:.2g} ± {value:.2
 _px = partial(ReasonKind, unit="px")
 _of_result = partial(ReasonKind, refuses="the result")
 _px_of_result = partial(_px, refuses="the result")
+_of_all_axes = partial(ReasonKind, refuses="all axes")
 
 _TONES = {
-    "rows_not_registered": ReasonKind(
+    "rows_not_registered": _of_all_axes(
         "only {value:.0%} of {what} can be registered, {limit:.0%} are needed: the motion is beyond the search range, "
         "or the frames lack detail or show different scenes",
         "increase search",
         "fraction of the visible rows or bands that were registered and of the registered bands that correlate more "
         "than independent noise, below 0.5",
-        refuses="all axes",
     ),
     "no_tone": ReasonKind(
         "no significant tone: the offsets are those of a uniform motion, or below their noise",
-        "use more frames if a vibration is expected",
+        _MAY_BE_STILL,
     ),
     "too_many_tones": ReasonKind(
         "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
@@ -187,7 +188,7 @@ _TONES = {
     "tone_not_significant": _px(
         "tone of {frequency:.4g} Hz is not significant: its amplitude is {value:.3g} ± {std:.2g} px, and 4 standard "
         "deviations, {limit:.3g} px, are needed",
-        _MORE_FRAMES,
+        _MAY_BE_STILL,
         "amplitude of the only tone, below 4 standard deviations",
     ),
     "tone_too_small": _px(
@@ -254,13 +255,12 @@ _TONES = {
         "select a part of the frame with one distance",
         "with roll or zoom: rms difference between strips of columns, above 0.035 px and 0.9 % of the rms offsets",
     ),
-    "blur_contradicts_exposure": ReasonKind(
-        "the difference of the blur between frames is {value:.2g} times the value expected for an exposure of "
+    "blur_contradicts_exposure": _of_all_axes(
+        "the difference of the blur between frames is {value:.3g} times the value expected for an exposure of "
         "{exposure_rows:g} rows, the limit is {limit:g}",
         "check exposure_rows[ (about {likely:.2g} rows agree with the blur)], and frame_rows and row_time, which "
-        "determine the motion",
+        "determine the motion[; the compression of a {compressed}, which makes frames alike, is another cause]",
         "difference of the blur between frames over the expected one, significantly between -0.3 and 0.6 or above 2",
-        refuses="all axes",
     ),
     "bands_unexplained": _px(
         "the fit does not explain the offset curve: mean residual {value:.3g} px, {limit:.3g} px are allowed for "
@@ -275,27 +275,23 @@ _TONES = {
         "check row_time",
         "method='bands': motion within a row time, above 0.1 px, condition (24) of the paper",
     ),
-    "other_frame_rows": ReasonKind(
+    "other_frame_rows": _of_all_axes(
         "the frames agree with frame_rows={limit:.5g}, not with {value:g}: frame_rows counts the blanking rows and is "
         "not the image height",
         "if the frame rate is known, row_time is 1 / (frame rate x frame_rows), with {frame_rate:.5g} frames/s "
         "{row_time:.5g} s",
         "the stated frame_rows (value), and the one with which detection is reliable (limit)",
         "row times",
-        "all axes",
     ),
-    "other_row_time": ReasonKind(
+    "other_row_time": _of_all_axes(
         "the frames agree with row_time={limit:.5g} s, not with {value:g} s, if the start times of frames are right",
         compares="the stated row time (value), and the one with which detection is reliable (limit)",
         unit="s",
-        refuses="all axes",
     ),
-    "other_readout_direction": ReasonKind(
-        "the frames agree with readout_direction='{agreeing}', not with '{stated}'", refuses="all axes"
+    "other_readout_direction": _of_all_axes(
+        "the frames agree with readout_direction='{agreeing}', not with '{stated}'"
     ),
-    "other_scan_axis": ReasonKind(
-        "the frames agree with scan_axis='{agreeing}', not with '{stated}'", refuses="all axes"
-    ),
+    "other_scan_axis": _of_all_axes("the frames agree with scan_axis='{agreeing}', not with '{stated}'"),
 }
 _FOLLOWED = {
     "not_followed": ReasonKind("the vibration is not known at this frame", _MORE_FRAMES),

@@ -12,7 +12,6 @@ from .recorded_motion import check_stack_motion as check_stack_motion
 from .run_folder import StackReport as StackReport
 from .window_restoration import RestoredFrames as RestoredFrames
 from .window_restoration import may_change as may_change
-from .window_restoration import restore_followed as restore_followed
 from .window_restoration import restore_trusted as restore_trusted
 from .window_restoration import without_data as without_data
 from .windows import Window as Window

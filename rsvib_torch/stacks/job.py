@@ -146,8 +146,7 @@ class StackJob:
         frames = self._images(inside)
         kept = tuple(index for index in usable if index in window.written)
         bad = {index: fault for index, fault in faults.items() if index in window.written}
-        taken = self._unchanged(frames[: len(kept)])
-        as_taken = WindowResult(window, kept, taken, False, None, None, None, bad)
+        as_taken = WindowResult(window, kept, self._unchanged(frames[: len(kept)]), False, None, None, None, bad)
         if faults and len(inside) < 2:
             return replace(as_taken, error=next(iter(faults.values())))
         if self.follow is True:
@@ -277,7 +276,6 @@ class StackJob:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
-        restored_frames = None if followed is None else result.restored * len({*followed} - {*result.unchanged})
         return window_record(
             None if restoration is None else restoration.verdict,
             result.bad_frames,
@@ -291,7 +289,7 @@ class StackJob:
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
             followed=followed,
-            restored_frames=restored_frames,
+            restored_frames=None if followed is None else result.restored * len({*followed} - {*result.unchanged}),
         )
 
 
@@ -412,11 +410,18 @@ def restore_block(
         frames: (T, H, W) or (T, C, H, W), as stored.
         timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
         detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore`` that keep the size, for frames whose full scale is 1.
+        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
         full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
         channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
+
+    Returns:
+        Restored frames.
+
+    Raises:
+        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
+            to have their channels last.
 
     Example:
         >>> restored = array.map_overlap(  # doctest: +SKIP
@@ -443,5 +448,4 @@ def restore_block(
     info = StackInfo(stored.shape, stored.dtype.name, scale)
     job = StackJob(Path("frames"), info, timing, scale, detection or {}, options, force=force, device=device)
     window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
-    restored = job.stored(job.compute(window, pixels), pixels).frames
-    return np.moveaxis(np.stack(restored), -3, axis)
+    return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels).frames), -3, axis)

@@ -79,8 +79,7 @@ class StackManifest(Result, file_format="rsvib stack"):
             last["bad_frames"] = len(record.bad_frames)
             last["note"] = record.error or "; ".join(map(str, record.left_alone))
             last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
-            tones = [{}] if found is None else found.tone_lines(pixel_size)
-            lines += [{**first, **tone, **last} for tone in tones]
+            lines += [{**first, **tone, **last} for tone in ([{}] if found is None else found.tone_lines(pixel_size))]
         return joined_columns(lines)
 
     def _results(self) -> Iterator[tuple[WindowRecord, int | None, DetectedVibration | None, float | None]]:
@@ -88,8 +87,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         starts, half_frame = None, 0.0
         if self.settings.get("sensor") is not None:
             timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
-            rows = self.input["shape"][timing.scan_axis]
-            half_frame = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+            half_frame = 0.5 * ((self.input["shape"][timing.scan_axis] - 1) * timing.row_time + timing.exposure_time)
             starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
         for record in self.windows:
             found: list[tuple[int | None, DetectedVibration | None]] = [(None, record.detection)]
@@ -157,7 +155,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         for name, of_axis in self.totals()["tones"].items():
             for tone in of_axis["tones"] or [{"windows": 0}]:
                 texts = [
-                    measured_text(tone[quantity], tone[f"{quantity}_spread"]) if tone["windows"] else ""
+                    measured_text(tone[quantity], tone[f"{quantity}_spread"] or None) if tone["windows"] else ""
                     for quantity in ("amplitude", "frequency")
                 ]
                 if unit != "windows" and tone["windows"]:
@@ -196,8 +194,8 @@ class StackManifest(Result, file_format="rsvib stack"):
             which = "" if len(followed) == len(self.windows) else " of the windows that were followed"
             restoration.append(f"{count} of {sum(record.written for record in followed)} frames{which} restored")
         if data["predicted_gain_db"] is not None:
-            low, high = data["predicted_gain_db"].values()
-            restoration.append(f"estimated improvement {low:+.1f} … {high:+.1f} dB")
+            gains = dict.fromkeys(f"{gain:+.1f}" for gain in data["predicted_gain_db"].values())
+            restoration.append(f"estimated improvement {' … '.join(gains)} dB")
         # All windows were measured, and nothing else than missing tones is stated against any axis.
         codes = {
             "failed" if one is None else one.codes((axis,))
@@ -218,6 +216,11 @@ class StackManifest(Result, file_format="rsvib stack"):
             failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"
             vibration.append(wrapped(f"{failed}; in window {window}: {error}"))
         return vibration, restoration
+
+    @property
+    def is_followed(self) -> bool:
+        """Whether the vibration was followed from frame to frame in all windows, or in a video."""
+        return "video" in self.settings or self._unit == "frames"
 
     @property
     def _unit(self) -> str:  # what has a detection
@@ -332,11 +335,22 @@ def manifest_text(
     windows = list(records)
     bad = {index: reason for record in windows for index, reason in record["bad_frames"].items()}
     stated = {"format": "rsvib stack", "version": 1, **header, "units": _UNITS}
-    content = {**stated, "windows": windows, "bad_frames": bad, "not_kept": list(not_kept), **results}
-    return json_text(content) + "\n"
+    return json_text({**stated, "windows": windows, "bad_frames": bad, "not_kept": list(not_kept), **results}) + "\n"
 
 
 @checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
-    """Read the ``manifest.json`` of a complete run."""
+    """Read the manifest of a complete run.
+
+    Args:
+        path: The ``manifest.json``.
+
+    Raises:
+        ValueError: If it is not a complete manifest.
+
+    Example:
+        >>> manifest = read_manifest("restored.tif.manifest.json")  # doctest: +SKIP
+        >>> manifest.detections()[0].vibration.frequency[:, 0].tolist()  # Hz, first window  # doctest: +SKIP
+        [110.0, 90.0]
+    """
     return StackManifest.load(path)

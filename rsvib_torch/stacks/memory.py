@@ -105,10 +105,7 @@ def windows_at_once(
 
 def check_stack_fits(info: StackInfo, restoration: Mapping[str, Any] | None = None, *, on_gpu: bool = False) -> None:
     """Raise a ``ValueError`` if a stack that is processed as a whole does not fit into the free memory."""
-    needed = memory_needed(info, info.shape[0], restoration, on_gpu=on_gpu)
-    check_fits(
-        f"{info.path or 'the frames'}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px, processed "
-        "together,",
-        needed - psutil.Process().memory_info().rss,
-        "process them in windows (rsvib run, rsvib detect --window 8)",
-    )
+    what = f"{info.path or 'the frames'}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px"
+    needed = memory_needed(info, info.shape[0], restoration, on_gpu=on_gpu) - psutil.Process().memory_info().rss
+    remedy = "process them in windows (rsvib run, rsvib detect --window 8)"
+    check_fits(f"{what}, processed together,", needed, remedy)

@@ -53,7 +53,7 @@ def test_values_of_a_video_and_of_options(place, capsys):
     assert "rsvib calibrate" in text
     timing = read_config(place / "camera.toml").timing
     assert (timing.exposure_rows, timing.frame_rate) == pytest.approx((20, 25))
-    assert "rsvib run clip.mp4 results --config camera.toml" in capsys.readouterr().out
+    assert "rsvib run clip.mp4 results --config camera.toml --video" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("angle", [90, 180, 270])

@@ -1,5 +1,7 @@
 """Comparison of a detected vibration with an accelerometer, whose record is computed from the true motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -26,9 +28,9 @@ def make_detection():
     return rsv.detect_vibration(frames, timing)
 
 
-def accelerometer(duration=2.0, rate=RATE, speed=1.0):
+def accelerometer(duration=2.0, rate=RATE, speed=1.0, start=100.0):
     """Times in s and acceleration in m/s^2; its clock runs at ``speed``."""
-    times = np.arange(0.0, duration, 1 / rate) + 100.0
+    times = np.arange(0.0, duration, 1 / rate) + start
     values = np.random.default_rng(1).normal([0.0, 9.81], 0.3, (len(times), 2))
     for axis, of_axis in TONES.items():
         for amplitude, frequency, phase in of_axis:
@@ -65,6 +67,20 @@ def test_a_wrong_scale_clock_or_frequency_disagrees(detection, options, speed, v
     far = (getattr(found, value) - expected).abs() > 3 * getattr(found, f"{value}_std")
     assert far.all()
     assert not found.agree.any()
+
+
+def test_the_clock_is_unknown_if_no_phases_agree(detection):
+    """The record begins after the frames."""
+    assert np.isnan(rsv.compare_accelerometer(detection, *accelerometer(start=100.8)).offset_std)
+
+
+def test_clocks_that_differ_by_periods_are_stated(detection):
+    """Tones of 137 and 411 Hz, the third multiple, agree at 1 / 137 s later as well."""
+    alone = replace(detection, reliable=torch.tensor([True, False]))
+    found = rsv.compare_accelerometer(alone, *accelerometer())
+    shifts = (np.array([found.offset, *found.other_offsets]) - OFFSET) * 137.0
+    np.testing.assert_allclose(shifts, shifts.round(), atol=0.01)
+    assert len(shifts) > 50
 
 
 def test_records_that_cannot_be_compared_are_refused(detection):

@@ -31,7 +31,7 @@ def test_angles_are_converted_to_pixels(tmp_path, unit, size):
 def test_rates_are_integrated_and_times_scaled(tmp_path):
     x, y = 0.01 * np.sin(9 * CLOCK), 0.02 * np.cos(5 * CLOCK)
     rates = np.degrees(0.09 * np.cos(9 * CLOCK)), np.degrees(-0.1 * np.sin(5 * CLOCK))
-    path = write(tmp_path / "a.csv", (1e3 * CLOCK, CLOCK, *rates), " Time , other, X, y")
+    path = write(tmp_path / "a.csv", (1e3 * CLOCK, CLOCK, *rates), " Time (ms), other, X(rad/s), y")
     motion = read_motion(path, unit="deg/s", focal_length=1000.0, time_unit="ms")
     found = motion.displacement(torch.from_numpy(CLOCK)).numpy()
     assert np.allclose(found[:, 0] - found[:, 0].mean(), 1000 * (x - x.mean()), atol=0.02)

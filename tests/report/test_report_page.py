@@ -278,7 +278,7 @@ def test_consecutive_frames_are_shown_at_one_place_of_the_scene():
     moving = Vibration([1.6, 1.1], [71.0, 113.0], [0.6, -1.2], [speed, -2 * speed])
     scene = resolution_chart(300, 320, sigma=0.7)
     frames = torch.stack([scene[20:276, 40:264], scene[34:290, 33:257]])  # the content moves by (7, -14) px
-    shown = frames_in_turn(report_of(frames=frames, restored=frames.flip(-1)), 0, moving)
+    shown = frames_in_turn(report_of(frames=frames, restored=frames.flip(-1)), 0, moving.image_motion)
     assert [name for name, _ in shown.panels] == ["input", "restored"]
     images = [decoded(uri).astype(float) for _, pair in shown.panels for uri in pair]
     assert np.abs(images[0] - images[1]).max() < 20  # JPEG
@@ -293,8 +293,8 @@ def test_one_frame_and_one_joint_image():
     report = report_of(restored=report_of().frames[:1])
     pair = whole_frame(report, 1, (report.frames[1], report.restored[0]), ("input", "restored"))
     assert pair.caption.startswith("Frame 1, and one image restored jointly from all frames. Grey levels are stretched")
-    assert [name for name, _ in frames_in_turn(report, 1, SHAKE).panels] == ["input"]
-    assert frames_in_turn(report_of(frames=report.frames[:1]), 0, SHAKE) is None
+    assert [name for name, _ in frames_in_turn(report, 1, SHAKE.image_motion).panels] == ["input"]
+    assert frames_in_turn(report_of(frames=report.frames[:1]), 0, SHAKE.image_motion) is None
 
 
 def test_page_without_restoration_has_no_pairs_but_what_was_tried(tmp_path):

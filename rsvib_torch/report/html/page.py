@@ -5,7 +5,9 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+import torch
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
@@ -16,7 +18,16 @@ from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report import plots
 from rsvib_torch.report.html import words
-from rsvib_torch.report.html.template import PERCENTILES, BeforeAfter, Blink, before_after, blink, drawing, write_page
+from rsvib_torch.report.html.template import (
+    PERCENTILES,
+    BeforeAfter,
+    Blink,
+    Drawing,
+    before_after,
+    blink,
+    drawing,
+    write_page,
+)
 from rsvib_torch.restoration import RestorationVerdict, trusted_vibration
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS
 from rsvib_torch.results.reason import Reason
@@ -38,11 +49,13 @@ class Report:
     restored: Tensor
     was_restored: bool  # whether ``restored`` is restored, or the unchanged input
     timing: SensorTiming  # the sensor
-    detection: DetectionResult  # the detection (not a batch)
-    verdict: RestorationVerdict | None  # comparison of pairs of frames; None if they could not be compared
-    left_alone: tuple[Reason, ...]  # a reason for each axis that was not restored
-    options: Table  # options of ``restore``
     version: str  # version of the package
+    # the detection (not a batch); None: the frames are those of a run that followed the vibration, with ``windows``
+    detection: DetectionResult | None = None
+    verdict: RestorationVerdict | None = None  # comparison of pairs of frames; None if they could not be compared
+    left_alone: tuple[Reason, ...] = ()  # a reason for each axis that was not restored
+    options: Table = field(default_factory=dict)  # options of ``restore``
+    first: int = 0  # number of the first of the frames
     next_steps: tuple[tuple[str, str], ...] = ()  # what to do next, and the command that does it, or an empty text
     command: str | None = None  # the command line that wrote the page; None for a page written from Python
     windows: StackManifest | None = None  # windows of the stack that were processed separately; None if there are none
@@ -143,7 +156,7 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
     grey = _grey(frames[-1]).float()
     place = plots.detailed_places(grey, min(96, *grey.shape), count=1, rim=16)[0]
     pair = before_after(*frames, names=names, caption="", full_at=(place[0] + 48, place[1] + 48))
-    caption = f"Frame {index}"
+    caption = f"Frame {report.first + index}"
     if report.was_restored and len(report.restored) == 1:
         caption += ", and one image restored jointly from all frames"
     if pair.scale < 1:
@@ -156,7 +169,7 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
     return replace(pair, caption=f"{caption}. Grey levels are stretched: {levels}{both}.")
 
 
-def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 480) -> Blink | None:
+def frames_in_turn(report: Report, index: int, image_motion: Tensor, size: int = 480) -> Blink | None:
     """Two consecutive frames before and after restoration, at full resolution where detail is strongest.
 
     Uniform motion along the image is compensated by whole px, the same for input and restored frames, so that the
@@ -170,7 +183,7 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
     if report.was_restored and len(report.restored) == count:
         frames, names = [report.frames, report.restored], ["input", "restored"]
     starts = report.timing.frame_starts(count)
-    moved = (removed.image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
+    moved = (image_motion * float(starts[first + 1] - starts[first])).round().int().tolist()
     height, width = report.frames.shape[-2:]
     rows, columns = (max(0, length - abs(step)) for length, step in ((height, moved[1]), (width, moved[0])))
     if min(rows, columns) < 32:  # px; the two frames have too little in common
@@ -185,14 +198,29 @@ def frames_in_turn(report: Report, index: int, removed: Vibration, size: int = 4
         return frame[..., row + down : row + down + size, column + right : column + right + size]
 
     pairs = [(part(stack[first], 0, 0), part(stack[first + 1], moved[1], moved[0])) for stack in frames]
-    caption = f"Frames {first} and {first + 1}, {_region(row, column, size, size)}."
+    number = report.first + first
+    caption = f"Frames {number} and {number + 1}, {_region(row, column, size, size)}."
     if any(moved):
         shift = f"{-moved[0]} px along x and {-moved[1]} px along y"
-        caption += f" Frame {first + 1} is moved by {shift}, the uniform motion."
+        caption += f" Frame {number + 1} is moved by {shift}, the uniform motion."
     if len(frames) > 1:
         caption += " The motion between the input frames is the vibration"
         caption += "; it is absent from the restored frames where restoration is right."
-    return blink(pairs, names=names, frames=(first, first + 1), caption=caption)
+    return blink(pairs, names=names, frames=(number, number + 1), caption=caption)
+
+
+def _figures_of(result: DetectionResult, removed: Vibration, timing: SensorTiming, num_rows: int) -> dict[str, Drawing]:
+    """Figures of a detection, and of the part ``removed`` of its vibration, by the name of their file."""
+    figures = {
+        f"offsets_{name}": drawing(plots.offset_panels(result, [axis], 5.6, 4.4)[0])
+        for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes])
+    }
+    figures["offset_gain"] = drawing(plots.gain_figure(result, timing))
+    centre = removed.translation()
+    if bool(centre.moving_axes().any()):
+        figures["rows"] = drawing(plots.rows_figure(centre, timing, num_rows))
+        figures["psf"] = drawing(plots.psf_figure(centre, timing, num_rows))
+    return figures
 
 
 def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None = None) -> list[str]:
@@ -204,41 +232,47 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
     points, finer = report.restored.shape[-1] // report.frames.shape[-1], report.restored
     report = replace(report, restored=finer[..., ::points, ::points])
     num_rows = report.frames.shape[int(timing.scan_axis)]
-    removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
-    centre = removed.translation()
     index = len(report.frames) // 2 if len(report.restored) < len(report.frames) else 0
     before = report.frames[index]
     last = min(index, len(report.restored) - 1)
     after = report.restored[last] if report.was_restored else None
     detail = finer[last] if report.was_restored else before
-    axes = AXIS_NAMES[: result.vibration.num_axes]
-    figures = {
-        f"offsets_{name}": drawing(plots.offset_panels(result, [axis], 5.6, 4.4)[0]) for axis, name in enumerate(axes)
-    }
-    figures["offset_gain"] = drawing(plots.gain_figure(result, timing))
-    if bool(centre.moving_axes().any()):
-        figures["rows"] = drawing(plots.rows_figure(centre, timing, num_rows))
-        figures["psf"] = drawing(plots.psf_figure(centre, timing, num_rows))
     shown = (before,) if after is None else (before, after)
     names = ("input", "restored")[: len(shown)]
     measured, notes = measure_edges(_grey(before), _grey(detail), edges)
+    figures: dict[str, Drawing] = {}
+    detected: dict[str, Any] = {"tried": [], "residuals": []}
     for direction in sorted({edge.direction for edge in measured}):
         chosen = [edge for edge in measured if edge.direction == direction]
         curves = [[one.before for one in chosen if one.before is not None], [one.after for one in chosen]]
         of_names = dict(zip(names, curves, strict=False))
         figures[f"mtf_{direction}"] = drawing(plots.mtf_figure(of_names, points={names[-1]: points}))
     restored = report.was_restored
-    sentences = words.verdict_sentences(
-        result, removed, timing, num_rows, restored=restored, left_alone=report.left_alone, verdict=report.verdict
-    )
-    if not restored and report.windows is not None and report.windows.totals()["restored"]:
-        sentences[0] = words.WINDOWS_RESTORED
-    mark = words.overall_result(result, report.verdict, restored)[0]
-    if restored and report.windows is not None and report.windows.followed() is not None:
-        verdict = report.verdict
-        sentences = [words.FOLLOWED, *([] if verdict is None else sentences[-1:])]
-        mark = "good" if verdict is not None and verdict.overall == "helps" else "doubt"
-    tried = [] if restored else words.tried_sentences(result, report.options, report.verdict, sentences[1:])
+    shape = report.frames.shape
+    if result is None:
+        assert report.windows is not None
+        totals, followed = report.windows.totals(), report.windows.followed()
+        mark = "good" if totals["outcomes"].get("helps") == totals["windows"] else "doubt"
+        sentences, shape = [words.FOLLOWED], report.windows.input["shape"]
+        motion = torch.zeros(2) if followed is None else followed.vibration.image_motion[report.first]
+    else:
+        removed = trusted_vibration(result, timing, len(report.frames), num_rows)[0].to("cpu")
+        motion = removed.image_motion
+        sentences = words.verdict_sentences(
+            result, removed, timing, num_rows, restored=restored, left_alone=report.left_alone, verdict=report.verdict
+        )
+        if not restored and report.windows is not None and report.windows.totals()["restored"]:
+            sentences[0] = words.WINDOWS_RESTORED
+        mark = words.overall_result(result, report.verdict, restored)[0]
+        if not restored:
+            detected["tried"] = words.tried_sentences(result, report.options, report.verdict, sentences[1:])
+        figures |= _figures_of(result, removed, timing, num_rows)
+        detected["residuals"] = [
+            (name, f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]}")
+            for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes])
+        ]
+        detected["tones"] = words.detected_tones(result)
+        detected["at_centre"] = " at the centre of the frame" if removed.num_axes > 2 else ""
     windows = None
     if report.windows is not None:
         vibration, restoration = report.windows.lines()
@@ -251,22 +285,17 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         "title": report.title,
         "mark": mark,
         "verdict": sentences if restored else sentences[:1],
-        "tried": tried,
+        **detected,
         "frames_title": "Input and restored frame" if restored else "Input frame",
         "overview": whole_frame(report, index, shown, names),
-        "blink": frames_in_turn(report, index, removed),
+        "blink": frames_in_turn(report, index, motion),
         "details": [] if after is None else _details(before, detail, names),
         "figures": figures,
-        "residuals": [
-            (name, f"{float(result.residual[axis]):.3g} {AXIS_UNITS[axis]}") for axis, name in enumerate(axes)
-        ],
-        "tones": words.detected_tones(result),
-        "at_centre": " at the centre of the frame" if removed.num_axes > 2 else "",
         "windows": windows,
         "mtf_head": ["edge", "direction", "angle", *(f"MTF50 of the {name} frame (cycles/px)" for name in names)],
         "mtf_rows": [edge.row(restored) for edge in measured],
         "mtf_notes": notes,
-        "camera": words.camera_rows(timing, report.frames.shape),
+        "camera": words.camera_rows(timing, shape),
         "about": words.about_rows(report.created, report.version, report.command, report.options if restored else {}),
         "terms": words.TERMS,
     }

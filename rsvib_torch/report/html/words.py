@@ -54,8 +54,9 @@ WINDOWS_RESTORED = (
     "Windows of the stack were restored before, see below; all frames together have no steady vibration that can be "
     "removed, and are unchanged on this page."
 )
-
-FOLLOWED = "The vibration changes. It was followed from frame to frame before, see below, and is removed here as well."
+FOLLOWED = (
+    "The vibration was followed from frame to frame, and removed, by rsvib run. The page shows two of its frames."
+)
 
 
 def overall_result(result: DetectionResult, verdict: RestorationVerdict | None, restored: bool) -> tuple[Mark, str]:
