@@ -318,8 +318,7 @@ class ReportOptions(shared.RestorationCommand, shared.VerdictOptions):
 def report(given: ReportOptions) -> Answer:
     """Detect, restore, and write an HTML page with all figures.
 
-    Detection, restoration and verdict are those of rsvib run. The page is one file that needs no network. The
-    figures are also written as PNG files.
+    Detection, restoration and verdict are those of rsvib run. The page needs no network; figures are also PNG files.
     """
     settings, frames, out = given.settings, given.stack, given.out
     list(map(_edge_box, given.edge or ()))  # errors before anything is computed

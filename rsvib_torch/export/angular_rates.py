@@ -43,16 +43,31 @@ def write_gcsv(
     *,
     sample_rate: Annotated[float, Field(ge=1, le=1e9)] | None = None,
 ) -> None:
-    """Write the angular rates of the camera as ``.gcsv``, the gyroscope log that Gyroflow reads (docs/export.md).
+    """Write the angular rates of the camera as ``.gcsv``, the gyroscope log that Gyroflow reads.
 
-    Rates are those about the axes of the camera, x to the right, y down, z forward, at times since the exposure start
-    of the first row of frame 0, even with reverse readout. By default the sample rate is the lowest of 1, 2, 4 ... kHz
-    with which the attitude by the trapezoidal rule is within 2e-7 rad of ``motion.attitude`` at all times. The first
-    sample lies at or before time 0. Gyroflow dates a frame at the middle of its readout, so that its synchronisation
-    finds an offset of half of ``frame_readout_time`` plus half of the exposure time.
+    Columns ``gx, gy, gz`` are the rates about the axes of the camera (``Camera``): x to the right, y down, z forward,
+    right-handed, in rad/s after multiplication by ``gscale``; the line ``orientation,yxz`` states these axes in terms
+    of Gyroflow's (x up, y to the left, z backward). ``t`` times ``tscale`` is the time in seconds since the exposure
+    start of the first row of frame 0, even with reverse readout. A sample is the rate at its time, not a mean. The
+    attitude at a sample follows from the one before by the rotation ``exp(dt (omega_before + omega) / 2)`` (the
+    trapezoidal rule): by default the sample rate is the lowest of 1, 2, 4 ... kHz with which this is within 2e-7 rad
+    of ``motion.attitude`` at all times. The first sample lies at or before time 0, where the attitude is
+    ``motion.attitude`` of that time; it is not in the file.
 
-    The motion, in image axes, needs a camera and must not zoom. The samples cover the exposures of ``num_frames``
-    frames of a ``size`` (height, width).
+    Gyroflow dates a frame at the middle of its readout, so that its synchronisation finds an offset of half of
+    ``frame_readout_time`` plus half of the exposure time between this clock and that of the video.
+
+    Args:
+        path: The file to write; an existing file is replaced.
+        motion: One motion with a camera, in image axes.
+        timing: The sensor.
+        size: (height, width) of the frames.
+        num_frames: Number of frames; the samples cover their exposures.
+        sample_rate: Samples per second; by default as stated above.
+
+    Raises:
+        ValueError: If the motion has no camera, is a batch, or zooms, which rates do not contain; or if too many
+            samples are necessary.
 
     Example:
         >>> import tempfile

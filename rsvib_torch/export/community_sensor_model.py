@@ -77,6 +77,9 @@ def camera_isd(
         radii: Semi-major and semi-minor axis of the body in km; by default those of the Earth.
         ephemeris_time: Time of the middle of the frame in s.
 
+    Returns:
+        The ISD, which ``json.dump`` can write.
+
     Example:
         >>> isd = camera_isd(Camera(2e5), (1024, 1024), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
         >>> isd["focal_length_model"], isd["detector_center"]
@@ -134,22 +137,37 @@ def write_isd(
 ) -> Literal["frame", "line-scan"]:
     """Write the ISD of one frame of a vibrating camera, for the Community Sensor Model.
 
-    The given ISD describes the camera at rest. The pixel at p of the frame, whose row is displaced by D (mean over its
-    exposure), has the ray of the camera at rest at p - D. Two models are available (docs/export.md):
+    The given ISD describes the camera at rest: without the motion, pixel and ray belong together as it states. The
+    pixel at p of the frame, whose row is displaced by D (mean over its exposure), has the ray of the camera at rest at
+    p - D. Two models are available:
 
-    * ``"frame"``: the ISD with polynomials ``jitter`` of the lowest degree up to 12 that suffices. They hold for all
-      columns, and the exposure times have a step at every line, so that this model is for slow motion without roll.
-    * ``"line-scan"``: a line scanner with one quaternion per row, whose rows have the rays of one line of the sensor:
-      for narrow fields of view, and for rows read from top to bottom.
+    * ``"frame"``: the ISD with polynomials ``jitter`` for lines (the displacement along y) and samples (along x), of
+      the lowest degree up to 12 that suffices. They hold for all columns, and the exposure times have a step at every
+      line, so that this model is for slow motion without roll. ``lineExposureTimes`` are seconds since one readout
+      duration before the exposure of the first row, since the polynomials are zero at time 0.
+    * ``"line-scan"``: a line scanner with one quaternion per row. All rows have the rays of one line of the sensor,
+      which a rotation takes to their place: a row at y px from the principal point is wider by the factor
+      ``sqrt(1 + y^2 / f^2)``, so that this model is for narrow fields of view, and for rows read from top to bottom.
+      The position is constant during the frame; uniform image motion is part of the quaternions.
 
-    The motion, in image axes, needs no camera; if it has one, its focal length must be that of the ISD. ``isd`` is that
-    of the camera as a mapping or JSON file, or that of ``camera_isd``; fields that do not concern the motion are kept.
-    Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used, which becomes the middle
-    of the frame. ``model="auto"`` is the first that is accurate enough; ``tolerance`` is the largest error of a
-    position in px, in both directions between image and ground.
+    Args:
+        path: The file to write; an existing file is replaced, but not that of ``isd``.
+        motion: One motion, in image axes. A camera is not required; if it has one, its focal length must be that of
+            the ISD.
+        timing: The sensor, with image rows as rows.
+        isd: The ISD of the camera as a mapping or JSON file, or that of ``camera_isd``. Fields that do not concern the
+            motion are kept. Of several positions and quaternions, those nearest to ``center_ephemeris_time`` are used,
+            which becomes the middle of the frame.
+        frame: Number of the frame.
+        model: ``"frame"``, ``"line-scan"``, or ``"auto"`` for the first of them that is accurate enough.
+        tolerance: Largest error of a position in px, in both directions between image and ground.
 
     Returns:
-        The model that was written. An error states why no permitted model is accurate enough.
+        The model that was written.
+
+    Raises:
+        ValueError: If the motion is a batch, the ISD lacks a field or has another focal length, columns are exposed one
+            after another, or no permitted model is accurate enough; the message states the errors and their reasons.
 
     Example:
         >>> import tempfile

@@ -82,12 +82,28 @@ def write_stmap(
 ) -> list[Path]:
     """Write the ``sampling_map`` of every frame as a float32 TIFF with three channels: an STMap.
 
-    The first two channels are the position (x, y) of ``sampling_map``, for ``"nuke"`` as
-    ``((x + 0.5) / width, (height - 0.5 - y) / height)``, for ``"opencv"`` in px from the centre of the first pixel, as
-    ``cv2.remap`` uses it (docs/export.md). The third channel is 1 where it lies in the recorded frame, else 0.
+    The first two channels are the position (x, y) in px of ``sampling_map``, counted from the centre of the first
+    pixel, in one of two conventions:
 
-    The folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ... is created, and files of these names are replaced; their
-    paths are returned. Other arguments are those of ``sampling_map``.
+    * ``"nuke"``: ``((x + 0.5) / width, (height - 0.5 - y) / height)``: red is 0 at the left and 1 at the right edge of
+      the recorded frame, green 0 at its bottom and 1 at its top; a map that changes nothing has
+      ``(0.5 / width, 1 - 0.5 / height)`` in its top left pixel. This is what the STMap node of Nuke samples. Load the
+      files as raw data, without a colour space.
+    * ``"opencv"``: (x, y) themselves, the maps of ``cv2.remap``.
+
+    The third channel is 1 where the position lies in the recorded frame, else 0. In float32 the positions are rounded
+    by at most 2.5e-4 px in frames of 8192 px; a TIFF of 16 bits would round them by up to 0.06 px.
+
+    Args:
+        folder: Folder for ``stmap_0000.tif``, ``stmap_0001.tif`` ...; it is created, files of these names are replaced.
+        motion: One motion, in image axes.
+        timing: The sensor.
+        size: (height, width) of the frames.
+        num_frames: Number of frames.
+        convention: ``"nuke"`` or ``"opencv"``.
+
+    Returns:
+        The files.
 
     Example:
         >>> import tempfile

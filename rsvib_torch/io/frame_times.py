@@ -135,8 +135,12 @@ def timing_of_stack(timing: SensorTiming, info: StackInfo) -> SensorTiming:
 def timing_from_first_frame(timing: SensorTiming, info: StackInfo) -> SensorTiming:
     """The timing of a stack: the sensor, with the frame times of the file relative to the first frame.
 
-    Those of the sensor, if it has any, are kept. A ``TimingWarning`` states if the file, which ``info`` from
-    ``read_stack_info`` describes, has another frame rate than the sensor, or irregular times that are too rough.
+    Args:
+        timing: The sensor. Its own ``frame_start_times``, if it has any, are kept.
+        info: What the file states, from ``read_stack_info``.
+
+    Warns:
+        TimingWarning: If the file states another frame rate than the sensor has, or irregular times that are too rough.
 
     Example:
         >>> import rsvib_torch as rsv

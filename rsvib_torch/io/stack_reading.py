@@ -32,8 +32,15 @@ _MAX_FRAMES = 10**7  # frames; reading that many frames of one pixel takes a min
 def open_stack(path: PathLike) -> FrameReader:
     """Open a stack to read its frames one at a time; call ``close`` on the result.
 
-    The path is as in ``read_stack``. The result has ``info``, ``frame(index)`` and ``close()``; damage of single frames
-    is detected when they are read.
+    Args:
+        path: As in ``read_stack``.
+
+    Returns:
+        An object with ``info``, ``frame(index)`` and ``close()``.
+
+    Raises:
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
+        ValueError: If it is not a readable stack. Damage of single frames is detected when they are read.
 
     Example:
         >>> reader = open_stack("frames.tif")  # doctest: +SKIP
@@ -57,6 +64,11 @@ def read_stack_info(path: PathLike) -> StackInfo:
     """Read what a file states about its stack: shape, data type and full scale, without its pixels.
 
     Arguments and errors are those of ``open_stack``; unknown values are None.
+
+    Example:
+        >>> info = read_stack_info("frames.tif")  # doctest: +SKIP
+        >>> info.shape, info.dtype, info.full_scale  # doctest: +SKIP
+        ((3, 64, 48), 'uint16', 4095.0)
     """
     with closing(open_stack(path)) as reader:
         return reader.info

@@ -161,6 +161,10 @@ def write_stack(
             NaN as its nodata value; ``metadata_not_kept`` lists those that are not. If both files are videos, the
             presentation times of the frames and the audio are copied. Its file must not be ``path``.
 
+    Raises:
+        OSError: If the file cannot be written.
+        ValueError: If the format does not support them, the full scale is unknown, or ``path`` is the file of ``like``.
+
     Example:
         >>> import tempfile
         >>> import torch

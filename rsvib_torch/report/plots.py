@@ -76,7 +76,13 @@ def tones_text(result: DetectionResult, axis: int) -> list[str]:
 def save_figure(
     figure: Figure, path: str | os.PathLike[str], *, dpi: Annotated[int, Field(ge=1, le=10_000)] = 150
 ) -> None:
-    """Write a figure as an image file, atomically; its ending selects the format (``.png``, ``.svg``, ``.pdf``)."""
+    """Write a figure as an image file, atomically.
+
+    Args:
+        figure: The figure.
+        path: The file to write; its ending selects the format (``.png``, ``.svg``, ``.pdf``).
+        dpi: Pixels per inch.
+    """
     write_figure(figure, path, dpi)
 
 
@@ -251,13 +257,18 @@ def windows_figure(
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 
-    Points of axes that are not reliable are hollow and do not determine the range of the axis. There is a detection for
-    each of the ``times``, None where it failed.
+    Points of axes that are not reliable are hollow and do not determine the range of the axis.
+
+    Args:
+        times: Position of each window on the horizontal axis.
+        detections: The detection of each window (not a batch); None where it failed.
+        time_label: Label of the horizontal axis.
 
     Example:
-        >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
-        >>> parts = [rsv.detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
+        >>> from rsvib_torch.datasets import example_frames
+        >>> from rsvib_torch.detection import detect_vibration
+        >>> frames, timing, _ = example_frames(num_frames=4)
+        >>> parts = [detect_vibration(part, timing, tones=1) for part in (frames[:2], frames[2:])]
         >>> len(windows_figure([0.0, 2 * timing.frame_period], parts).axes)
         4
     """
@@ -304,9 +315,12 @@ def _batch_figure(results: DetectionResult) -> Figure:
 
 @checks_arguments
 def motion_figure(motion: Motion, first: float = 0.0, last: float | None = None) -> Figure:
-    """Draw the displacement of a motion (not a batch) over time, from ``first`` to ``last`` in seconds.
+    """Draw the displacement of a motion along both axes over time.
 
-    By default, all of a free motion is drawn, and four periods of the tone of lower frequency of others.
+    Args:
+        motion: The motion (not a batch).
+        first: Start of the drawing in seconds.
+        last: End of the drawing; by default that of a free motion, or four periods of the tone of lower frequency.
 
     Example:
         >>> motion_figure(Vibration([3.1, 5.2], [50.0, 30.0])).axes[0].get_xlabel()
@@ -547,7 +561,12 @@ def comparison_figure(
 ) -> Figure:
     """Draw crops of an input frame and a restored frame below each other, where detail is strongest.
 
-    Both frames are (H, W) or (C, H, W) with full scale 1; there are ``count`` crops with a side of ``size`` px.
+    Args:
+        raw: (H, W) or (C, H, W), full scale 1.
+        restored: The same shape.
+        count: Number of crops.
+        size: Side of the crops in px.
+        names: Titles of the two rows of panels.
 
     Example:
         >>> frame = torch.rand(96, 128, generator=torch.Generator().manual_seed(0))

@@ -26,7 +26,13 @@ from rsvib_torch.text import quoted
 
 @checks_arguments
 def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timing: SensorTiming | None = None) -> None:
-    """Write a detection (not a batch) as ``vibration.json``, with the timing, by default ``result.timing``."""
+    """Write a detection as ``vibration.json``: vibration, standard deviations, verdict, offset curve and timing.
+
+    Args:
+        path: The file to write; an existing file is replaced.
+        result: A detection (not a batch).
+        timing: The sensor; by default ``result.timing``.
+    """
     check_single("result", result)
     timing = timing or result.timing
     if timing is None:
@@ -38,13 +44,18 @@ def write_vibration(path: str | os.PathLike[str], result: DetectionResult, timin
 def read_vibration(path: str | os.PathLike[str], timing: SensorTiming | None = None) -> DetectedVibration:
     """Read a ``vibration.json``, as ``restore`` needs it; ``DetectionResult.load`` also reads its offset curve.
 
-    It was written by ``write_vibration``, ``DetectionResult.save`` or the program. The ``timing`` of the frames to be
-    restored must be that of the file; None does not compare them.
+    Args:
+        path: A file written by ``write_vibration``, ``DetectionResult.save`` or the program.
+        timing: The sensor of the frames to be restored, which must be that of the file; None not to compare them.
+
+    Raises:
+        ValueError: If it is not a complete ``vibration.json``, or was detected with another timing.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> path = tempfile.mkdtemp() + "/vibration.json"
         >>> rsv.write_vibration(path, rsv.detect_vibration(frames, timing))
         >>> rsv.read_vibration(path, timing).vibration.frequency[:, 0].round().tolist()  # Hz
@@ -120,12 +131,16 @@ def write_columns(path: str | os.PathLike[str], columns: Mapping[str, Iterable[o
 def write_table(path: str | os.PathLike[str], result: Result, *, pixel_size: float | None = None) -> None:
     """Write ``result.table()`` as CSV: tones of a detection or of the windows of a manifest, or a spectrum.
 
-    Unknown values are empty cells. The size of a pixel in m adds columns in um, um/s and m/s^2.
+    Args:
+        path: The file to write; an existing file is replaced.
+        result: A result that has a table. Its unknown values are empty cells.
+        pixel_size: Size of a pixel in m, to add columns in um, um/s and m/s^2.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> path = tempfile.mkdtemp() + "/tones.csv"
         >>> rsv.write_table(path, rsv.detect_vibration(frames, timing, tones=1))
         >>> with open(path) as file:

@@ -23,11 +23,17 @@ class VibrationCorrector(nn.Module):
 
     Gradients flow to the frames through the restoration; the detected vibration is constant for them. The module has no
     weights. What ``torch.export`` and ONNX accept is the restoration with a given vibration, ``FixedDewarp``: the
-    number of steps of a detection depends on the frames. ``detection`` and ``restoration`` are their options.
+    number of steps of a detection depends on the frames.
+
+    Args:
+        timing: The sensor.
+        detection: Options of ``detect_vibration``.
+        restoration: Options of ``restore``.
 
     Example:
         >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames()
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, _ = example_frames()
         >>> corrector = rsv.VibrationCorrector(timing, restoration={"method": "dewarp"})
         >>> corrector
         VibrationCorrector(

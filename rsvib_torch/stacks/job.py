@@ -410,11 +410,18 @@ def restore_block(
         frames: (T, H, W) or (T, C, H, W), as stored.
         timing: The sensor; frames must be evenly spaced, because the position of the block in the stack is unknown.
         detection: Options of ``detect_vibration``.
-        restoration: Options of ``restore`` that keep the size, for frames whose full scale is 1.
+        restoration: Options of ``restore``, for frames whose full scale is 1; not ``joint=True``.
         full_scale: Count that corresponds to 1.0; 255 for ``uint8`` if not given, required for other integers.
         channels: ``"last"`` for frames (T, H, W, C), as in ``detect_vibration``.
         force: Whether to return restored frames even if they are judged worse than the raw ones.
         device: Device for the computation.
+
+    Returns:
+        Restored frames.
+
+    Raises:
+        ValueError: If the timing has frame start times, ``joint=True``, the full scale is unknown, or the frames appear
+            to have their channels last.
 
     Example:
         >>> restored = array.map_overlap(  # doctest: +SKIP

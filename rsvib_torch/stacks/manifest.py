@@ -340,5 +340,17 @@ def manifest_text(
 
 @checks_arguments
 def read_manifest(path: str | os.PathLike[str]) -> StackManifest:
-    """Read the ``manifest.json`` of a complete run."""
+    """Read the manifest of a complete run.
+
+    Args:
+        path: The ``manifest.json``.
+
+    Raises:
+        ValueError: If it is not a complete manifest.
+
+    Example:
+        >>> manifest = read_manifest("restored.tif.manifest.json")  # doctest: +SKIP
+        >>> manifest.detections()[0].vibration.frequency[:, 0].tolist()  # Hz, first window  # doctest: +SKIP
+        [110.0, 90.0]
+    """
     return StackManifest.load(path)

@@ -43,6 +43,9 @@ def iterate_stack(source: PathLike, timing: SensorTiming, options: StackOptions)
     Yields:
         One ``WindowResult`` per window, in order.
 
+    Raises:
+        ValueError: If a value is out of range, the stack is not readable, or a window does not fit into the memory.
+
     Example:
         >>> for result in iterate_stack("frames.tif", timing, window=3):  # doctest: +SKIP
         ...     print(result.indices, result.detection.vibration.frequency[:, 0].round().tolist())
@@ -79,9 +82,10 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
 def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options: ProcessStackOptions) -> StackReport:
     """Restore a stack of any length from file to file.
 
-    The stack is cut into windows as in ``iterate_stack``; results do not depend on memory, workers and scheduler. The
-    output gets its name when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from
-    which an interrupted run can be resumed. Memory does not grow with the number of frames.
+    The stack is cut into windows as in ``iterate_stack``. They depend only on the number of frames and ``window``, and
+    each is computed on one thread: results do not depend on memory, workers and scheduler. The output gets its name
+    when it is complete; until then it is stored in the folder ``.NAME.rsvib`` beside it, from which an interrupted run
+    can be resumed. Memory does not grow with the number of frames.
 
     Frames that cannot be read or used (constant, infinite, beyond full scale) are listed in the manifest; the other
     frames of their window are restored without them. A window in which the detection fails is written unchanged.
@@ -93,16 +97,22 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         timing: As in ``iterate_stack``.
         options: Options.
 
+    Returns:
+        Summary of the run.
+
     Raises:
         FileExistsError: If there is an interrupted run and ``resume`` is False.
+        ModuleNotFoundError: If an optional package is missing, with the extra to install.
         OSError: If a file cannot be read or written; the run can then be resumed.
-        ValueError: If a window does not fit into the memory, detection fails in all first windows, an output is or
-            contains the input or lies inside it, or input, settings or versions differ from those of the run to resume.
+        ValueError: If a value is out of range, the stack is not readable, a window does not fit into the memory,
+            detection fails in all first windows, an output is or contains the input or lies inside it, input, settings
+            or versions differ from those of the run to resume, or its journal is damaged.
 
     Example:
         >>> import tempfile
         >>> import rsvib_torch as rsv
-        >>> frames, timing, _ = rsv.datasets.example_frames(num_frames=4)
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, _ = example_frames(num_frames=4)
         >>> folder = tempfile.mkdtemp()
         >>> rsv.write_stack(f"{folder}/frames.npy", frames)
         >>> options = {"window": 3, "detection": {"tones": 1}, "restoration": {"method": "dewarp"}}

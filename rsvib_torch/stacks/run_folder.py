@@ -315,6 +315,12 @@ class StackReport(Summarised):
         first: Result of the first window, if it was computed in this process.
         manifest: Path of the manifest.
         not_kept: Metadata of the input that the output does not contain.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> report = rsv.process_stack("frames.tif", "restored.tif", timing)  # doctest: +SKIP
+        >>> report.frames, report.windows, report.restored, report.failed  # doctest: +SKIP
+        (200, 28, 28, 0)
     """
 
     frames: int

@@ -54,7 +54,6 @@ WINDOWS_RESTORED = (
     "Windows of the stack were restored before, see below; all frames together have no steady vibration that can be "
     "removed, and are unchanged on this page."
 )
-
 FOLLOWED = (
     "The vibration was followed from frame to frame, and removed, by rsvib run. The page shows two of its frames."
 )
