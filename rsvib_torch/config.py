@@ -48,7 +48,8 @@ def simulation_section() -> Any:
     class CameraSection(Section):
         focal_length: float
         principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
-        distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=5, max_length=5)
+        distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=4, max_length=5)
+        fisheye: bool = False
 
     class VibrationSection(Section):
         """Fields of ``Vibration``, which checks their values; an axis is one number (one tone) or a list of tones."""
@@ -118,7 +119,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     Args:
         path: The TOML file; None if ``sensor`` describes the camera.
         sensor: Keys of ``[sensor]`` that replace those of the file. ``exposure_time`` also replaces ``exposure_rows``,
-            ``frame_rate`` also ``frame_rows``, and vice versa.
+            ``frame_rate`` also ``frame_rows``, ``row_time`` also ``row_time_std``, and vice versa.
 
     Raises:
         ValueError: If it is not TOML, or keys are missing, unknown or have a wrong type or value: one line for each.
@@ -133,7 +134,7 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     if sensor:
         stated = data.get("sensor", {})
         if isinstance(stated, dict):
-            same = ({"exposure_time", "exposure_rows"}, {"frame_rate", "frame_rows"})
+            same = ({"exposure_time", "exposure_rows"}, {"frame_rate", "frame_rows"}, {"row_time", "row_time_std"})
             replaced = set(sensor).union(*(pair for pair in same if pair & set(sensor)))
             stated = {name: value for name, value in stated.items() if name not in replaced}
             data["sensor"] = {**stated, **sensor}

@@ -472,6 +472,9 @@ class ProcessVideoOptions(RunOptions, ResourceOptions):
     gyroscope: FilePath = None
     """File with the rates of a gyroscope, as in ``read_gyroscope``, or ``"auto"``: the track of the video itself. The
     path of the camera is its rotation by the gyroscope, instead of the path and the tones by corners."""
+    lens_profile: FilePath = None
+    """With ``gyroscope``: lens profile of Gyroflow (JSON), as in ``Camera.from_gyroflow``. By default, a focal length
+    without distortion is fitted."""
     restoration: OptionTable = None
     """``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames whose full scale
     is 1. Without ``saturation``, saturated pixels count as measured: their values are restored 0.2 dB worse if 1 % of

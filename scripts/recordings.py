@@ -18,7 +18,6 @@ import argparse
 import csv
 import statistics
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from harness import table
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.interpolate import CubicSpline
-from scipy.signal import hilbert
 
 import rsvib_torch as rsv
 
@@ -44,7 +42,6 @@ SCENE_ROWS = 400  # of the phone's 600; the dashboard below moves with the camer
 CLOCK_RANGE = (-0.05, 0.07)  # s, of the phone's gyroscope from the clock of the frames
 DRONE_CAMERA = rsv.Camera(400.0)  # px; 94 degrees across, typical of this camera: the amplitude in px scales with it
 DRONE_RATE = 30000 / 1001  # frames per second
-LINE_WIDTH = 4.0  # Hz, half the width of the band around the line
 WINDOW, WINDOWS = 10, 6  # frames of a row time, and row times of a recording
 
 
@@ -98,39 +95,24 @@ def windows(count: int) -> range:
 
 
 def row_times(folder: Path) -> None:
-    """Row times of windows of frames, whose scatter is an error that does not depend on their standard deviations.
-
-    Of the phone with its gyroscope and from the frames alone, of the drone from the frames alone.
-    """
+    """Row times of windows of frames, whose scatter is an error that does not depend on their standard deviations."""
     times, frames = phone_frames(folder)
     rate = (len(times) - 1) / (times[-1] - times[0])
-    with (folder / "phone_gyro" / "gyroscope.csv").open(newline="") as text, tempfile.TemporaryDirectory() as scratch:
-        rates = [(row["time_s"], row["x_rad_s"], row["y_rad_s"]) for row in csv.DictReader(text)]
-        motion = Path(scratch) / "motion.csv"
-        motion.write_text("time,x,y\n" + "\n".join(",".join(row) for row in rates) + "\n")
-        focal_length = PHONE_CAMERA.focal_length
-        recorded = rsv.read_motion(motion, unit="rad/s", focal_length=focal_length, signs=(1.0, -1.0))
-    for model in ("gyroscope", "frames alone"):
-        found = []
-        for first in windows(len(times)):
-            options = {}
-            if model == "gyroscope":
-                offsets = tuple(times[first] + clock for clock in CLOCK_RANGE)
-                options = {"recorded": recorded, "offsets": offsets, "fit_gain": True}
-            result = rsv.calibrate_row_time_by_motion(
-                frames[first : first + WINDOW, ..., :SCENE_ROWS, :],
-                frame_rate=rate,
-                row_time=(5e-6, 1 / (rate * 600)),
-                exposure_time=PHONE_EXPOSURE,
-                **options,
-            )
-            print(f"phone, {model}, frames {first} to {first + WINDOW - 1}:\n{result}\n", flush=True)
-            if result.row_time is not None:
-                found.append(1e6 * result.row_time * (1 if result.readout_direction != "reverse" else -1))
-        if len(found) > 1:
-            listed = ", ".join(f"{value:.2f}" for value in found)
-            spread = f"standard deviation of a window {statistics.stdev(found):.2f} us ({listed})"
-            print(f"phone, {model}: median {statistics.median(found):.2f} us, {spread}")
+    found = []
+    for first in windows(len(times)):
+        result = rsv.calibrate_row_time_by_motion(
+            frames[first : first + WINDOW, ..., :SCENE_ROWS, :],
+            frame_rate=rate,
+            row_time=(5e-6, 1 / (rate * 600)),
+            exposure_time=PHONE_EXPOSURE,
+        )
+        print(f"phone, frames {first} to {first + WINDOW - 1}:\n{result}\n", flush=True)
+        if result.row_time is not None:
+            found.append(1e6 * result.row_time * (1 if result.readout_direction != "reverse" else -1))
+    if len(found) > 1:
+        listed = ", ".join(f"{value:.2f}" for value in found)
+        spread = f"standard deviation of a window {statistics.stdev(found):.2f} us ({listed})"
+        print(f"phone: median {statistics.median(found):.2f} us, {spread}")
     frames = rsv.read_stack(folder / "drone_gyro" / "karma.mp4")
     for first in windows(len(frames)):
         result = rsv.calibrate_row_time_by_motion(frames[first : first + WINDOW], frame_rate=DRONE_RATE)
@@ -192,85 +174,14 @@ def print_differences(found: rsv.RotationAlignment) -> None:
 
 
 def drone(folder: Path) -> None:
-    """The line near 167 Hz of the drone's gyroscope, or its alias above half of the sample rate, in its frames.
-
-    The line, times an unknown complex factor, is fitted to the offsets of the row bands of all frames.
-    """
+    """Alignment of the drone's gyroscope, which turns too little between frames."""
     path = folder / "drone_gyro" / "karma.mp4"
-    rates, times, frames = rsv.read_gyroscope(path), rsv.read_stack_info(path).frame_times, rsv.read_stack(path)
-
-    def timing(starts: tuple[float, ...]) -> rsv.SensorTiming:
-        row_time = 30e-6
-        return rsv.SensorTiming(
-            row_time, DRONE_EXPOSURE / row_time, 1 / DRONE_RATE / row_time, frame_start_times=list(starts)
-        )
-
-    found = rsv.align_motion(frames[:60], timing(times[:60]), rates, camera=DRONE_CAMERA, offsets=(-0.1, 0.1))
+    rates, times, row_time = rsv.read_gyroscope(path), rsv.read_stack_info(path).frame_times[:60], 30e-6
+    frame_rows = 1 / DRONE_RATE / row_time
+    timing = rsv.SensorTiming(row_time, DRONE_EXPOSURE / row_time, frame_rows, frame_start_times=list(times))
+    found = rsv.align_motion(rsv.read_stack(path)[:60], timing, rates, camera=DRONE_CAMERA, offsets=(-0.1, 0.1))
     print(f"drone, 60 frames:\n{found}")
     print_differences(found)
-    curve = rsv.register_bands(frames, timing(times), method="phase")
-    print(f"drone, line in {len(frames)} frames (amplitudes in px, before the average over the exposure)")
-    for row_time in (20e-6, 30e-6, 40e-6, 50e-6, 60e-6):
-        line(rates, curve.offsets.numpy(), curve.rows.numpy(), np.array(times), row_time)
-
-
-def line(rates: rsv.AngularRates, offsets: Array, rows: Array, frame_times: Array, row_time: float) -> None:
-    """Amplitude of the line and of its alias in the offsets of the bands, for one row time.
-
-    The axis with the largest line gives its phase; the factor between it and the image is unknown. The times of
-    the gyroscope are those of the packets in the video; the clocks agree to 2e-4, by the exposures in the file.
-    """
-    samples, times = rates.rates.numpy(), rates.times.numpy()
-    rate = (len(times) - 1) / (times[-1] - times[0])
-    frequency = np.fft.rfftfreq(len(samples), 1 / rate)
-    spectrum = np.abs(np.fft.rfft(samples * np.hanning(len(samples))[:, None], axis=0)) * (frequency > 120)[:, None]
-    centre, axis = frequency[spectrum.max(1).argmax()], spectrum.max(0).argmax()
-    near = np.fft.rfft(samples[:, axis]) * (np.abs(frequency - centre) < LINE_WIDTH)
-    envelope = hilbert(np.fft.irfft(near, len(samples))) * np.exp(-2j * np.pi * centre * times)
-    for name, hertz, slow in (("line", centre, envelope), ("alias", rate - centre, envelope.conj())):
-        angle = DRONE_CAMERA.focal_length * slow / (2j * np.pi * hertz)  # px
-        exposed = np.sinc(hertz * DRONE_EXPOSURE)
-        size = float(np.sqrt((np.abs(angle) ** 2).mean()))
-        found = {"x": (0.0, 0.0), "y": (0.0, 0.0)}  # the largest gain within the error of the ratio of the clocks
-        for drift in np.linspace(-2e-4, 2e-4, 9):
-            predicted = np.zeros(offsets.shape[:2], complex)
-            for starts, moved, sign in ((frame_times[1:], offsets[..., 1], 1.0), (frame_times[:-1], 0.0, -1.0)):
-                t = starts[:, None] + (rows + np.nan_to_num(moved)) * row_time + DRONE_EXPOSURE / 2
-                t *= 1.0 + drift
-                slowly = np.interp(t, times, angle.real) + 1j * np.interp(t, times, angle.imag)
-                predicted += sign * exposed * slowly * np.exp(2j * np.pi * hertz * t)
-            for index, label in enumerate("xy"):
-                found[label] = max(found[label], gain(offsets[..., index], predicted, rows))
-        for label, (factor, std) in found.items():
-            print(
-                f"  row time {1e6 * row_time:.0f} us, {name} {hertz:.2f} Hz, {label}: {factor * size:.4f} ± "
-                f"{std * size:.4f} px, 95 % limit {(factor + 2 * std) * size:.4f} px; gyroscope {size:.4f} px, of "
-                f"which the exposure leaves {abs(exposed):.2f}",
-                flush=True,
-            )
-
-
-def gain(offsets: Array, predicted: Array, rows: Array) -> tuple[float, float]:
-    """Size of the complex factor of the predicted offsets (P, N), and the standard deviation of each of its parts.
-
-    A cubic polynomial in the row is fitted to every pair of frames as well: other motion of the camera.
-    """
-    smooth = np.polynomial.legendre.legvander(2 * rows / rows.max() - 1, 3)
-    parts = []
-    for measured, expected in zip(offsets, predicted, strict=True):
-        good = np.isfinite(measured)
-        if good.sum() < 12:
-            continue
-        basis, _ = np.linalg.qr(smooth[good])
-        data = np.stack([measured[good], expected[good].real, -expected[good].imag], -1)
-        data -= basis @ (basis.T @ data)
-        parts.append(data[np.abs(data[:, 0]) < 4.5 * np.median(np.abs(data[:, 0]))])  # 3 standard deviations
-    data = np.concatenate(parts)
-    normal = data[:, 1:].T @ data[:, 1:]
-    factor = np.linalg.solve(normal, data[:, 1:].T @ data[:, 0])
-    rest = data[:, 0] - data[:, 1:] @ factor
-    variance = 2.0 * (rest**2).sum() / (len(data) - 4 * len(parts))  # bands overlap by half
-    return float(np.hypot(*factor)), float(np.sqrt(variance * np.linalg.inv(normal).diagonal().mean()))
 
 
 # A scanned eye

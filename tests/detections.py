@@ -58,5 +58,5 @@ def result_of(
         (),
         curve,
         fitted,
-        TimingSensitivity(*[gain] * 6),
+        TimingSensitivity(*[gain] * 9),
     )

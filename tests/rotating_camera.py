@@ -2,6 +2,7 @@
 
 import itertools
 
+import cv2
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates, spline_filter
@@ -33,10 +34,11 @@ def rates_of(times, size=1.0, step=1e-6):
     return (attitude(times - step, size).inv() * attitude(times + step, size)).as_rotvec() / (2 * step)
 
 
-def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUNT):
+def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUNT, fisheye=None):
     """Frames (T, H, W) of a distant scene, and of what is fixed to the camera in the last ``dashboard`` rows.
 
-    A subject on 62 % of the frame moves before the scene by ``subject`` of the time, (N, 2) px.
+    A subject on 62 % of the frame moves before the scene by ``subject`` of the time, (N, 2) px. The lens has the four
+    coefficients ``fisheye`` of OpenCV.
     """
     height, width = SIZE
     scene = draw_scene(height + 60, width + 60, 5)
@@ -45,6 +47,9 @@ def take(timing, size=1.0, *, noise=0.003, dashboard=0, subject=None, count=COUN
     line, lines = (row, height) if timing.scan_axis == -2 else (column, width)
     line = lines - 1 - line if timing.readout_direction == "reverse" else line
     ray = np.stack([column - (width - 1) / 2, row - (height - 1) / 2, np.full_like(row, FOCAL_LENGTH)], -1)
+    if fisheye is not None:
+        normal = cv2.fisheye.undistortPoints(ray[..., :2].reshape(-1, 1, 2) / FOCAL_LENGTH, np.eye(3), fisheye)
+        ray[..., :2] = FOCAL_LENGTH * normal.reshape(height, width, 2)
     frames = np.zeros((count, height, width))
     nodes, weights = np.polynomial.legendre.leggauss(3)
     for frame, (node, weight) in itertools.product(range(count), zip(nodes, weights, strict=True)):

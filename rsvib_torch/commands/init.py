@@ -119,14 +119,15 @@ def cameras(given: CamerasOptions) -> Answer:
     return Answer({"Cameras": [text_table(head, rows, most=len(rows))]}, {"cameras": data})
 
 
-def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> tuple[float, str]:
-    """Row time in s of a camera model in the mode of the frames, and where it comes from."""
+def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> tuple[dict[str, float], str]:
+    """Row time in s of a camera model in the mode of the frames, with its std, and where it comes from."""
     if "frame_rate" not in values:
         raise ValueError(f"the mode of {camera} depends on the frame rate: give --frame-rate")
     rows, columns = info.shape[-2:] if values.get("scan_axis") != "x" else info.shape[:-3:-1]
     mode = camera_mode(camera, width=columns, height=rows, frame_rate=values["frame_rate"])
     time = measured_text(1e6 * mode.row_time, 1e6 * mode.row_time_std)
-    return mode.row_time, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
+    found = {"row_time": mode.row_time, "row_time_std": mode.row_time_std}
+    return found, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
 
 
 def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -> str:
@@ -142,13 +143,15 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         note(f"frame rate {stated:.6g} per second, from the times in the file")
     elif stated is not None and not math.isclose(stated, given["frame_rate"], rel_tol=0.01):
         warn(f"--frame-rate is {given['frame_rate']:g}, the times in the file give {stated:.6g}")
-    source, likely, proposal = None, {}, ""
+    source, proposal = None, ""
+    likely: dict[str, float] = {}
     if camera is not None:
-        values["row_time"], source = _row_time_of(camera, info, values)
+        known, source = _row_time_of(camera, info, values)
+        values |= known
         note(source)
     elif info.camera is not None and "row_time" not in given:
         try:
-            likely["row_time"], proposed = _row_time_of(info.camera, info, values)
+            likely, proposed = _row_time_of(info.camera, info, values)
             proposal = f' The file names its camera: --camera "{info.camera}" takes {proposed}.'
         except ValueError as error:
             proposal = f" The file names its camera, {info.camera}: {error}."
@@ -169,6 +172,8 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
             f"{math.degrees(track.turned):.2g} degrees, and their rows no longer show its motion"
         )
     _complete(values, rows, likely, proposal)
+    if "row_time" in likely and math.isclose(values["row_time"], likely["row_time"], rel_tol=1e-5):  # it was accepted
+        values["row_time_std"] = likely["row_time_std"]
     _check_timing(read_config(None, sensor=values).timing, rows)
     head = [
         f"Camera of {printable(path.name)}: {size}. Written by rsvib init.",
@@ -178,7 +183,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
         head.append(f"{source[0].upper()}{source[1:]}. Users measured it: confirm it with rsvib calibrate.")
     if info.frame_times is not None and not info.time_error:
         head.append("The frames file states the time of every frame, which all commands use.")
-    order = ("row_time", "exposure_time", "frame_rate", "scan_axis", "readout_direction", "full_scale")
+    order = ("row_time", "row_time_std", "exposure_time", "frame_rate", "scan_axis", "readout_direction", "full_scale")
     values = {"scan_axis": "y", "readout_direction": "forward"} | values
     return sensor_toml({name: values[name] for name in order if name in values}, head)
 

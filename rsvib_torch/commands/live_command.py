@@ -41,8 +41,6 @@ class LiveOptions(CameraOptions, RangeOptions):
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
     page: Annotated[int, Field(ge=0, le=65535)] | None = option(None, metavar="PORT")
     """Show the restored frames at http://127.0.0.1:PORT."""
-    preview: bool = False
-    """Show the restored frames in a window."""
     spectrogram: Path | None = option(None, metavar="NAME")
     """Write the spectrogram of both axes: NAME.png and NAME.zarr."""
     max_frequency: float = option(250.0, metavar="HZ")
@@ -175,8 +173,6 @@ def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> l
         outputs.append(video.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))
     if stream is not None:
         outputs.append(video.PipeOutput(stream))
-    if given.preview:
-        outputs.append(video.PreviewOutput())
     if given.page is not None:  # the last one, because it is the only one that is opened before the first frame
         served = video.PageOutput(given.page)
         outputs.append(served)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -24,6 +26,8 @@ from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit,
 from rsvib_torch.text import measured_text
 
 if TYPE_CHECKING:
+    import torch
+
     from rsvib_torch.io.stack_info import StackInfo
     from rsvib_torch.results.presentation import Result
 
@@ -103,6 +107,8 @@ class KnownOptions(shared.StackCommand):
     """Unit of x and y: px, an angle, or an angular rate."""
     focal_length: float | None = option(None, show_default="for a gyroscope, estimated from the frames")
     """Focal length in px; required for angles and angular rates."""
+    lens_profile: Path | None = option(None, show_default="a lens without distortion")
+    """With a gyroscope: lens profile of Gyroflow (JSON)."""
     time_unit: TimeUnit = "s"
     """Unit of the times."""
     flip_x: bool = False
@@ -120,6 +126,9 @@ class KnownOptions(shared.StackCommand):
     """Estimate the focal length from the frames as well."""
     fit_row_time: bool = False
     """With a gyroscope: estimate the row time from the frames as well."""
+    ignore: list[str] | None = option(None, metavar="ROWS[,COLUMNS]", show_default="all rows count")
+    """Rows of the frames, or a part of them, that do not count in the comparison with the recording, for example 400:
+    for a dashboard below row 400, or :60,500: for a sign in a corner; may be given several times."""
     force: bool = False
     """Restore even if the recording does not explain the motion of the frames, or the restored frames are judged no
     better than the input."""
@@ -147,11 +156,11 @@ def known(given: KnownOptions) -> Answer:
     """
     manifest = given.restored.with_name(f"{given.restored.name}.manifest.json")
     outputs, replaces = [*io.stack_files(given.restored), manifest], given.overwrite or "resume" in given.processing
-    shared.check_new(outputs, replaces, [*given.inputs, given.motion])
-    recorded, focal_length = _recorded(given), given.focal_length if given.unit is None else None
-    camera = None if focal_length is None else rsvib_torch.Camera(focal_length)
+    shared.check_new(outputs, replaces, [*given.inputs, given.motion, given.lens_profile])
+    recorded = _recorded(given)
     info, scale, options = given.planned_restoration()
     info, timing = replace(info, full_scale=scale), given.settings.timing
+    ignore = _ignored(given.ignore or (), (info.shape[-2], info.shape[-1]))
     io.check_stack_target(
         given.restored, shared.restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info
     )
@@ -160,16 +169,19 @@ def known(given: KnownOptions) -> Answer:
     results: dict[str, list[str]] = {}
     data: Table = {"alignment": None, "check": None}
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
-        fitted: Table = {"camera": camera, "fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time}
+        fitted: Table = {
+            **{"camera": _camera(given, info), "offsets": given.offsets, "ignore": ignore},
+            **{"fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time},
+        }
         with working("aligning the recording"):
-            found = stacks.align_stack(given.stack, info, timing, recorded, offsets=given.offsets, **fitted)
+            found = stacks.align_stack(given.stack, info, timing, recorded, **fitted)
         results["Recording on the clock of the frames"], data["alignment"] = [found.summary()], _without_curve(found)
         _refuse(given, found.reasons)
         placed = found.motion
         if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
             rows = timing.row_time / found.row_time
             in_rows: Table = {"exposure_rows": rows * timing.exposure_rows, "frame_rows": rows * timing.frame_rows}
-            timing = replace(timing, row_time=found.row_time, **in_rows)
+            timing = replace(timing, row_time=found.row_time, **in_rows, row_time_std=found.row_time_std)
     else:
         placed = recorded.retimed(given.offset)
         starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
@@ -179,7 +191,8 @@ def known(given: KnownOptions) -> Answer:
             needed = f"the frames need {given.offset:.6g} to {given.offset + last:.6g} s"
             raise ValueError(f"{given.motion}: covers {recorded.start:.6g} to {recorded.end:.6g} s, {needed}")
     # 2. Whether it explains the offsets of rows; rates were compared by the alignment.
-    check = _check_motion(given, info, timing, placed) if isinstance(recorded, rsvib_torch.FreeMotion) else None
+    compared = isinstance(recorded, rsvib_torch.FreeMotion)
+    check = _check_motion(given, info, timing, placed, ignore) if compared else None
     if check is not None:
         results["Motion of the frames"], data["check"] = [check.summary()], _without_curve(check)
     # 3. Restoration in windows.
@@ -205,9 +218,11 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     """The recording."""
     if given.offset is not None and given.offsets is not None:
         raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
+    if given.lens_profile is not None and given.focal_length is not None:
+        raise ValueError("--lens-profile and --focal-length both state the focal length: give one of them")
     if given.unit is not None:
-        if given.fit_row_time:
-            raise ValueError("--fit-row-time is for a gyroscope, without --unit")
+        if given.fit_row_time or given.lens_profile is not None:
+            raise ValueError("--fit-row-time and --lens-profile are for a gyroscope, without --unit")
         signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
         units: Table = {"unit": given.unit, "focal_length": given.focal_length, "time_unit": given.time_unit}
         return rsvib_torch.read_motion(given.motion, **units, signs=signs)
@@ -219,6 +234,28 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
     return rsvib_torch.read_gyroscope(given.motion)
 
 
+def _camera(given: KnownOptions, info: StackInfo) -> rsvib_torch.Camera | None:
+    """The stated lens of a gyroscope."""
+    if given.lens_profile is not None:
+        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
+    return rsvib_torch.Camera(given.focal_length) if given.unit is None and given.focal_length is not None else None
+
+
+def _ignored(regions: Sequence[str], size: tuple[int, int]) -> torch.Tensor | None:
+    """Mask (H, W) of the regions of frames, as ``--ignore`` states them; None without regions."""
+    import torch  # noqa: PLC0415
+
+    mask = torch.zeros(size, dtype=torch.bool)
+    for region in regions:
+        if not re.fullmatch(r"\d*:\d*(,\d*:\d*)?", region):
+            raise ValueError(f"--ignore must be rows, or rows and columns, such as 400: or :60,500:, got {region!r}")
+        part = mask[tuple(slice(*(int(end) if end else None for end in ends.split(":"))) for ends in region.split(","))]
+        if part.numel() == 0:
+            raise ValueError(f"--ignore {region} has no pixel of frames of {size[0]} rows and {size[1]} columns")
+        part.fill_(True)
+    return mask if regions else None
+
+
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
     """Raise an error with the reasons against a recording, or print them as warnings with ``--force``."""
     if reasons and not given.force:
@@ -228,7 +265,11 @@ def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
 
 
 def _check_motion(
-    given: KnownOptions, info: StackInfo, timing: rsvib_torch.SensorTiming, motion: rsvib_torch.FreeMotion
+    given: KnownOptions,
+    info: StackInfo,
+    timing: rsvib_torch.SensorTiming,
+    motion: rsvib_torch.FreeMotion,
+    ignore: torch.Tensor | None,
 ) -> gyroscope.MotionCheck | None:
     """Compare the offsets of rows before and after correction with a motion, and refuse a motion that enlarges them.
 
@@ -236,7 +277,7 @@ def _check_motion(
     """
     try:
         with working("comparing the motion"):
-            check = stacks.check_stack_motion(given.stack, info, timing, motion)
+            check = stacks.check_stack_motion(given.stack, info, timing, motion, ignore)
     except ValueError as error:
         if given.offset is None:
             raise
@@ -389,7 +430,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")
     period: Table = {"frame_rate": None} if result.frame_rows is None else {"frame_rows": result.frame_rows}
-    values = {"row_time": result.row_time, "exposure_time": result.exposure_time, **period}
+    values = {name: getattr(result, name) for name in ("row_time", "row_time_std", "exposure_time")} | period
     values |= {"scan_axis": given.scan_axis, "readout_direction": result.readout_direction}
     table = sensor_toml(values, ["Written by rsvib calibrate.", *result.notes])  # unknown values are comments
     rows = stack.shape[axis]

@@ -65,6 +65,7 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
                     "log, a GoPro video or a CSV; auto: the track of the video itself.",
                     "metavar": "FILE",
                 },
+                "lens_profile": {"text": "With --gyroscope, lens profile of Gyroflow (JSON).", "metavar": "FILE"},
             },
         ),
     ]

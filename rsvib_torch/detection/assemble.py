@@ -13,7 +13,7 @@ import torch
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import DetectionResult
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
-from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
+from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, motion_of_fit
 from rsvib_torch.detection.verdict import Findings
@@ -67,10 +67,15 @@ def assembled(
     heights = sequence_from_row_order(curve.heights, timing)
     residual = (curve.offsets - predicted).abs().nanmean(dim=(1, 2))
     reliable = [[not of_axis for of_axis in of_stack] for of_stack in findings]
+    stds = [
+        of and with_row_time_std(scale.std(of).from_row_order(timing), vibration, sensitivity, timing)
+        for of in (std, std_if_hidden_tone)
+    ]
+    assert stds[0] is not None
     return DetectionResult(
         vibration=vibration,
-        std=scale.std(std).from_row_order(timing),
-        std_if_hidden_tone=None if std_if_hidden_tone is None else scale.std(std_if_hidden_tone).from_row_order(timing),
+        std=stds[0],
+        std_if_hidden_tone=stds[1],
         offsets=replace(
             curve,
             offsets=offsets_from_row_order(curve.offsets * units, timing),

@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 
 _TONE_VALUES = ("amplitude", "frequency")
 _SENSITIVITY_SHAPES = {
-    f"{value}_by_{time}": "... A K" for time in ("row_time", "frame_rows", "exposure_rows") for value in _TONE_VALUES
+    f"{value}_by_{time}": "... A K"
+    for time in ("row_time", "frame_rows", "exposure_rows")
+    for value in (*_TONE_VALUES, "phase")
 }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
-    """Relative change of amplitudes and frequencies over the relative change of a stated time.
+    """Relative change of amplitudes and frequencies, and change of phases, over the relative change of a stated time.
 
     ``d ln A / d ln frame_rows = 3`` means that an amplitude becomes 3 % larger if ``frame_rows`` is stated 1 % larger
     and the frames are the same. All values have the shape (..., 2, K), axes (x, y), 0 where there is no tone. A change
@@ -41,6 +43,9 @@ class TimingSensitivity(Result, shapes=_SENSITIVITY_SHAPES):
     frequency_by_row_time: Tensor  # d ln f / d ln row_time
     frequency_by_frame_rows: Tensor  # d ln f / d ln frame_rows
     frequency_by_exposure_rows: Tensor  # d ln f / d ln exposure_rows
+    phase_by_row_time: Tensor  # d phi / d ln row_time in rad, at the time origin
+    phase_by_frame_rows: Tensor  # d phi / d ln frame_rows
+    phase_by_exposure_rows: Tensor  # d phi / d ln exposure_rows
 
     def summary(self) -> str:
         """Changes of every tone if a time is stated 1 % larger; of a batch, of the strongest one of each axis."""

@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displacements
-from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import pseudo_inverse, split_axis, table, tables
 from rsvib_torch.results.presentation import AXIS_NAMES
 
@@ -59,9 +60,31 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
         along = fit.coefficients.conj() * (by_tones[..., 0] + 1j * by_tones[..., 1])
         amplitude = np.where(fit.active, along.real / np.square(size), 0.0)
         frequency = np.where(fit.active, by_tones[..., 2] / np.maximum(fit.frequencies, 1e-300), 0.0)
-        for of, change in (("amplitude", amplitude), ("frequency", frequency)):
+        # the phase at the time origin instead of the middle of the record
+        turned = np.where(fit.active, along.imag / np.square(size), 0.0)
+        phase = turned - 2 * math.pi * fit.frequencies * frequency * fit.centre[:, None, None]
+        for of, change in (("amplitude", amplitude), ("frequency", frequency), ("phase", phase)):
             values[f"{of}_by_{name}"] = torch.from_numpy(np.take_along_axis(change, largest_first, -1))
     return TimingSensitivity(**values)
+
+
+def with_row_time_std(
+    std: VibrationStd, vibration: Vibration, sensitivity: TimingSensitivity, timing: SensorTiming
+) -> VibrationStd:
+    """Standard deviations of tones with that of the row time, which exposure and frame period in s do not share."""
+
+    def widened(name: str, of: str, unit: Tensor) -> Tensor:
+        by = {time: getattr(sensitivity, f"{of}_by_{time}") for time in ("row_time", "frame_rows", "exposure_rows")}
+        change = unit * (by["row_time"] - by["frame_rows"] - by["exposure_rows"])
+        return torch.hypot(getattr(std, name), change * (timing.row_time_std / timing.row_time))
+
+    return replace(
+        std,
+        amplitude=widened("amplitude", "amplitude", vibration.amplitude),
+        frequency=widened("frequency", "frequency", vibration.frequency),
+        period=widened("period", "frequency", 1 / vibration.frequency.clamp(min=1e-300)),
+        phase=widened("phase", "phase", torch.ones_like(vibration.phase)),
+    )
 
 
 def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:
@@ -88,7 +111,8 @@ def assumptions(
     sentences = []
     if timing.frame_start_times is None:
         # two frames show frequencies relative to the row time, more frames relative to the frame rate
-        row, rate = f"row_time={timing.row_time:g} s", f"{timing.frame_rate:.4g}"
+        uncertain = f" ± {timing.row_time_std:.2g}" if timing.row_time_std else ""
+        row, rate = f"row_time={timing.row_time:g}{uncertain} s", f"{timing.frame_rate:.4g}"
         sentences.append(
             f"{row}; frequencies scale inversely with it, or differ by multiples of {rate} Hz"
             if num_frames == 2

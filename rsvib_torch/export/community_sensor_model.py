@@ -95,6 +95,8 @@ def camera_isd(
     # rows: axes of the sensor in axes of the body
     pointing = Rotation.from_matrix(np.stack([right, np.cross(forward, right), forward]))
     f = camera.focal_length
+    if camera.fisheye:
+        raise ValueError("an ISD has no fisheye lens: pass a camera with the coefficients (k1, k2, p1, p2, k3)")
     k1, k2, p1, p2, k3 = camera.distortion
     lens: Table = {"radial": {"coefficients": [0.0, 0.0, 0.0]}}
     if any(camera.distortion):  # usgscsm does not divide by the focal length

@@ -268,16 +268,16 @@ def align_motion(
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = best_offset(measured, turned, low, high, rowwise)
     clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))
-    clock, _, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
+    clock, _ = fit_clock(measured, turned, clock, False, options.fit_gain)
     weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-    clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+    clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     groups = frame_groups(stack_spectra(grey, stack.valid), rowwise, clock.motion(turned).expanded(1).to(grey.device))
     for _ in range(3):
         measured, _ = measure_groups(
             groups, rowwise, clock.motion(turned).expanded(1).to(grey.device), keep_images=False
         )
         weighed = measured.reweighted(residual_of_motion(measured, clock.motion(turned)))
-        clock, covariance, _ = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
+        clock, covariance = fit_clock(weighed, turned, clock, options.fit_scale, options.fit_gain)
     aligned = clock.motion(turned)
     residual = residual_of_motion(measured, aligned)
     covariance = covariance / measured.independent_fraction(residual)
@@ -344,42 +344,24 @@ def best_offset(
 
 
 def fit_clock(
-    measured: Measurements,
-    recorded: FreeMotion,
-    clock: FittedClock,
-    fit_scale: bool,
-    fit_gain: bool,
-    rows: Array | None = None,
-) -> tuple[FittedClock, Array, float]:
-    """Gauss-Newton on clock reading, scale, gain and drift, and on the row time, from start values.
+    measured: Measurements, recorded: FreeMotion, clock: FittedClock, fit_scale: bool, fit_gain: bool
+) -> tuple[FittedClock, Array]:
+    """Gauss-Newton on clock reading, scale, gain and drift, from start values.
 
-    To fit the row time, give the frame rows (1, N, G): the exposure of row r starts r row times after a time that is
-    known. The result has the fitted values, the covariance (7, 7) of clock reading, scale, gain and drift of x and y,
-    and row time, and the change of the row time in s.
+    Returns the fitted values and their covariance (6, 6): clock reading, scale, gain and drift of x and y.
     """
-    row_time = 0.0
-    exposure_starts = measured.exposure_starts
-    free = np.array([True, fit_scale, fit_gain, fit_gain, True, True, rows is not None])
-    places = np.zeros_like(exposure_starts) if rows is None else rows
+    starts = measured.exposure_starts
+    free = np.array([True, fit_scale, fit_gain, fit_gain, True, True])
     for _ in range(12):
         # 1. Displacement and velocity of the recording at the measured rows.
-        measured = replace(measured, exposure_starts=exposure_starts + places * row_time)
-        starts = measured.exposure_starts
         middle = starts + 0.5 * measured.exposure_time - clock.middle
         in_time = recorded.retimed(clock.offset, clock.scale)
         speed = table(in_time.velocity(tensor(starts + 0.5 * measured.exposure_time))) * clock.gain / clock.scale
         value = table(in_time.mean_displacement(tensor(starts), measured.exposure_time))
-        # 2. Derivatives (1, N, G, 2, 7) of the displacements by the parameters.
+        # 2. Derivatives (1, N, G, 2, 6) of the displacements by the parameters.
         x, y = np.eye(2)
-        columns = [
-            speed,
-            speed * middle[..., None],
-            value * x,
-            value * y,
-            middle[..., None] * x,
-            middle[..., None] * y,
-            clock.scale * speed * places[..., None],
-        ]
+        middle = middle[..., None]
+        columns = [speed, speed * middle, value * x, value * y, middle * x, middle * y]
         jacobian = measured.relative(np.stack(columns, -1)) * free
         # 3. The normal equations, in units of the sizes of the columns, and the step.
         residual = residual_of_motion(measured, clock.motion(recorded))
@@ -391,8 +373,7 @@ def fit_clock(
         change = inverse @ right
         known = max(float(measured.num_measurements.sum()), 8.0) - free.sum()
         covariance = inverse * (measured.square(residual).sum() / known)
-        at, speedup, gain_x, gain_y, drift_x, drift_y, later = change.tolist()
-        row_time += later
+        at, speedup, gain_x, gain_y, drift_x, drift_y = change.tolist()
         clock = FittedClock(
             clock.at + at,
             max(clock.scale + speedup, 0.1 * clock.scale),
@@ -402,4 +383,4 @@ def fit_clock(
         )
         if (np.abs(change) <= 1e-3 * np.sqrt(np.maximum(covariance.diagonal(), 0.0))).all():
             break
-    return clock, covariance, row_time
+    return clock, covariance

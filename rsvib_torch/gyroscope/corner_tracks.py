@@ -59,15 +59,14 @@ def corner_tracks(
         ValueError: If fewer than half of the pairs of frames have enough corners.
     """
     follower = CornerFollower(timing, most=_MOST_CORNERS, consistent=False)
-    range_of_levels: tuple[float, float] | None = None
+    levels: tuple[float, float] | None = None
     size, before = (0, 0), -2
     pairs: dict[int, Corners] = {}
     for number, frame, valid in frames:
         values = frame.cpu().numpy()
-        if range_of_levels is None:  # the same for all frames, so that places keep their grey level
-            low, high = np.percentile(values, (0.1, 99.9))
-            range_of_levels, size = (low, max(high - low, 1e-12)), (values.shape[0], values.shape[1])
-        grey = (255 * ((values - range_of_levels[0]) / range_of_levels[1]).clip(0, 1)).round().astype(np.uint8)
+        if levels is None:  # the same for all frames, so that places keep their grey level
+            levels, size = np.percentile(values, (0.1, 99.9)), (values.shape[0], values.shape[1])
+        grey = np.interp(values, levels, (0, 255)).round().astype(np.uint8)
         followed = follower.next(grey, starts[number], None if valid is None else _inner(valid))
         if followed is not None and before == number - 1:
             pairs[before] = followed

@@ -6,6 +6,7 @@ one stream of each kind the samples (GYRO) after their scale (SCAL).
 """
 
 import struct
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation, oriented
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
+from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation
 
 Array = NDArray[np.float64]
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
@@ -25,6 +26,10 @@ _NUMBERS = {
     b"b": "i1", b"B": "u1", b"s": ">i2", b"S": ">u2", b"l": ">i4", b"L": ">u4", b"f": ">f4", b"d": ">f8", b"j": ">i8",
     b"J": ">u8",
 }  # fmt: skip
+
+
+class _NoTrackError(ValueError):
+    """A video has no GPMF track."""
 
 
 def is_mp4(head: bytes) -> bool:
@@ -45,7 +50,7 @@ def read_gpmf(path: Path) -> AngularRates:
     source = f"{path.name}, GPMF track, {len(parts)} packets" + (f", axes {orientation}" if orientation else "")
     if any(part.stabilised for part in parts):
         source += ", images that the camera has stabilised (IORI)"
-    rates = oriented(rates, orientation) if orientation else rates
+    rates = rates @ orientation_matrix(orientation).numpy().T if orientation else rates
     return angular_rates(path, _sample_times(parts), rates, source)
 
 
@@ -68,7 +73,10 @@ class CameraTrack:
 
 
 def read_camera_track(path: Path) -> CameraTrack | None:
-    """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one."""
+    """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one.
+
+    Of a damaged one, a ``UserWarning`` says so.
+    """
     if not path.is_file():
         return None
     with path.open("rb") as file:
@@ -84,7 +92,11 @@ def read_camera_track(path: Path) -> CameraTrack | None:
                         times.append(packet.start + packet.duration / len(shutter) * np.arange(len(shutter)))
                         exposures.append(shutter[:, 0])
                     turned = max(turned, _largest_turn(stream))
-    except (ValueError, struct.error, IndexError):
+    except _NoTrackError:
+        return None
+    except (ValueError, struct.error, IndexError) as error:
+        problem = str(error).removeprefix(f"{path}: ")
+        warnings.warn(f"{path}: the GPMF track is damaged and is not used: {problem}", stacklevel=2)
         return None
     if not times:
         return CameraTrack(np.zeros(0), np.zeros(0), turned)
@@ -120,7 +132,7 @@ def _packets(path: Path) -> Iterator[_Packet]:
                 container.seek(0)
     except av.error.FFmpegError as error:
         raise ValueError(f"{path}: damaged MP4 file: {error.strerror}") from error
-    raise ValueError(f"{path}: a video without a GPMF track (gpmd); read its gyroscope from another file")
+    raise _NoTrackError(f"{path}: a video without a GPMF track (gpmd); read its gyroscope from another file")
 
 
 # GPMF

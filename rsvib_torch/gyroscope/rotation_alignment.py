@@ -10,12 +10,11 @@ from torch import Tensor
 from rsvib_torch.detection.verdict import recording_reasons
 from rsvib_torch.gyroscope.clock_range import offset_range, outside
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_fit import NAMES, RotationFit, RotationModel, components_of, fit_robustly
 from rsvib_torch.gyroscope.rotation_search import (
     OrientationSearch,
     Start,
-    orientation_matrix,
     search_orientations,
 )
 from rsvib_torch.motion.camera import Camera
@@ -37,25 +36,14 @@ _MAX_FOCAL_LENGTH_STD, _MAX_ROW_TIME_STD = 0.05, 0.2  # of the value; less accur
 class RotationAlignment(
     JudgedResult,
     units={
-        "offset": "s",
-        "offset_std": "s",
-        "bias": "rad/s",
-        "bias_std": "rad/s",
-        "focal_length": "px",
-        "focal_length_std": "px",
-        "row_time": "s",
-        "row_time_std": "s",
-        "corner_std": "px",
-        "times": "s",
+        **dict.fromkeys(("offset", "offset_std", "row_time", "row_time_std", "times"), "s"),
+        **dict.fromkeys(("bias", "bias_std"), "rad/s"),
+        **dict.fromkeys(("focal_length", "focal_length_std", "corner_std"), "px"),
     },
     shapes={
-        "bias": "3",
-        "bias_std": "3",
-        "translation": "P 3",
-        "unexplained": "3",
+        **dict.fromkeys(("bias", "bias_std", "unexplained"), "3"),
+        **dict.fromkeys(("translation", "measured", "predicted"), "P 3"),
         "times": "P",
-        "measured": "P 3",
-        "predicted": "P 3",
     },
 ):
     """The motion of the image by the rotation that a gyroscope recorded. Its clock reads ``scale t + offset``.

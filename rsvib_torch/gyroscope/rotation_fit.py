@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.gyroscope.corner_tracks import CELL_COLUMNS, CELL_ROWS, CornerTracks
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
-from rsvib_torch.gyroscope.rotation_search import MIN_FOCAL_LENGTH, orientation_matrix
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
+from rsvib_torch.gyroscope.rotation_search import MIN_FOCAL_LENGTH
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.numerics.splines import gauss_legendre
 
@@ -37,9 +37,7 @@ _ROW_ERROR = 0.5  # rows, of all corners in common; of the same clips, the offse
 _SIGNIFICANT = 8.0
 _STEPS = 5  # of Gauss-Newton with fixed weights from the start values of a search; it converges within 4
 _CUT = 4.7  # standard deviations beyond which a residual has no weight; efficiency of 95 % for normal errors (biweight)
-_BIAS = (
-    0.1  # rad/s, prior; the zero-rate offset of consumer gyroscopes is at most 3 to 5 degrees/s by their data sheets
-)
+_BIAS = 0.1  # rad/s, prior; the zero-rate offset of gyroscopes is at most 3 to 5 degrees/s by their data sheets
 _START_ROTATION = 0.02  # px, start value of rotations that are not explained; of 5 px, they exchange with translations
 _START_TRANSLATION = 0.3  # px, least start value of the deviations of the translation
 _HELD_ROUNDS = 4  # at first, in which the effects keep these values, until the parameters are near
@@ -73,13 +71,8 @@ class RotationModel:
         """Displacements (M, 2) in px by the rotation, for parameters (7,) in the order of ``NAMES``."""
         nodes, weights = gauss_legendre(2)  # exact for a motion of third order within an exposure
         components = [self._components(parameters, node) for node in nodes.tolist()]
-        return sum(
-            (
-                weight * self._displaced(one, parameters)
-                for weight, one in zip(weights.tolist(), components, strict=True)
-            ),
-            torch.zeros_like(self.tracks.offsets),
-        )
+        displaced = torch.stack([self._displaced(one, parameters) for one in components], -1)
+        return displaced @ weights.to(displaced)
 
     def _components(self, parameters: Tensor, node: float) -> Tensor:
         times = self.tracks.times(float(parameters[6])) + node * self.exposure_time

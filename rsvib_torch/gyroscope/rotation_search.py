@@ -13,26 +13,13 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.gyroscope.corner_tracks import CornerTracks
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_factors
 
 MIN_FOCAL_LENGTH = 10.0  # px; the result is that of no motion, and refused
 _MOST_OFFSETS = 20_000
 _MOST_ROTATIONS = 1_500_000  # of offsets times corners; 2 s on one core
-
-
-def orientation_matrix(name: str) -> Tensor:
-    """(3, 3) matrix from rates about the axes of the gyroscope to those about the axes of the camera.
-
-    Example:
-        >>> orientation_matrix("YxZ").tolist()
-        [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    """
-    matrix = torch.zeros(3, 3, dtype=torch.float64, device="cpu")
-    for row, letter in enumerate(name):
-        matrix[row, "xyz".index(letter.lower())] = 1.0 if letter.isupper() else -1.0
-    return matrix
 
 
 _ALL = tuple(
@@ -118,11 +105,8 @@ def search_orientations(
         q = torch.einsum("ocdjk,cj,dk->ocd", square, turn, turn)
         size = q[:, :2, :2].sum((1, 2)).clamp(min=1e-300)
         linear = p[:, :2].sum(-1) - q[:, :2, 2].sum(-1)
-        f = (
-            (linear / size).clamp(min=MIN_FOCAL_LENGTH)
-            if camera is None
-            else torch.full_like(size, camera.focal_length)
-        )
+        f = (linear / size).clamp(min=MIN_FOCAL_LENGTH)
+        f = f if camera is None else torch.full_like(f, camera.focal_length)
         return energy - 2 * f * linear + f.square() * size - 2 * p[:, 2] + q[:, 2, 2], f
 
     costs = {name: cost_of(name) for name in _ALL}

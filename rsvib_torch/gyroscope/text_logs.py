@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import rows_of_numbers, text_lines
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.motion.recorded import SECONDS
 from rsvib_torch.text import one_line, quoted
 
@@ -114,18 +114,6 @@ def check_orientation(text: str) -> str:
     return text
 
 
-def oriented(rates: NDArray[np.float64], orientation: str) -> NDArray[np.float64]:
-    """Rates (N, 3) about the axes that an orientation names.
-
-    Example:
-        >>> oriented(np.array([[1.0, 2.0, 3.0]]), "YxZ").tolist()
-        [[2.0, -1.0, 3.0]]
-    """
-    columns = ["xyz".index(letter.lower()) for letter in orientation]
-    signs = np.array([1.0 if letter.isupper() else -1.0 for letter in orientation])
-    return np.asarray(rates[:, columns] * signs)
-
-
 def read_gcsv(path: Path) -> AngularRates:
     """Angular rates of a gyroflow log."""
     with path.open(newline="", encoding="utf-8-sig") as file:
@@ -147,7 +135,7 @@ def read_gcsv(path: Path) -> AngularRates:
         raise ValueError(f"{path}: {error}") from error
     scales = [_scale(path, header, name) for name in ("tscale", "gscale")]
     source = f"{path.name}, gyroflow log, orientation {orientation}"
-    rates = oriented(table[:, 1:], orientation) * scales[1]
+    rates = table[:, 1:] @ orientation_matrix(orientation).numpy().T * scales[1]
     return angular_rates(path, table[:, 0] * scales[0], rates, source)
 
 

@@ -1,17 +1,24 @@
 """A camera with a focal length and lens distortion: the image displacement that a rotation of the camera causes."""
 
 import math
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_broadcast, checked_methods
+from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_number, check_whole_number
 from rsvib_torch.text import quoted
 
 _NEWTON_STEPS = 8  # of the inverse of the distortion; quadratic convergence, 1e-13 after 6 steps for 60 degrees
+_LARGEST_ANGLE = 1.55  # rad from the optical axis, of the rays of a fisheye lens; those of 90 degrees have no (u, v, 1)
+_CENTRAL = 1e-5  # squared tangent of the angle, below which series replace quotients of a fisheye lens
+_SAME_ASPECT = 0.01  # of the ratio of width and height; 2160 and 2176 rows of 3840 px are one mode of a camera
+_SAME_FOCAL_LENGTH = 0.02  # of both axes of a lens profile; of 1,094, nine in ten differ by less than 1 %
 
 
 def _first(components: Tensor) -> Tensor:
@@ -24,7 +31,7 @@ def _first(components: Tensor) -> Tensor:
 @dataclass(frozen=True)
 @checked_methods
 class Camera:
-    """Focal length, principal point, and lens distortion (the five coefficients of OpenCV).
+    """Focal length, principal point, and lens distortion (the coefficients of OpenCV).
 
     Axes of the camera: x to the right and y down as in the image, z forward. Scene content at the ray r appears,
     after the rotation of the camera by the vector ``w = (pitch, yaw, roll)`` in rad (right-handed about x, y, z), at
@@ -37,16 +44,21 @@ class Camera:
 
         ``(x, y) = c + (1 + zeta) f (u L + 2 p1 u v + p2 (s + 2 u^2), v L + p1 (s + 2 v^2) + 2 p2 u v)``,
 
-    with ``(u, v) = (r_x, r_y) / r_z, s = u^2 + v^2, L = 1 + k1 s + k2 s^2 + k3 s^3`` (OpenCV, camera calibration).
+    with ``(u, v) = (r_x, r_y) / r_z, s = u^2 + v^2, L = 1 + k1 s + k2 s^2 + k3 s^3`` (OpenCV, camera calibration). For
+    a fisheye lens, ``p1 = p2 = 0`` and, with the angle ``a = arctan sqrt(s)`` from the optical axis,
+
+        ``L = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) / sqrt(s)`` (OpenCV, fisheye camera model).
 
     Args:
         focal_length: f in px.
         principal_point: c in px from the centre of the frame, (x, y). OpenCV counts from the first pixel: subtract
             ``(width - 1) / 2`` and ``(height - 1) / 2``.
-        distortion: (k1, k2, p1, p2, k3).
+        distortion: (k1, k2, p1, p2, k3), or (k1, k2, k3, k4) of a fisheye lens; by default zeros.
+        fisheye: Whether it is a fisheye lens.
 
     Raises:
-        ValueError: If a value is not finite, the focal length is not positive, or there are not five coefficients.
+        ValueError: If a value is not finite, the focal length is not positive, or there are not five (four)
+            coefficients.
 
     Example:
         >>> camera = Camera(focal_length=1000.0)
@@ -58,41 +70,106 @@ class Camera:
 
     focal_length: float
     principal_point: tuple[float, float] = (0.0, 0.0)
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = ()
+    fisheye: bool = False
 
     def __post_init__(self) -> None:
         check_number("focal_length", self.focal_length, at_least=1.0, at_most=1e9)
-        for name, count in (("principal_point", 2), ("distortion", 5)):
-            values = getattr(self, name)
+        for name, count in (("principal_point", 2), ("distortion", 4 if self.fisheye else 5)):
+            values = (0.0,) * count if getattr(self, name) == () else getattr(self, name)
             if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != count:
                 raise ValueError(f"{name} must be {count} numbers, got {quoted(values)}")
             for value in values:
                 check_number(name, value, at_least=-1e6, at_most=1e6)
             object.__setattr__(self, name, tuple(float(value) for value in values))
 
+    @staticmethod
+    def from_gyroflow(path: str | os.PathLike[str], width: int, height: int) -> "Camera":
+        """The fisheye lens of a lens profile of Gyroflow (JSON), for frames of a size to which the image is scaled.
+
+        Profiles of many cameras: https://github.com/gyroflow/lens_profiles.
+
+        Raises:
+            ValueError: If it is no such profile, of another lens model, or of another aspect than the frames.
+
+        Example:
+            >>> Camera.from_gyroflow("GoPro_HERO11 Black_Wide_16by9.json", 1920, 1080)  # doctest: +SKIP
+        """
+        columns, rows = check_whole_number("width", width, at_least=1), check_whole_number("height", height, at_least=1)
+        profile = read_json(Path(path), "lens profile of Gyroflow")
+        model = profile.get("digital_lens") or profile.get("distortion_model") or "opencv_fisheye"
+        if model != "opencv_fisheye":
+            raise ValueError(f"{path}: the lens model {quoted(model)} is not supported, only opencv_fisheye")
+        try:
+            size, lens = profile["calib_dimension"], profile["fisheye_params"]
+            (fx, _, cx), (_, fy, cy), _ = lens["camera_matrix"]
+            centre = cx - 0.5 * (size["w"] - 1), cy - 0.5 * (size["h"] - 1)
+            camera = Camera(math.sqrt(fx * fy), centre, tuple(lens["distortion_coeffs"]), fisheye=True)
+            aspects = size["w"] / size["h"], columns / rows
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+            raise ValueError(f"{path}: not a lens profile of Gyroflow: {error!r}") from error
+        if not math.isclose(*aspects, rel_tol=_SAME_ASPECT):
+            raise ValueError(f"{path}: is for frames of {size['w']} x {size['h']} px, got {columns} x {rows} px")
+        if not math.isclose(fx, fy, rel_tol=_SAME_FOCAL_LENGTH):
+            raise ValueError(f"{path}: different focal lengths along x and y, {fx:g} and {fy:g} px, are not supported")
+        return camera.scaled(columns / size["w"])
+
+    def scaled(self, factor: float) -> "Camera":
+        """The camera for images whose pixels are smaller by a factor."""
+        x, y = self.principal_point
+        return replace(self, focal_length=factor * self.focal_length, principal_point=(factor * x, factor * y))
+
+    @property
+    def distorts(self) -> bool:
+        """Whether positions in the image are not in proportion to (u, v)."""
+        return self.fisheye or any(self.distortion)
+
+    @property
+    def _tangential(self) -> tuple[float, float]:
+        """(p1, p2)."""
+        return (0.0, 0.0) if self.fisheye else (self.distortion[2], self.distortion[3])
+
     def with_axes(self, order: Sequence[int], signs: Sequence[float]) -> "Camera":
         """The camera for images whose axis k (x, y) is ``signs[k]`` times axis ``order[k]`` of these images."""
         if sorted(order)[:2] != [0, 1] or any(sign not in (1, -1) for sign in signs):
             raise ValueError(f"order must be a permutation of the axes and signs 1 or -1, got {order} and {signs}")
         x, y = (signs[k] * self.principal_point[order[k]] for k in (0, 1))
+        if self.fisheye:
+            return replace(self, principal_point=(x, y))
         k1, k2, p1, p2, k3 = self.distortion
         tangential = (p2, p1)  # along x, along y
         p2, p1 = (signs[k] * tangential[order[k]] for k in (0, 1))
         return Camera(self.focal_length, (x, y), (k1, k2, p1, p2, k3))
 
+    def _radial(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """The factor L, and twice its derivative by s."""
+        if not self.fisheye:
+            k1, k2, _, _, k3 = self.distortion
+            return 1 + s * (k1 + s * (k2 + s * k3)), 2 * (k1 + s * (2 * k2 + s * 3 * k3))
+        r = (s + torch.finfo(s.dtype).tiny).sqrt()
+        distance, slope = self._distance(r.atan())
+        factor = distance / r
+        series = 2 * (self.distortion[0] - 1 / 3)
+        return factor, torch.where(s < _CENTRAL, series, (slope / (1 + s) - factor) / s.clamp(min=_CENTRAL))
+
+    def _distance(self, angle: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance of the image of a ray from the principal point over f, by a fisheye lens, and its derivative."""
+        k1, k2, k3, k4 = self.distortion
+        t = angle * angle
+        distance = angle * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
+        return distance, 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
+
     def _distorted(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        k1, k2, p1, p2, k3 = self.distortion
+        p1, p2 = self._tangential
         s = u * u + v * v
-        radial = 1 + s * (k1 + s * (k2 + s * k3))
+        radial, _ = self._radial(s)
         along = u * radial + 2 * p1 * u * v + p2 * (s + 2 * u * u)
         return along, v * radial + p1 * (s + 2 * v * v) + 2 * p2 * u * v
 
     def _distortion_slope(self, u: Tensor, v: Tensor) -> Tensor:
         """Derivative (S, 2, 2) of the distorted position with respect to (u, v)."""
-        k1, k2, p1, p2, k3 = self.distortion
-        s = u * u + v * v
-        radial = 1 + s * (k1 + s * (k2 + s * k3))
-        slope = 2 * (k1 + s * (2 * k2 + s * 3 * k3))  # of the radial factor, divided by u or v
+        p1, p2 = self._tangential
+        radial, slope = self._radial(u * u + v * v)
         mixed = u * v * slope + 2 * (p1 * u + p2 * v)
         return torch.stack(
             [
@@ -110,8 +187,16 @@ class Camera:
             (x - self.principal_point[0]) / self.focal_length,
             (y - self.principal_point[1]) / self.focal_length,
         )
-        if not any(self.distortion):
+        if not self.distorts:
             return along, across
+        if self.fisheye:
+            distance = torch.hypot(along, across)
+            angle = distance.clamp(max=_LARGEST_ANGLE)
+            for _ in range(2 * _NEWTON_STEPS):
+                reached, slope = self._distance(angle)
+                angle = (angle - (reached - distance) / slope).clamp(0.0, _LARGEST_ANGLE)
+            factor = torch.where(distance > 0, angle.tan() / distance.clamp(min=1e-30), 1.0)
+            return along * factor, across * factor
         u, v = along, across
         for _ in range(_NEWTON_STEPS):
             there = self._distorted(u, v)
@@ -141,10 +226,11 @@ class Camera:
             for k, at in ((0, x), (1, y))
         )
         folded = bool((torch.linalg.det(self._distortion_slope(u, v)) <= 0).any())
+        names = "k1, k2, k3, k4" if self.fisheye else "k1, k2, p1, p2, k3"
         if folded or not bool(torch.isfinite(px).all()) or not missed < 1e-6:
             raise ValueError(
                 f"distortion {self.distortion} with focal_length={self.focal_length:g} px is not invertible in frames "
-                f"of {width} x {height} px: check the order (k1, k2, p1, p2, k3) and the size of the frames of the "
+                f"of {width} x {height} px: check the order ({names}) and the size of the frames of the "
                 "calibration"
             )
 

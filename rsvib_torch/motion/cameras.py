@@ -87,7 +87,10 @@ class CameraMode:
             (2.306, 7236)
         """
         return SensorTiming.from_seconds(
-            row_time=self.row_time, exposure_time=exposure_time, frame_rate=self.frame_rate
+            row_time=self.row_time,
+            row_time_std=self.row_time_std,
+            exposure_time=exposure_time,
+            frame_rate=self.frame_rate,
         )
 
     def __str__(self) -> str:

@@ -150,7 +150,7 @@ class ColumnMotion(Motion):
     def _ray_coefficients(self) -> Tensor:
         """(..., 2, K): polynomials of ``y / (0.55 num_rows)`` for the rays u and v of the content of the columns."""
         camera = self.components.camera or Camera(1.0)
-        degree = _RAY_DEGREE if any(camera.distortion) else 1
+        degree = _RAY_DEGREE if camera.distorts else 1
         nodes = torch.cos(math.pi * torch.linspace(0, 1, 4 * degree + 1, dtype=torch.float64, device=self.device))
         x, y = torch.broadcast_tensors(self.column[..., None], 0.55 * self.num_rows * nodes)
         values = torch.stack(camera.rays(x, y), -2)

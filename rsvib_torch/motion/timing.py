@@ -10,7 +10,7 @@ import itertools
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -55,6 +55,8 @@ class SensorTiming:
             last one is.
         frame_start_times: Exposure start of the first row of each frame in seconds, for frames that are not evenly
             spaced (dropped frames, irregular clocks); strictly increasing.
+        row_time_std: Standard deviation of ``row_time`` in s, with the same exposure and frame period in s. That of
+            tones contains its effect.
 
     Raises:
         ValueError: If a value is out of range, or indicates another unit (a row time over 10 ms, a frame period
@@ -76,6 +78,7 @@ class SensorTiming:
     scan_axis: Literal[-2, -1, "y", "x"] = -2
     readout_direction: Literal["forward", "reverse"] = "forward"
     frame_start_times: Sequence[float] | Tensor | None = None
+    row_time_std: float = 0.0
 
     def __post_init__(self) -> None:
         row_time = check_number("row_time", self.row_time, above=0.0)
@@ -109,6 +112,8 @@ class SensorTiming:
         if type(self.scan_axis) not in (int, str) or self.scan_axis not in _SCAN_AXES:
             raise ValueError(f"scan_axis must be -2 ('y') or -1 ('x'), got {described(self.scan_axis)}")
         check_choice("readout_direction", self.readout_direction, ("forward", "reverse"))
+        row_time_std = check_number("row_time_std", self.row_time_std, at_least=0.0, at_most=row_time)
+        object.__setattr__(self, "row_time_std", row_time_std)
         object.__setattr__(self, "row_time", row_time)
         object.__setattr__(self, "exposure_rows", exposure_rows)
         object.__setattr__(self, "frame_rows", frame_rows)
@@ -136,6 +141,7 @@ class SensorTiming:
         scan_axis: Literal[-2, -1, "y", "x"] = -2,
         readout_direction: Literal["forward", "reverse"] = "forward",
         frame_start_times: Sequence[float] | Tensor | None = None,
+        row_time_std: float = 0.0,
     ) -> SensorTiming:
         """The timing from the exposure time in s and the frame rate: ``N_e = T_e / T_row``, ``m = 1 / (rate T_row)``.
 
@@ -149,7 +155,8 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        return cls(row_time, exposure / row_time, period / row_time, scan_axis, readout_direction, frame_start_times)
+        others = scan_axis, readout_direction, frame_start_times, row_time_std
+        return cls(row_time, exposure / row_time, period / row_time, *others)
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -275,18 +282,13 @@ class SensorTiming:
     def to_dict(self) -> dict[str, Any]:
         """The arguments that make this timing, as plain numbers and texts."""
         starts = self.frame_start_times
-        return {
-            "row_time": float(self.row_time),
-            "exposure_rows": float(self.exposure_rows),
-            "frame_rows": float(self.frame_rows),
-            "scan_axis": "x" if self.scan_axis == -1 else "y",
-            "readout_direction": self.readout_direction,
-            "frame_start_times": None if starts is None else [float(start) for start in starts],
-        }
+        scan_axis = "x" if self.scan_axis == -1 else "y"
+        return asdict(self) | {"scan_axis": scan_axis, "frame_start_times": None if starts is None else list(starts)}
 
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
-        return RowTiming(self.row_time, self.exposure_rows, self.frame_rows, frame_start_times=self.frame_start_times)
+        times = self.row_time, self.exposure_rows, self.frame_rows
+        return RowTiming(*times, frame_start_times=self.frame_start_times, row_time_std=self.row_time_std)
 
 
 class SensorSection(Section):
@@ -315,6 +317,8 @@ class SensorSection(Section):
     frame_start_times: list[float] | None = None
     """Exposure start of the first row of each frame in seconds, for frames that are not evenly spaced (dropped frames,
     irregular clocks); strictly increasing."""
+    row_time_std: float = 0.0
+    """Standard deviation of row_time in s, which those of frequencies and amplitudes then contain."""
     full_scale: float | None = None
     """Count of a saturated pixel: 4095 for 12 bits, also in a 16-bit file."""
 
@@ -340,6 +344,7 @@ class SensorSection(Section):
             self.scan_axis,
             self.readout_direction,
             self.frame_start_times,
+            self.row_time_std,
         )
 
 

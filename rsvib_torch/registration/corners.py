@@ -139,7 +139,7 @@ def find_corners(
     number = -(-most // (rows * columns))
     distance = max(3.0, 0.5 * side / math.sqrt(number))
     quality = cv2.cornerMinEigenVal(grey, 3)  # as in goodFeaturesToTrack
-    floor = min(_NOISE * float(np.median(quality)), _FAINT * float(quality.max()))
+    floor = min(_NOISE * float(np.median(quality[::3, ::3])), _FAINT * float(quality.max()))
     known = np.zeros((0, 2)) if known is None else known
     cells = np.floor(known / [width / columns, height / rows]).astype(int) @ [1, columns]
     filled = np.bincount(cells, minlength=rows * columns).reshape(rows, columns)

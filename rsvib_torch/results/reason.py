@@ -350,7 +350,6 @@ _RECORDED = {
         "rows move by {value:.3g} px that the recording does not explain, {limit:.2g} px are allowed",
         compares="motion of the rows beside the recorded one, above 25 % of the recorded motion and 0.05 px",
     ),
-    "recording_explains_nothing": _of_result("the recording does not explain the frames"),
     "motion_repeats": _of_result("an offset of {offset:.6g} s explains the frames as well: the motion repeats"),
     "offset_outside": _of_result(
         "the frames begin at {value:.6g} s of the recording, and offsets ends at {limit:.6g} s",

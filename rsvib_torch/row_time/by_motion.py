@@ -12,21 +12,19 @@ from pydantic import Field
 
 from rsvib_torch.checks.validation import Number, Positive
 from rsvib_torch.checks.validation import options as option_group
-from rsvib_torch.checks.values import check_number, check_single
+from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
 from rsvib_torch.frames.orientation import reasons_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
-from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import OffsetOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.row_time.by_free_motion import row_time_of_splines
-from rsvib_torch.row_time.by_recording import row_time_of_recording
 from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
 from rsvib_torch.row_time.joint_fit import FramePlaces, rows_of_frames
 
@@ -57,20 +55,6 @@ class RowTimeOptions(OffsetOptions):
     )
     readout_direction: Literal["forward", "reverse"] | None = Field(
         default=None, description="None to determine it as well."
-    )
-    recorded: FreeMotion | None = Field(
-        default=None,
-        description="Motion that another instrument recorded, on its own clock, in image axes; its offset is then "
-        "fitted together with the row time, and two frames are enough.",
-    )
-    offsets: tuple[Number, Number] | None = Field(
-        default=None,
-        strict=False,
-        description="With ``recorded``: smallest and largest reading of its clock in s at the time when the middle row "
-        "of frame 0 is exposed; by default all for which the recording covers the frames.",
-    )
-    fit_gain: bool = Field(
-        default=False, description="With ``recorded``: whether to fit a factor of each axis (focal length)."
     )
 
 
@@ -127,13 +111,9 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         >>> two.reliable, two.findings[0].code
         (False, 'too_few_frames_for_row_time')
     """
-    period, exposure, recorded = 1 / options.frame_rate, options.exposure_time, options.recorded
+    period, exposure = 1 / options.frame_rate, options.exposure_time
     if exposure is not None and exposure > period:
         raise ValueError(f"exposure_time={exposure:g} s exceeds the frame period of {period:.6g} s; give it in seconds")
-    if recorded is None and (options.offsets is not None or options.fit_gain):
-        raise ValueError("offsets and fit_gain belong to a recorded motion: pass recorded")
-    if recorded is not None:
-        check_single("recorded", recorded)
     # frames are converted with any row time: only scan axis and readout direction matter
     sensor = SensorTiming(1e-9, 1.0, 10.0 * 2**20, options.scan_axis)
     stack = grey_frames(frames, sensor, options, timed=False)
@@ -152,13 +132,7 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
     if exposure is not None:
         notes.append("the exposure time is the given one")
     curve, bands = bands_of_frames(stack, clock, options)
-    if recorded is not None:
-        places = _measured_freely(stack, clock, options, curve)
-        turned = recorded.to_row_order(sensor).to(stack.images.device)
-        found = row_time_of_recording(
-            places, turned, clock, num_frames, offsets=options.offsets, fit_gain=options.fit_gain
-        )
-    elif num_frames < _MIN_FRAMES:
+    if num_frames < _MIN_FRAMES:
         found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
     else:
         by_tones = row_time_of_tones(stack, clock, options, bands)

@@ -30,14 +30,8 @@ ScanAxis = Literal[-2, -1, "y", "x"]
 class RowTimeCalibration(
     JudgedResult,
     units={
-        "row_time": "s",
-        "row_time_std": "s",
-        "period_rows": "rows",
-        "flicker_frequency": "Hz",
-        "frame_rows": "row times",
-        "exposure_time": "s",
-        "exposure_time_std": "s",
-        "candidates": "s",
+        **dict.fromkeys(("row_time", "row_time_std", "exposure_time", "exposure_time_std", "candidates"), "s"),
+        **{"period_rows": "rows", "flicker_frequency": "Hz", "frame_rows": "row times"},
     },
 ):
     """Result of a calibration; undetermined values are None, with the reason in ``notes``.
@@ -255,11 +249,7 @@ def _check_readout(row_time: float, frequency: float, height: int, frame_rate: f
             f"a row time of {1e6 * row_time:.3f} us does not fit: {height} rows would take longer than a frame at "
             f"frame_rate={frame_rate:g} per second; check flicker_frequency={frequency:g} Hz"
         )
-    others = [
-        turns / frequency + sign * row_time
-        for turns in (1, 2)  # the shortest ones
-        for sign in (-1, 1)
-    ]
+    others = [turns / frequency + sign * row_time for turns in (1, 2) for sign in (-1, 1)]  # the shortest ones
     possible = sorted(time for time in (row_time, *others) if time <= longest)
     if len(possible) > 1:
         listed = ", ".join(f"{1e6 * time:.3f}" for time in possible)

@@ -66,18 +66,19 @@ def align_stack(
     offsets: tuple[float, float] | None = None,
     fit_gain: bool = False,
     fit_row_time: bool = False,
+    ignore: Tensor | None = None,
 ) -> ClockAlignment | RotationAlignment:
     """``align_motion`` for a stack of any length, in bounded time and memory.
 
     Angular rates are compared with 48 pairs of neighbouring frames over the whole stack, a motion with three runs of 16
     frames; of stacks that are not longer, all frames are used. ``info`` describes the stack, with its full scale;
-    ``timing`` is that of the caller.
+    ``timing`` is that of the caller. Pixels of ``ignore`` (H, W, bool) do not count.
     """
     timing = timing_from_first_frame(timing, info)
     if isinstance(recorded, AngularRates):
         pairs = compared_pairs(info.shape[0])
         starts = timing.frame_starts(info.shape[0])
-        tracks = corner_tracks(_grey_frames(source, info, pairs), starts.tolist(), timing)
+        tracks = corner_tracks(_grey_frames(source, info, pairs, ignore), starts.tolist(), timing)
         index = tracks.first_frames
         size = info.shape[-2:] if timing.scan_axis == -2 else info.shape[:-3:-1]
         of_pairs = torch.stack([starts[index], starts[index + 1]], -1)
@@ -87,20 +88,24 @@ def align_stack(
     runs = compared_runs(info.shape[0])
     if len(runs) == 1:
         frames, of_run = part_of_stack(source, info, timing, runs[0])
-        return align_motion(frames, of_run, recorded, offsets=offsets, fit_gain=fit_gain)
-    return _aligned_runs(source, info, timing, recorded, runs, offsets, fit_gain)
+        return align_motion(frames, of_run, recorded, offsets=offsets, fit_gain=fit_gain, ignore=ignore)
+    return _aligned_runs(source, info, timing, recorded, runs, offsets, fit_gain, ignore)
 
 
-def check_stack_motion(source: Path, info: StackInfo, timing: SensorTiming, motion: FreeMotion) -> MotionCheck:
+def check_stack_motion(
+    source: Path, info: StackInfo, timing: SensorTiming, motion: FreeMotion, ignore: Tensor | None = None
+) -> MotionCheck:
     """``check_motion`` for a stack of any length, by the frames in its middle."""
     timing = timing_from_first_frame(timing, info)
     runs = compared_runs(info.shape[0])
     frames, of_run = part_of_stack(source, info, timing, runs[len(runs) // 2])
-    return check_motion(frames, of_run, motion)
+    return check_motion(frames, of_run, motion, ignore=ignore)
 
 
-def _grey_frames(source: Path, info: StackInfo, pairs: list[int]) -> Iterator[tuple[int, Tensor, Tensor | None]]:
-    """Number and pixels (H, W) of the frames of pairs, and which of them have data if some have not."""
+def _grey_frames(
+    source: Path, info: StackInfo, pairs: list[int], ignore: Tensor | None
+) -> Iterator[tuple[int, Tensor, Tensor | None]]:
+    """Number and pixels (H, W) of the frames of pairs, and which of them count if some do not."""
     with closing(open_stack(source)) as reader:
         for index in sorted({*pairs, *(first + 1 for first in pairs)}):
             frame = stored_frame(reader.frame, index)
@@ -108,7 +113,7 @@ def _grey_frames(source: Path, info: StackInfo, pairs: list[int]) -> Iterator[tu
                 continue
             image = counts_to_frames(frame[None], info.full_scale, str(source), info.nodata)[0]
             image = image if image.ndim == 2 else image.mean(0)
-            valid = torch.isfinite(image)
+            valid = torch.isfinite(image) if ignore is None else torch.isfinite(image) & ~ignore
             yield index, image.nan_to_num(0.0), None if bool(valid.all()) else valid
 
 
@@ -120,6 +125,7 @@ def _aligned_runs(
     runs: list[slice],
     offsets: tuple[float, float] | None,
     fit_gain: bool,
+    ignore: Tensor | None,
 ) -> ClockAlignment:
     """The clock by the runs of a long stack, each of which determines its reading at one time."""
     # 1. The run in the middle, at all offsets; then the others, near its clock.
@@ -136,7 +142,7 @@ def _aligned_runs(
         if found:
             error = _CLOCK_ERROR * abs(middles[-1] - middles[0]) + 4 * found[0].offset_std
             near = max(limits[0], found[0].offset - error), min(limits[1], found[0].offset + error)
-        one = align_motion(frames, of_run, recorded, offsets=near, fit_gain=fit_gain, fit_scale=False)
+        one = align_motion(frames, of_run, recorded, offsets=near, fit_gain=fit_gain, fit_scale=False, ignore=ignore)
         found.append(one)
         if not one.reliable:  # the others cannot make it reliable
             return one

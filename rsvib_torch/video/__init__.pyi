@@ -1,4 +1,4 @@
-from .frame_outputs import FrameOutput, PipeOutput, PreviewOutput, VideoOutput
+from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
 from .live_page import PageOutput
 from .process_video import process_video
 from .session import LiveReport, run_live
@@ -16,7 +16,6 @@ __all__ = [
     "PageOutput",
     "PipeOutput",
     "PipeSource",
-    "PreviewOutput",
     "Spectrogram",
     "TimedFrame",
     "VideoBorder",

@@ -1,4 +1,4 @@
-"""Outputs of video frames: files, pipes and a window."""
+"""Outputs of video frames: files and pipes."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -102,26 +102,3 @@ class VideoOutput:
                 self._encoder.finish()
             self._container.close()
             sync(self._path)
-
-
-class PreviewOutput:
-    """A window of OpenCV, if the installed one has windows."""
-
-    def __init__(self) -> None:
-        import cv2  # noqa: PLC0415
-
-        windows = next((line for line in cv2.getBuildInformation().splitlines() if line.strip().startswith("GUI:")), "")
-        if "NONE" in windows or not windows:
-            raise ValueError(
-                "--preview: the installed OpenCV (opencv-python-headless) has no windows; use --page 8080 and a browser"
-            )
-        self._cv2 = cv2
-
-    def write(self, frame: Frame, index: int) -> None:
-        """Show a frame."""
-        self._cv2.imshow("rsvib live", frame if frame.ndim == 2 else frame[..., ::-1])
-        self._cv2.waitKey(1)
-
-    def close(self) -> None:
-        """Close the window."""
-        self._cv2.destroyAllWindows()

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
-from itertools import count, groupby
+from itertools import chain, count, groupby, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +23,10 @@ from rsvib_torch.io.stack_info import StackInfo, split_range
 from rsvib_torch.io.stack_reading import PathLike, open_stack
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files
 from rsvib_torch.io.video import CONTAINERS, VideoReader, join_parts, part_of_video
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import ProcessVideoOptions, ResourceOptions, RestorationOptions, StackOptions
+from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import plain_values
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import plan_job, single_frame_options
@@ -43,12 +45,14 @@ from rsvib_torch.video.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMot
 # measured less well, because objects at other distances move beside them.
 _MORE_SHAKING, _VISIBLE_SHAKING = {"frame_to_frame": 1.1, "rows": 1.5}, 0.1  # -, px
 
+_JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
+
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
 Frame = NDArray[Any]
 Planes = list[Frame]
-_Restored = tuple[FrameTrack, Frame | str, RestoredFrame]  # a frame as stored, or why it cannot be read, and restored
+_Restored = tuple[FrameTrack, RestoredFrame]
 
 
 class _Output(NamedTuple):
@@ -76,8 +80,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
     states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
 
-    Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in
-    parts of 32 frames in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
+    Two frames of each part of 32 are judged: of a part that is worse and shakes more than as taken, no vibration is
+    undone. Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is
+    encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
     the first frames of each part is compared with that of the input: a video that shakes more is not written.
 
     Args:
@@ -108,6 +113,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     if recording == Path("auto"):
         recording = split_range(source)[0]
     rates = None if recording is None else read_gyroscope(recording)
+    if rates is None and options.lens_profile is not None:
+        raise ValueError("lens_profile belongs to a gyroscope: give gyroscope as well")
     video, at_once = _planned(source, timing, options, rates)
     job = video.frames.job
     if sink.suffix.lower() not in CONTAINERS:
@@ -123,6 +130,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             "steady": options.steady,
             "crop_limit": options.crop_limit,
             "gyroscope": None if recording is None else fingerprint(recording),
+            "camera": video.camera and asdict(video.camera),
             "stabilised": video.stabilised,
             "exposures": None if video.exposures is None else [min(video.exposures), max(video.exposures)],
         },
@@ -146,8 +154,8 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         check_info_target(sink, content, check_folder=False)
         output = _Output(sink, content, border, margins)
         with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
-            for part, frames in parts:
-                _encode_part(video, motion, folder, part, frames, output, progress)
+            for part, frames, verdicts in parts:
+                _encode_part(video, motion, folder, part, frames, verdicts, output, progress)
         _check_shaking(folder)
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
@@ -163,7 +171,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         sink,
         options,
         header,
-        inputs=[*stack_files(source), *([] if recording is None else [recording])],
+        inputs=[*stack_files(source), *(Path(file) for file in (recording, options.lens_profile) if file is not None)],
         windows=video.parts,
         compute=compute,
         write=write,
@@ -206,30 +214,41 @@ def _planned(
         starts = starts - starts[0]
     stabilised = track is not None and track.stabilised
     stated = None if exposures is None else exposures.tolist()
-    passes = VideoPasses(frames, starts.tolist(), options.steady, options.crop_limit, rates, stated, stabilised)
-    return passes, at_once
+    profile, (height, width) = options.lens_profile, frames.size
+    camera = None if profile is None else Camera.from_gyroflow(profile, width, height)
+    steadied = options.steady, options.crop_limit
+    return VideoPasses(frames, starts.tolist(), *steadied, rates, camera, stated, stabilised), at_once
 
 
 def _restored_parts(
     video: VideoPasses, motion: VideoMotion, folder: RunFolder, at_once: int, progress: Callable[[], None]
-) -> Generator[tuple[int, Iterator[_Restored]], None, None]:
-    """Number and restored frames of each part that is not in the folder."""
+) -> Generator[tuple[int, Iterator[_Restored], dict[int, RestorationVerdict | None]], None, None]:
+    """Number and restored frames of each part that is not in the folder, and the verdicts on the parts so far."""
+    verdicts: dict[int, RestorationVerdict | None] = {}
 
     def missing() -> Generator[tuple[FrameTrack, Frame | str], None, None]:
         with closing(video.decoded()) as decoded:
-            for index, frame in enumerate(decoded):
-                if index // PART_FRAMES not in folder:
-                    yield video.track(motion, index), frame
-                else:
-                    progress()
+            for part, frames in groupby(enumerate(decoded), lambda one: one[0] // PART_FRAMES):
+                if part in folder:
+                    for _ in frames:
+                        progress()
+                    continue
+                tracked = ((video.track(motion, index), frame) for index, frame in frames)
+                first = list(islice(tracked, _JUDGED_FRAMES))
+                verdicts[part] = verdict = video.verdict(first)
+                # Parallax makes two frames worse that shake less: corners decide.
+                is_worse = verdict is not None and verdict.overall == "worse" and video.shakes_more(motion, first)
+                for track, frame in chain(first, tracked):
+                    yield video.left_alone(track) if is_worse else track, frame
 
     def restore(track: FrameTrack, frame: Frame | str) -> _Restored:
-        return track, frame, video.frames.restored(frame, track)
+        return track, video.frames.restored(frame, track)
 
     share_one_heap()
     threads = 1 if video.frames.job.device == "cpu" else torch.get_num_threads()
     with closing(in_threads(restore, missing(), at_once=at_once, threads=threads)) as frames:
-        yield from groupby(frames, lambda one: one[0].index // PART_FRAMES)
+        for part, of_part in groupby(frames, lambda one: one[0].index // PART_FRAMES):
+            yield part, of_part, verdicts
 
 
 def _encode_part(
@@ -238,6 +257,7 @@ def _encode_part(
     folder: RunFolder,
     part: int,
     frames: Iterator[_Restored],
+    verdicts: dict[int, RestorationVerdict | None],
     output: _Output,
     progress: Callable[[], None],
 ) -> None:
@@ -245,7 +265,6 @@ def _encode_part(
     layout, name = video.frames, f"{part:06d}{output.path.suffix.lower()}"
     tracks: list[FrameTrack] = []
     written: list[Frame] = []  # the first frames
-    pair: list[tuple[FrameTrack, Frame]] = []  # the first two neighbouring frames without fault
     before: Planes | None = None  # the frame before, without margins cut off
     if part > 0:
         with folder.open(f"{part - 1:06d}.npy") as file:
@@ -254,7 +273,7 @@ def _encode_part(
         with disk_errors_named(folder):
             encoded = part_of_video(folder.create(name), output.path, output.info, layout.picture)
             write = opened.enter_context(encoded)
-        for track, frame, restored in frames:
+        for track, restored in frames:
             if tracks:
                 progress()  # the frame before is complete
             before = _without_gaps(restored, before, layout, output.border)
@@ -264,14 +283,10 @@ def _encode_part(
             if len(tracks) < CHECKED_FRAMES:
                 written.append(final)
             tracks.append(track)
-            if len(pair) < 2 and track.fault is None and not isinstance(frame, str):
-                follows = bool(pair) and pair[-1][0].index == track.index - 1
-                pair = [*pair, (track, frame)] if follows else [(track, frame)]
         with disk_errors_named(folder):
             opened.close()  # the file is complete
     assert before is not None
-    verdict = video.verdict(pair) if len(pair) == 2 else None
-    record = video.record(part, tracks, motion, verdict, written)
+    record = video.record(part, tracks, motion, verdicts[part], written)
     folder.add(record, [name], np.ascontiguousarray(layout.frame(before)))
     progress()
 

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
+from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment
-from rsvib_torch.gyroscope.rotation_search import orientation_matrix
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.numerics.tables import Array, table, tensor
@@ -46,7 +45,7 @@ class RecordedRotation:
         before = torch.searchsorted(of_camera.times, middles, right=True) - 1
         samples = Rotation.from_rotvec(table(of_camera.attitude(float(times[0]))[before]))
         rest = Rotation.from_rotvec(table(of_camera.rotation(of_camera.times[before], middles)))
-        return cls(of_camera, Camera(found.focal_length), times, samples * rest)
+        return cls(of_camera, found.motion.camera or Camera(found.focal_length), times, samples * rest)
 
     def apart(self, number: int, others: slice) -> Array:
         """(n, 4) components of the path from a frame to others: x, y (px), roll (rad), and a zoom of 0."""

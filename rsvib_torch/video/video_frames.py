@@ -72,22 +72,9 @@ class VideoFrames:
         return self.job.info.shape[-2], self.job.info.shape[-1]
 
     @property
-    def dtype(self) -> np.dtype[Any]:
-        """Data type of the counts."""
-        return np.dtype(self.job.info.dtype)
-
-    @property
     def full_scale(self) -> float | None:
         """Count that corresponds to 1.0; None for floats."""
         return self.job.full_scale if self.picture is None else 255.0
-
-    @property
-    def white(self) -> float | None:
-        """Count from which pixels are saturated; None for none."""
-        if not isinstance(self.options.saturation, float):
-            return None
-        black, full = (0.0, self.job.full_scale or 1.0) if self.picture is None else self.picture.levels
-        return black + self.options.saturation * (full - black)
 
     def luma(self, frame: Frame) -> Frame:
         """The part of a frame in which motion is measured."""
@@ -117,9 +104,9 @@ class VideoFrames:
     def black(self) -> list[Frame]:
         """Planes of a frame without content."""
         if not self.planar:
-            return [np.zeros(self.job.info.shape[1:], self.dtype)]
+            return [np.zeros(self.job.info.shape[1:], self.job.info.dtype)]
         height, width = self.size
-        return [np.full((height, width), 16, self.dtype), np.full((2, height // 2, width // 2), 128, self.dtype)]
+        return [np.full((height, width), 16, np.uint8), np.full((2, height // 2, width // 2), 128, np.uint8)]
 
     def margins(self, margins: Margins) -> Margins:
         """The margins, widened to whole pixels of every plane."""
@@ -150,8 +137,9 @@ class VideoFrames:
                 motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
             source = source_map(motion, timing, plane.shape[-2:])
             results.append(moved_back(plane, source))
-            limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
-            visible.append(np.all((source >= 0) & (source <= limits), axis=0))
+            if self.masks:
+                limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
+                visible.append(np.all((source >= 0) & (source <= limits), axis=0))
         return RestoredFrame(results, visible if self.masks else None)
 
     def timing_of(self, plane: int, exposure: float | None = None) -> SensorTiming:
@@ -173,13 +161,17 @@ class VideoFrames:
 
     def _without_vibration(self, plane: Frame, timing: SensorTiming, motion: Vibration) -> Frame:
         scale = self.full_scale
-        level = self.white if "clipped" in METHODS[self.options.method].masks else None
         images: Tensor = counts_to_frames(plane[None], scale, "the video").to(self.job.device)
-        saturation = None if level is None else level / (scale or 1.0)
+        saturation = self.options.saturation if isinstance(self.options.saturation, float) else None
+        if saturation is not None and self.picture is not None:
+            black, white = self.picture.levels
+            saturation = (black + saturation * (white - black)) / 255.0
+        if "clipped" not in METHODS[self.options.method].masks:
+            saturation = None
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
             restored = restore_prepared(prepared, motion, self.options)
-        return frames_to_counts(prepared.from_row_order(restored)[0], self.dtype, scale)
+        return frames_to_counts(prepared.from_row_order(restored)[0], np.dtype(self.job.info.dtype), scale)
 
 
 def moved_back(plane: Frame, source: NDArray[np.float32]) -> Frame:
@@ -199,5 +191,5 @@ def _on_half_pixels(motion: Vibration | FreeMotion) -> Vibration | FreeMotion:
     factors = torch.tensor([0.5, 0.5, 1.0, 1.0][: motion.num_axes], dtype=torch.float64)
     if isinstance(motion, Vibration):
         return motion.scaled(factors)
-    camera = motion.camera and replace(motion.camera, focal_length=0.5 * motion.camera.focal_length)
+    camera = motion.camera and motion.camera.scaled(0.5)
     return FreeMotion(motion.coefficients * factors[:, None], motion.start, motion.spacing, camera=camera)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
 from rsvib_torch.io.full_scale import counts_to_frames
 from rsvib_torch.io.video import VideoReader
+from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.sampling import recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
@@ -66,6 +67,7 @@ class VideoPasses:
     steady: float  # as in ``process_video``
     crop_limit: float  # as in ``process_video``
     rates: AngularRates | None  # of a gyroscope, whose rotation is the path
+    camera: Camera | None  # whose lens is known; None: its focal length is fitted
     exposures: list[float] | None  # s, of the frames; None: all that of the sensor
     stabilised: bool  # by the camera: frames move as a whole, without rows that are read one after another
 
@@ -149,7 +151,8 @@ class VideoPasses:
         timing, size = self.frames.job.timing, self.frames.size
         tracks = tracks_of_pairs(pairs, self.starts, timing, size)
         starts = tensor(np.array([self.starts[index : index + 2] for index in pairs]))
-        found = align_rates(tracks, starts, size if timing.scan_axis == -2 else size[::-1], timing, rates)
+        rows_first, fitted = size if timing.scan_axis == -2 else size[::-1], self.camera is None
+        found = align_rates(tracks, starts, rows_first, timing, rates, self.camera, fit_focal_length=fitted)
         if not found.reliable:
             raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {'; '.join(found.reasons)}")
         return found
@@ -169,6 +172,13 @@ class VideoPasses:
         """What is removed from a frame."""
         exposure = None if self.exposures is None else self.exposures[index]
         return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
+
+    def left_alone(self, track: FrameTrack) -> FrameTrack:
+        """What is removed from a frame of a part that restoration makes worse: no vibration."""
+        if not isinstance(track.motion, Vibration):
+            return track
+        still = track.motion.scaled(0.0) if self.steady == 0 else track.motion
+        return replace(track, motion=replace(still, amplitude=torch.zeros_like(still.amplitude)))
 
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
@@ -203,15 +213,25 @@ class VideoPasses:
             "rows": np.sqrt(np.square(rows).mean(0)).tolist(),
         }
 
-    def verdict(self, frames: list[tuple[FrameTrack, Frame]]) -> RestorationVerdict | None:
+    def shakes_more(self, motion: VideoMotion, frames: list[tuple[FrameTrack, Frame | str]]) -> bool:
+        """Whether frames that follow each other shake more when they are restored, or it is unknown."""
+        planes = [self.frames.restored(frame, track).planes for track, frame in frames]
+        known = [self.frames.frame(one) for one in planes if one is not None]
+        measured = self.shaking(motion, frames[0][0].index, known) if len(known) == len(frames) else None
+        return measured is None or any(after > before for before, after in measured.values())
+
+    def verdict(self, frames: list[tuple[FrameTrack, Frame | str]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
-        (first, one), (_, other) = frames
+        usable = (pair for pair in pairwise(frames) if all(track.fault is None for track, _ in pair))
+        (first, one), (second, other) = next(usable, ((None, ""), (None, "")))
+        if first is None or second is None or isinstance(one, str) or isinstance(other, str):
+            return None
         if not isinstance(first.motion, Vibration):
             return None
         pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
         images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)
         motion = replace(first.motion, image_shift=torch.zeros_like(first.motion.image_shift)).translation()
-        interval = frames[1][0].time - first.time
+        interval = second.time - first.time
         return pair_verdict(images, self.frames.job.timing, motion, interval, self.frames.options)
 
     def record(

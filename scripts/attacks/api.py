@@ -189,7 +189,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "align_motion": {"camera": None, "fit_gain": True},
         "calibrate_row_time": {"frames": stripes},
         "calibrate_row_time_by_exposure": {"frames": stripes},
-        "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4), "recorded": None, "offsets": None},
+        "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
         "camera_isd": of_isd,
         "comparison_figure": {"size": 32, "restored": restored[0]},
         "detect_motion": {"iterations": 1},

@@ -48,6 +48,9 @@ class Clip:
     order: tuple[int, int, int] = (0, 1, 2)  # of the axes of the rates
     tones: tuple[tuple[int, float, float, float], ...] = ()  # axis, px, Hz, rad
     parallax: float = 0.0  # px, amplitude of nearer content on 40 % of the area; a subject moves on 15 %
+    decay: float = 0.0  # 1/s, by which the tones decay
+    sweep: float = 0.0  # Hz/s, by which the frequencies of the tones change
+    pan: float = 0.0  # px, by which the camera turns within half a second, there and back
 
 
 CLIPS = (
@@ -56,6 +59,9 @@ CLIPS = (
     Clip("tones of 71 and 110 Hz", 0.02, (0, 1, 2), ((1, 1.5, 110.0, 1.0), (0, 2.0, 71.0, 0.0))),
     Clip("hand, tones, parallax, subject", 1.0, (0, 1, 2), ((0, 0.9, 137.0, 0.3), (1, 1.7, 47.0, 1.0)), 6.0),
     Clip("fast hand, blind tone, parallax, subject", 1.5, (1, 0, 2), ((1, 1.7, 210.0, 1.0),), 4.0),
+    Clip("tones that decay with 0.8 s", 0.7, (0, 1, 2), ((0, 3.0, 71.0, 0.3), (1, 2.0, 98.0, 1.0)), decay=1 / 0.8),
+    Clip("tones that sweep by 24 Hz/s", 0.7, (0, 1, 2), ((0, 1.5, 60.0, 0.3), (1, 0.8, 80.0, 1.0)), sweep=24.0),
+    Clip("fast pan, tone of 66 Hz", 0.7, (0, 1, 2), ((1, 1.2, 66.0, 1.0),), pan=320.0),
 )
 
 
@@ -96,9 +102,11 @@ def taken(clip: Clip, scene: NDArray[np.float32], hand: tuple[Array, Array], cou
 
     def recorded(t: Array) -> Array:
         pitch, yaw, roll = (np.interp(t, hand[0], centred[:, axis])[:, None] for axis in range(3))
-        shift = [FOCAL * yaw, FOCAL * pitch]
+        turned = clip.pan * (np.clip(2 * t - 1, 0, 1) - np.clip(2 * t - 4, 0, 1))
+        shift = [FOCAL * yaw + turned[:, None], FOCAL * pitch]
         for axis, size, frequency, phase in clip.tones:
-            shift[axis] = shift[axis] + size * np.sin(2 * np.pi * frequency * t + phase)[:, None]
+            wave = np.exp(-clip.decay * t) * np.sin(2 * np.pi * (frequency + 0.5 * clip.sweep * t) * t + phase)
+            shift[axis] = shift[axis] + size * wave[:, None]
 
         def sampled(near_x: Any, near_y: Any) -> tuple[Array, Array]:
             u, v = x - middle[0] - shift[0] - near_x, y - middle[1] - shift[1] - near_y

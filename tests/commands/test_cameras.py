@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 from program import Terminal, refused, rsvib
 
 import rsvib_torch as rsv
+from rsvib_torch.config import read_config
 
 # Name as a user writes it, size and rate of a clip, readout time in ms that the profiles of the model state
 MODELS = (
@@ -115,6 +116,11 @@ def test_init_takes_the_row_time_of_a_camera(place, capsys):
     assert "similar: Sony Xperia 1 V" in error
     assert rsvib("init", "clip.mp4", "--camera", "HERO5 Black", *options) == 0  # scaled from 1520 rows
     assert sensor()["row_time"] == pytest.approx(26.69e-3 / 1080, rel=1e-3)
+    timing = rsv.SensorTiming.from_file("camera.toml")
+    assert timing.row_time_std == pytest.approx(0.03 * timing.row_time, rel=0.01)
+    assert timing.to_dict()["row_time_std"] == timing.in_row_order().row_time_std == timing.row_time_std
+    other = read_config("camera.toml", sensor={"row_time": 12e-6}).timing  # a row time of the command line is exact
+    assert (other.row_time, other.row_time_std) == (12e-6, 0.0)
     text = " ".join(line.removeprefix("# ") for line in (place / "camera.toml").read_text().splitlines())
     assert "GoPro HERO5 Black, 1920 x 1080 px at 30/s" in text
     assert "1 calibration of 1520 rows, which are assumed to be read in the same time" in text
@@ -146,6 +152,7 @@ def test_row_time_of_the_named_camera_is_proposed_in_a_terminal(monkeypatch):
     monkeypatch.setattr("sys.stderr", Terminal())
     assert rsvib("init", "clip.mp4") == 0
     assert sensor()["row_time"] == pytest.approx(8.34167e-3 / 2160, rel=1e-5)
+    assert sensor()["row_time_std"] == pytest.approx(0.03 * sensor()["row_time"], rel=0.01)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png"])

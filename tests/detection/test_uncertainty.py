@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from rsvib_torch.datasets import example_frames
+from rsvib_torch.detection import detect_vibration
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.sensitivity import assumptions, timing_sensitivity
 from rsvib_torch.detection.tones.fit import displacement_std, fit_tones, vibration_of_fit, with_errors_of_blocks
 from rsvib_torch.detection.tones.uncertainty import with_further_tones, without_aliasing
-from rsvib_torch.motion.timing import RowTiming
+from rsvib_torch.motion.timing import RowTiming, SensorTiming
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # exact displacements along y: 0 / 0 is no error
 
@@ -151,13 +153,33 @@ def test_sensitivity_agrees_with_fits_of_other_timings(name, times):
         measurements = measured(truth, other)
         own_starts = other.row_starts(4, ROWS).numpy().T[None]
         fit = fitted(replace(measurements, exposure_starts=own_starts), [37.0])
-        logs.append([math.log(float(fit.amplitude[0, 0, 0])), math.log(float(fit.frequencies[0, 0, 0]))])
+        vibration = vibration_of_fit(fit)[0]
+        tone = (float(values[0, 0, 0]) for values in (vibration.amplitude, vibration.frequency, vibration.phase))
+        amplitude, frequency, phase = tone
+        logs.append([math.log(amplitude), math.log(frequency), phase])
     change = (np.array(logs[1]) - np.array(logs[0])) / 0.001
     exact = measured(truth, timing)
     fit = fitted(replace(exact, exposure_starts=starts[None]), [37.0])
     found = timing_sensitivity(fit, timing, 4, ROWS)
-    for of, expected in zip(("amplitude", "frequency"), change, strict=True):
+    for of, expected in zip(("amplitude", "frequency", "phase"), change, strict=True):
         assert float(getattr(found, f"{of}_by_{name}")[0, 0, 0]) == pytest.approx(expected, rel=0.03, abs=2e-3)
+
+
+def test_standard_deviations_contain_that_of_the_row_time():
+    """In two frames the rows of a frame determine the frequency, which is wrong in proportion to the row time."""
+    frames, timing, _ = example_frames()
+    stated = []
+    for factor in (1.0, 1.01):  # of the row time, with the same exposure and frame rate
+        seconds = {"exposure_time": timing.exposure_time, "frame_rate": timing.frame_rate}
+        row_time = factor * timing.row_time
+        wrong = SensorTiming.from_seconds(row_time=row_time, row_time_std=0.01 * row_time, **seconds)
+        stated.append(detect_vibration(frames, wrong))
+    right, wrong = stated
+    for name in ("amplitude", "frequency", "phase"):
+        error = (getattr(wrong.vibration, name) - getattr(right.vibration, name)).abs()
+        assert torch.allclose(getattr(right.std, name), error, rtol=0.15)  # second order
+    assert torch.allclose(right.std.period, right.std.frequency / right.vibration.frequency**2)
+    assert "± 4e-07 s" in right.assumptions[0]
 
 
 def test_assumptions_state_what_the_frames_cannot_contradict():

@@ -180,3 +180,6 @@ def test_exposures_and_rotations_of_the_images_in_a_track(tmp_path):
     assert not plain.stabilised
     assert read_camera_track(mp4(tmp_path / "other.mp4", packets_of(), kind=b"text")) is None
     assert read_camera_track(tmp_path / "missing.tif") is None
+    damaged = mp4(tmp_path / "damaged.mp4", [packets_of()[0][:-40]] * 3)
+    with pytest.warns(UserWarning, match=r"damaged\.mp4: the GPMF track is damaged and is not used: a GPMF entry"):
+        assert read_camera_track(damaged) is None

@@ -80,6 +80,22 @@ def test_other_readout(options):
     )
 
 
+def test_fisheye_lens():
+    """A lens that moves the corners by 9 px: without it, pans do not explain the displacements at the border."""
+    lens = (-0.6, 0.2, 0.0, 0.0)
+    frames, limits = take(TIMING, fisheye=np.array(lens)), (OFFSET - 0.01, OFFSET + 0.01)
+    camera = rsv.Camera(FOCAL_LENGTH, distortion=lens, fisheye=True)
+    found = rsv.align_motion(frames, TIMING, recorded("yZx"), camera=camera, offsets=limits)
+    check(found, "yZx")
+    plain = rsv.align_motion(frames, TIMING, recorded("yZx"), offsets=limits)
+    assert plain.corner_std > 1.5 * found.corner_std
+    left = []
+    for motion in (found.motion, plain.motion):
+        restored = rsv.restore(frames, TIMING, motion, check=False, method="dewarp")[:, 6:-6, 6:-6]
+        left.append(float((restored[1:] - restored[:-1]).square().mean().sqrt()))
+    assert left[0] < 0.8 * left[1]
+
+
 def test_search_finds_all_24_orientations(tracks):
     assert len(ORIENTATIONS) == 24
     for name in ORIENTATIONS:
@@ -111,10 +127,7 @@ def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
     (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 7e-5\nexposure_rows = 11.4\nframe_rows = 480\n")
     rsv.write_stack(tmp_path / "frames.tif", frames)
     rates = recorded("ZXY")
-    rows = [
-        ",".join(f"{v:.12g}" for v in (t, *w)) for t, w in zip(rates.times.tolist(), rates.rates.tolist(), strict=True)
-    ]
-    (tmp_path / "rates.csv").write_text("time,gx_rad_s,gy_rad_s,gz_rad_s\n" + "\n".join(rows))
+    write_rates(tmp_path / "rates.csv", rates)
     known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
     arguments = (*known, "--motion", tmp_path / "rates.csv", "--focal-length", 380, "--device", "cpu")
     log = "GYROFLOW IMU LOG\nversion,1.3\nid,test\norientation,XYZ\ntscale,1e-6\ngscale,1e-6\nt,gx,gy,gz\n"
@@ -138,6 +151,30 @@ def test_command_estimates_clock_and_row_time(frames, tmp_path, capsys):
     assert "give one of them" in refused(capsys, *arguments, *both)
     alone = ("--offset", 0.35, "--overwrite")
     assert "axes and clock of a gyroscope are estimated from the frames" in refused(capsys, *arguments, *alone)
+
+
+def write_rates(path, rates):
+    rows = torch.cat([rates.times[:, None], rates.rates], 1).tolist()
+    text = "\n".join(",".join(f"{value:.12g}" for value in row) for row in rows)
+    path.write_text(f"time,gx_rad_s,gy_rad_s,gz_rad_s\n{text}")
+
+
+def test_rows_that_do_not_count(tmp_path, capsys):
+    """A dashboard on two thirds of the frames hides the axes and the clock."""
+    rsv.write_stack(tmp_path / "frames.tif", take(TIMING, dashboard=130))
+    (tmp_path / "camera.toml").write_text("[sensor]\nrow_time = 8e-5\nexposure_rows = 10\nframe_rows = 420\n")
+    write_rates(tmp_path / "rates.csv", recorded("ZXY"))
+    known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
+    known += ("--motion", tmp_path / "rates.csv", "--device", "cpu", "--force", "--overwrite", "--json")
+    found = []
+    for more in ([], ["--ignore", "70:"], ["--ignore", "70:140,:", "--ignore", "140:"]):
+        assert rsvib(*known, *more) == 0
+        found.append(json.loads(capsys.readouterr().out)["alignment"])
+    assert not found[0]["reliable"]
+    assert found[1] == found[2]
+    assert (found[1]["orientation"], found[1]["offset"]) == ("ZXY", pytest.approx(OFFSET, abs=5e-4))
+    assert "such as 400: or :60,500:, got '70'" in refused(capsys, *known, "--ignore", "70")
+    assert "no pixel of frames of 200 rows and 216 columns" in refused(capsys, *known, "--ignore", "200:")
 
 
 def test_mirrored_axes_are_refused(tracks):

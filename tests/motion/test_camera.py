@@ -1,16 +1,20 @@
 """Camera with lens distortion: projection against OpenCV, image formation against direct sampling of the scene."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
 
 LENS = rsv.Camera(574.0, (6.5, 9.5), (-0.12, 0.05, 1e-3, -2e-3, 0.01))
+FISHEYE = rsv.Camera(390.0, (-6.0, 7.0), (0.15, -0.148, 0.083, -0.0155), fisheye=True)  # 75 degrees at a corner
 
 
 def grid(width, height, dtype=torch.float64):
@@ -19,38 +23,53 @@ def grid(width, height, dtype=torch.float64):
     return torch.broadcast_tensors(x, y)
 
 
+def project_angle(lens, angle):
+    """Distance from the principal point over the focal length of a ray at an angle, by OpenCV."""
+    ray = np.array([[[np.tan(angle), 0.0, 1.0]]])
+    return cv2.fisheye.projectPoints(ray, np.zeros(3), np.zeros(3), np.eye(3), lens)[0][0, 0, 0]
+
+
 def opencv_displacement(camera, components, points):
     """Displacement by a rotation: undistorted by root finding, rotated by SciPy, projected by OpenCV."""
     f, (cx, cy), lens = camera.focal_length, camera.principal_point, np.array(camera.distortion)
 
     def project(rays, scale=1.0):
         matrix = np.array([[scale * f, 0, cx], [0, scale * f, cy], [0, 0, 1]])
+        if camera.fisheye:
+            return cv2.fisheye.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, lens)[0][:, 0]
         return cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, lens)[0][:, 0]
 
     rays = np.c_[(points - camera.principal_point) / f, np.ones(len(points))]
-    for _ in range(100):  # fixed point: the distortion of this lens moves points by less than a tenth
-        rays[:, :2] -= (project(rays) - points) / f
+    if camera.fisheye:
+        far = np.linalg.norm(rays[:, :2], axis=1)
+        angles = [brentq(lambda angle, d=d: project_angle(lens, angle) - d, 0, 1.5) for d in far]
+        rays[:, :2] *= (np.tan(angles) / far)[:, None]
+    else:
+        for _ in range(100):  # fixed point: the distortion of this lens moves points by less than a tenth
+            rays[:, :2] -= (project(rays) - points) / f
     x, y, theta, zeta = components
     turned = Rotation.from_rotvec([-y / f, x / f, theta]).apply(rays)
     return project(turned, 1 + zeta) - points
 
 
-def test_displacement_equals_rotation_and_projection_of_opencv():
+@pytest.mark.parametrize("camera", [LENS, FISHEYE])
+def test_displacement_equals_rotation_and_projection_of_opencv(camera):
     components = torch.tensor([7.0, -5.0, 4e-3, 3e-4], dtype=torch.float64)
     x, y = grid(800, 600)
-    moved = LENS.displacement(components, x, y).reshape(-1, 2)
-    expected = opencv_displacement(LENS, components.tolist(), torch.stack([x, y], -1).reshape(-1, 2).numpy())
+    moved = camera.displacement(components, x, y).reshape(-1, 2)
+    expected = opencv_displacement(camera, components.tolist(), torch.stack([x, y], -1).reshape(-1, 2).numpy())
     np.testing.assert_allclose(moved, expected, atol=1e-9)
     assert float((moved - components[:2]).abs().max()) > 3.0  # px: far from a translation
 
 
-def test_factors_are_the_derivative_of_the_displacement():
+@pytest.mark.parametrize("camera", [LENS, FISHEYE, rsv.Camera(390.0, fisheye=True)])
+def test_factors_are_the_derivative_of_the_displacement(camera):
     x, y = grid(800, 600)
-    factors = LENS.factors(x, y, 4)
+    factors = camera.factors(x, y, 4)
     for axis, step in enumerate((1e-4, 1e-4, 1e-7, 1e-7)):
         unit = torch.zeros(4, dtype=torch.float64)
         unit[axis] = step
-        slope = (LENS.displacement(unit, x, y) - LENS.displacement(-unit, x, y)) / (2 * step)
+        slope = (camera.displacement(unit, x, y) - camera.displacement(-unit, x, y)) / (2 * step)
         torch.testing.assert_close(slope, factors[..., axis], atol=2e-5, rtol=1e-6)
 
 
@@ -105,9 +124,9 @@ def test_simulated_frames_equal_a_scene_sampled_through_the_lens():
 def test_files_keep_the_camera(tmp_path):
     vibration = rsv.Vibration((3.0, 5.0), (90.0, 61.0), camera=LENS)
     free = rsv.FreeMotion(torch.zeros(3, 8), 0.0, 0.01, camera=LENS)
-    for motion in (vibration, free):
+    for motion in (vibration, free, vibration.with_camera(FISHEYE)):
         motion.save(tmp_path / "motion.json")
-        assert type(motion).load(tmp_path / "motion.json").camera == LENS
+        assert type(motion).load(tmp_path / "motion.json").camera == motion.camera
 
 
 @pytest.mark.parametrize(
@@ -116,9 +135,58 @@ def test_files_keep_the_camera(tmp_path):
         ({"focal_length": 0.0}, "focal_length must be"),
         ({"focal_length": float("nan")}, "focal_length must be"),
         ({"focal_length": 500.0, "distortion": (0.1, 0.2)}, "distortion must be 5 numbers"),
+        ({"focal_length": 500.0, "distortion": (0.1,) * 5, "fisheye": True}, "distortion must be 4 numbers"),
         ({"focal_length": 500.0, "principal_point": (0.1, float("inf"))}, "principal_point must be"),
     ],
 )
 def test_bad_cameras_are_refused(arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         rsv.Camera(**arguments)
+
+
+# Format of the files in https://github.com/gyroflow/lens_profiles.
+PROFILE = {
+    "calib_dimension": {"w": 3840, "h": 2160},
+    "fisheye_params": {
+        "camera_matrix": [[1248.0, 0.0, 1909.5], [0.0, 1250.0, 1086.5], [0.0, 0.0, 1.0]],
+        "distortion_coeffs": [0.15, -0.148, 0.083, -0.0155],
+    },
+    "distortion_model": None,
+    "digital_lens": None,
+    "fps": 59.94,
+}
+
+
+def test_lens_profile_for_scaled_frames(tmp_path):
+    (tmp_path / "lens.json").write_text(json.dumps(PROFILE))
+    camera = rsv.Camera.from_gyroflow(tmp_path / "lens.json", 1920, 1080)
+    assert camera.focal_length == pytest.approx(624.5, abs=0.01)
+    assert camera.principal_point == pytest.approx((-5.0, 3.5))
+    assert (camera.fisheye, camera.distortion) == (True, (0.15, -0.148, 0.083, -0.0155))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"digital_lens": "gopro_superview"}, "lens model 'gopro_superview' is not supported"),
+        ({"distortion_model": "poly5"}, "lens model 'poly5' is not supported"),
+        ({"calib_dimension": {"w": 3840, "h": 2880}}, "is for frames of 3840 x 2880 px, got 1920 x 1080 px"),
+        ({"calib_dimension": {"w": 3840}}, "not a lens profile of Gyroflow: KeyError"),
+        ({"fisheye_params": {}}, "not a lens profile of Gyroflow: KeyError"),
+        ({"fisheye_params": {"camera_matrix": [["1", 0, 0]] * 3}}, "not a lens profile of Gyroflow: TypeError"),
+        (
+            {"fisheye_params": PROFILE["fisheye_params"] | {"camera_matrix": [[9.0, 0, 0], [0, 12.0, 0], [0, 0, 1]]}},
+            "different focal lengths along x and y, 9 and 12 px",
+        ),
+    ],
+)
+def test_other_lens_profiles_are_refused(tmp_path, change, message):
+    (tmp_path / "lens.json").write_text(json.dumps(PROFILE | change))
+    with pytest.raises(ValueError, match=message):
+        rsv.Camera.from_gyroflow(tmp_path / "lens.json", 1920, 1080)
+
+
+def test_a_lens_that_folds_the_image_is_refused():
+    FISHEYE.check_size(800, 600)
+    with pytest.raises(ValueError, match=r"check the order \(k1, k2, k3, k4\)"):
+        rsv.Camera(390.0, distortion=(-1.0, 0.0, 0.0, 0.0), fisheye=True).check_size(800, 600)

@@ -113,18 +113,6 @@ def test_what_is_not_identifiable_is_refused(two_tones, tmp_path, frames, code):
     assert loaded.findings == found.findings
 
 
-def test_row_time_of_a_hand_held_camera_with_its_gyroscope(two_tones):
-    clock = torch.arange(-0.05, 0.15, 5e-4, dtype=torch.float64)
-    recorded = rsv.FreeMotion.from_samples(clock + 7.003, torch.from_numpy(Tones().displacement(clock.numpy())))
-    offsets = (7.003 + 0.5 * HEIGHT * ROW_TIME - 2e-3, 7.003 + 0.5 * HEIGHT * ROW_TIME + 2e-3)
-    found = rsv.calibrate_row_time_by_motion(
-        two_tones[:3], frame_rate=RATE, recorded=recorded, offsets=offsets, row_time=(3e-5, 7.2e-5)
-    )
-    assert found.reliable, found.reasons
-    assert found.readout_direction == "forward"
-    assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std < 4e-3 * ROW_TIME
-
-
 def smooth_motion(times, highest, seed):
     generator = np.random.default_rng(seed)
     frequency = np.linspace(0.5, highest, 60)
@@ -160,7 +148,6 @@ def test_smooth_motion_continues_over_the_blanking_time(highest, known):
         ({"row_time": (20.0, 60.0)}, "in seconds"),
         ({"row_time": 6e-5}, "row_time"),
         ({"exposure_time": 0.5}, "exceeds the frame period"),
-        ({"fit_gain": True}, "pass recorded"),
     ],
 )
 def test_bad_options(two_tones, options, message):

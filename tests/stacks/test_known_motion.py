@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from program import rsvib
 from truth import MARGIN, Motion, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import align_stack
+from rsvib_torch.stacks import align_stack, check_stack_motion
 
 HEIGHT, WIDTH, COUNT = 160, 128, 60
 TIMING = rsv.SensorTiming(row_time=6e-5, exposure_rows=20, frame_rows=300)
@@ -51,6 +52,18 @@ def test_the_clock_over_a_long_stack_is_found_by_parts_of_it(place):
     assert abs(found.scale - SPEED) < min(4 * found.scale_std, 1e-4)
     off = align_stack(place / "frames.npy", info, TIMING, recorded, offsets=(812.3, 812.34))
     assert not off.reliable
+
+
+def test_parts_that_are_fixed_to_the_camera_do_not_count(place, tmp_path):
+    frames = np.load(place / "frames.npy")
+    frames[:, 100:] = draw_scene(HEIGHT - 100, WIDTH, 9)
+    np.save(tmp_path / "frames.npy", frames.astype(np.float32))
+    recorded, info = rsv.read_motion(place / "motion.csv", unit="px"), rsv.read_stack_info(tmp_path / "frames.npy")
+    ignore = torch.arange(HEIGHT)[:, None].expand(HEIGHT, WIDTH) >= 100
+    found = align_stack(tmp_path / "frames.npy", info, TIMING, recorded, ignore=ignore)
+    assert found.reliable, found.reasons
+    assert found.offset == pytest.approx(CLOCK, abs=1e-4)
+    assert check_stack_motion(tmp_path / "frames.npy", info, TIMING, found.motion, ignore).helps
 
 
 def test_a_long_stack_is_restored_in_windows_with_a_recording(place, tmp_path, capsys):

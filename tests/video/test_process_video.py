@@ -112,6 +112,19 @@ def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path, method):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["still.mp4", "still.mp4.manifest.json"]
 
 
+def test_a_part_that_restoration_makes_worse_is_left_as_it_is(frames, tmp_path):
+    """The frames by which the second part is judged do not vibrate; the tones are those of all frames."""
+    paused = frames.copy()
+    paused[PART : PART + 4] = (255 * STILL).round().transpose(1, 2, 0)
+    clip = write(tmp_path / "clip.mp4", paused)
+    report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    windows = read_manifest(report.manifest).windows
+    assert [(one.outcome, one.frames) for one in windows] == [("helps", "restored"), ("worse", "as taken")]
+    raw, restored = pixels(clip), pixels(tmp_path / "still.mp4")
+    assert gains(clip, restored)[: PART - 4].min() > 6
+    assert np.abs(restored - raw)[PART:].mean() < 0.01  # of two compressions
+
+
 def test_colours_are_kept_as_stored(clip, tmp_path):
     process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS)
     with av.open(str(clip)) as one, av.open(str(tmp_path / "still.mp4")) as other:

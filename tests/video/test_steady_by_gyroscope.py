@@ -36,13 +36,15 @@ def rates_of_clip():
 def make_place(tmp_path_factory):
     """A clip with a subject that moves by itself, and the rates of the gyroscope."""
     place = tmp_path_factory.mktemp("place")
-    frames = take(TIMING, SHAKING, subject=walk, count=COUNT).numpy()
-    counts = np.repeat(np.clip(np.round(255 * frames), 0, 255).astype(np.uint8)[..., None], 3, -1)
-    encoder = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6", "threads": "1"}, "sound": "aac"}
-    times = np.arange(COUNT) * TIMING.frame_period
-    write_video(place / "clip.mp4", counts, times, layout="rgb24", rate=30, **encoder)
+    write_clip(place / "clip.mp4", take(TIMING, SHAKING, subject=walk, count=COUNT))
     write_rates(place / "rates.csv", rates_of_clip())
     return place
+
+
+def write_clip(path, frames):
+    counts = np.repeat(np.clip(np.round(255 * frames.numpy()), 0, 255).astype(np.uint8)[..., None], 3, -1)
+    encoder = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6", "threads": "1"}, "sound": "aac"}
+    write_video(path, counts, np.arange(COUNT) * TIMING.frame_period, layout="rgb24", rate=30, **encoder)
 
 
 def write_rates(path, rates):
@@ -71,6 +73,21 @@ def test_the_scene_behind_a_large_subject_becomes_steady(place, tmp_path):
     assert found["offset"] == pytest.approx(OFFSET, abs=1e-3)
     assert found["focal_length"] == pytest.approx(FOCAL_LENGTH, rel=0.03)
     assert sound_of(tmp_path / "steady.mp4") == sound_of(place / "clip.mp4")
+
+
+def test_a_fisheye_lens(place, tmp_path, capsys):
+    lens = {"camera_matrix": [[2 * FOCAL_LENGTH, 0, 215.5], [0, 2 * FOCAL_LENGTH, 199.5], [0, 0, 1]]}
+    lens["distortion_coeffs"] = [-0.6, 0.2, 0.0, 0.0]  # moves the corners by 9 px
+    profile = {"calib_dimension": {"w": 432, "h": 400}, "fisheye_params": lens}  # of frames that are twice as large
+    (tmp_path / "lens.json").write_text(json.dumps(profile))
+    write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=COUNT, fisheye=np.array(lens["distortion_coeffs"])))
+    steadied = ["run", str(tmp_path / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "0.333"]
+    steadied += ["--method", "dewarp", "--device", "cpu", "--lens-profile", str(tmp_path / "lens.json")]
+    assert run_command(steadied) == 2
+    assert "lens_profile belongs to a gyroscope" in capsys.readouterr().err
+    assert run_command([*steadied, "--gyroscope", str(place / "rates.csv")]) == 0
+    assert shaking(tmp_path / "out" / "restored.mp4") < 0.15  # 0.54 without, or the alignment is refused
+    assert rsv.read_manifest(tmp_path / "out" / "manifest.json").gyroscope["focal_length"] == FOCAL_LENGTH
 
 
 def test_the_track_of_the_clip_itself(place, tmp_path, capsys):

@@ -191,9 +191,10 @@ def detected_tones(result: DetectionResult) -> tuple[tuple[str, ...], list[list[
 def camera_rows(timing: SensorTiming, shape: Sequence[int]) -> list[list[str]]:
     """Lines of the table of the camera."""
     blind = ", ".join(f"{value:.1f}" for value in blind_frequencies(timing, 4.5 / timing.frame_period).tolist())
+    uncertain = timing.row_time_std > 0
     return [
         ["shape of the stack", " x ".join(str(size) for size in shape)],
-        ["row time", f"{1e6 * timing.row_time:g} µs"],
+        ["row time", f"{1e6 * timing.row_time:g}{f' ± {1e6 * timing.row_time_std:.2g}' * uncertain} µs"],
         ["exposure time", f"{1e3 * timing.exposure_time:.4g} ms ({timing.exposure_rows:g} row times)"],
         ["frame period", f"{timing.frame_rows:g} row times ({timing.frame_rate:.2f} frames per second)"],
         ["scan axis", f"{'x' if timing.scan_axis == -1 else 'y'}, {timing.readout_direction}"],
