@@ -114,7 +114,7 @@ def camera_isd(
         "focal2pixel_lines": [0.0, 0.0, 1.0],
         "focal2pixel_samples": [0.0, 1.0, 0.0],
         "focal_length_model": {"focal_length": f},
-        "detector_center": dict(zip(("sample", "line"), centre, strict=True)),
+        "detector_center": {"line": centre[1], "sample": centre[0]},
         "interpolation_method": "lagrange",
         "optical_distortion": lens,
         "radii": {"semimajor": radii[0], "semiminor": radii[1], "unit": "km"},

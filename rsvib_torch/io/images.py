@@ -43,7 +43,7 @@ def image_info(path: Path) -> StackInfo:
         if is_png and image.is_animated:
             raise ValueError("an animated PNG, of which only the first frame could be read; write its frames as files")
         if image.mode not in _CHANNELS:
-            raise ValueError(f"pixels are {image.mode}; expected grey, RGB or RGBA")
+            raise ValueError(f"pixels are {image.mode}; expected grey{', RGB or RGBA' if is_png else ' or RGB'}")
         channels, dtype = _CHANNELS[image.mode], np.dtype(np.uint16 if is_png and head[24] == 16 else np.uint8)
         if "transparency" in image.info and channels == 3:  # one transparent value of a grey image is not decoded
             channels = 4

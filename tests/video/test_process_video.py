@@ -285,7 +285,7 @@ def test_one_command_makes_a_shaky_video_steady(shaky, tmp_path, capsys):
     capsys.readouterr()
     vibration = ("--vibration", tmp_path / "out" / "manifest.json")
     wrong = {
-        ("restore", shaky, tmp_path / "again.mp4", *CAMERA, *vibration): "its parts are not windows; detect",
+        ("restore", shaky, tmp_path / "again.mp4", *CAMERA, *vibration): "is not that of windows; repeat rsvib run",
         steady: "results exist already",
         (*arguments[:3], *CAMERA, "--steady", "1"): "--steady goes with --video",
         (*steady, "--overwrite", "--joint", "3"): "method='dewarp' has no option 'joint'",
