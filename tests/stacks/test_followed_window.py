@@ -187,7 +187,9 @@ def test_run_and_detect_follow_a_vibration_that_changes_without_an_option(place,
     answer = " ".join(capsys.readouterr().out.split())
     assert f"{FRAMES} frames restored" in answer
     assert "--follow if" not in answer  # the remedy of a steady vibration
-    assert "The vibration changes." in (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    assert "followed from frame to frame, and removed, by rsvib run" in (tmp_path / "page" / "report.html").read_text(
+        encoding="utf-8"
+    )
     manifest = tmp_path / "detect" / "manifest.json"
     again = ("restore", place / "frames.npy", tmp_path / "again.npy", *CAMERA, "--vibration", manifest)
     assert "repeat rsvib run" in refused(capsys, *again)

@@ -293,6 +293,7 @@ def test_signals_end_a_session(tmp_path, number):
         if round(tracked.time * 30) == 5:
             signal.raise_signal(number)
             signal.raise_signal(number)  # a second one does not end the process
+            time.sleep(0.2)  # frames of one pixel take less time than the signal
 
     saved = []
 
