@@ -381,13 +381,14 @@ def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, 
     v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=u.device)
     total, noise_power = _smoothed(whole, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
     of_blocks = _of_blocks(u), _of_blocks(v)
+    bands = _pass_bands(*of_blocks)
     # 2. The filter.
     wiener = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
-    filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, *of_blocks)
+    filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, of_blocks[0], *bands)
     torch.view_as_real(whole).mul_(_in_pass_band(filtered, u, v)[..., None])
     # 3. A filter that attenuates frequencies of the scene makes derivatives d too small for least squares: with the
     # true ones g, the sum of ``d g`` is larger than that of ``d^2``.
-    passed = filtered * torch.outer(*_pass_bands(*of_blocks)).to(filtered.dtype)
+    passed = filtered * torch.outer(*bands).to(filtered.dtype)
     products, squares = passed * wiener * total, passed.square() * total
     x, y = (f.square().to(filtered.dtype) for f in of_blocks)
     larger_x, larger_y = (
@@ -397,7 +398,7 @@ def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, 
     detail = torch.fft.ifft(whole)
     whole *= (2j * math.pi * v).to(whole.dtype) * larger_y
     across = torch.fft.ifft(whole)
-    aliasing = _aliasing_bias(total - noise_power, *of_blocks)
+    aliasing = _aliasing_bias(total - noise_power, of_blocks[0], *bands)
     along = (2j * math.pi * u).to(whole.dtype) * larger_x
     return detail.transpose(-2, -1), along, across.transpose(-2, -1), aliasing
 
@@ -413,20 +414,20 @@ def _in_pass_band(factors: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return blocks[:, : len(u), : len(v)] * passed
 
 
-def _with_little_aliasing(scene_power: Tensor, noise_power: Tensor, u: Tensor, v: Tensor) -> Tensor:
+def _with_little_aliasing(scene_power: Tensor, noise_power: Tensor, u: Tensor, along: Tensor, across: Tensor) -> Tensor:
     """Factors (B, U / 16, 1) that attenuate detail along rows where its aliased part exceeds the noise.
 
     A scene whose power falls as ``exp(-k u)`` has the power ``exp(-k u) + exp(-k (1 - u))`` in the frames, proportional
     to ``cosh(k (1/2 - u))``. The second term is aliased. k follows from the powers at two frequencies, and the size of
     that term from the power at 1/2, which is twice as large. Arguments as of ``_aliasing_bias``.
     """
-    along, across = (band.to(scene_power.dtype) for band in _pass_bands(u, v))
+    passed = (along > 0.5)[:, None] & (across > 0.5)
+    across = across.to(scene_power.dtype)
     power = (scene_power @ across).clamp(min=torch.finfo(scene_power.dtype).tiny)
     highest, below = power[:, -2:].mean(1), 0.5 - u.to(power.dtype)
     place = int((u - 0.35).abs().argmin())
     fall = torch.acosh((power[:, place] / highest).clamp(1.0, 1e6)) / below[place]
     aliased = 0.5 * highest[:, None] * torch.exp(-fall[:, None] * below)
-    passed = (along > 0.5)[:, None] & (across > 0.5)
     noise = noise_power.masked_fill(~passed, math.inf).amin((1, 2))[:, None] * across.sum()
     factors: Tensor = (1 / (1 + aliased / (2 * noise + _LEAST_ALIASED * power)))[..., None]
     return factors
@@ -441,16 +442,15 @@ def _pass_bands(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     return _low_pass(u, 0.40, 0.48), _low_pass(v, 0.24, 0.34)
 
 
-def _aliasing_bias(scene_power: Tensor, u: Tensor, v: Tensor) -> Tensor:
+def _aliasing_bias(scene_power: Tensor, u: Tensor, along: Tensor, across: Tensor) -> Tensor:
     """Expected size (B,) in px of the bias of displacements by aliasing, that of the scene itself.
 
     An aliased part of power A(u) in frames of power P(u) biases a displacement of a quarter of a pixel by ``sum 2 pi u
     A / sum (2 pi u)^2 P`` over the pass band of the gradients. At u = 1/2, A is the power of the scene (B, U / 16, S /
-    16, smoothed); it falls quickly towards lower u. Frequencies u (U / 16,) along and v (S / 16,) across rows are in
-    cycles/px.
+    16, smoothed); it falls quickly towards lower u. ``u`` (U / 16,) are the frequencies along rows in cycles/px;
+    ``along`` (U / 16,) and ``across`` (S / 16,) are the pass bands.
     """
     power = scene_power.to(torch.float64)
-    along, across = _pass_bands(u, v)
     at_nyquist = (power[:, -1] @ across / across.sum()).clamp(min=0.0)
     slope = 2 * math.pi * u * along
     squares = (slope.square() @ power @ across.square()).clamp(min=1e-300)
