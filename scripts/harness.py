@@ -310,6 +310,14 @@ def today() -> str:
     return datetime.datetime.now(tz=datetime.UTC).date().isoformat()
 
 
+_NOT_STORED = ("out", "only", "store")  # options of the run that do not concern its figures
+
+
+def _without_folder(value: Any) -> Any:
+    """The name of a file that an option states by an absolute path; other values as they are."""
+    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
+
+
 def write_result(section: str, rows: Rows, options: argparse.Namespace, seconds: float, folder: Path = RESULTS) -> Path:
     """Store the figures of a section with options, version, date and machine as ``section.json`` in a folder."""
     content = {
@@ -319,7 +327,7 @@ def write_result(section: str, rows: Rows, options: argparse.Namespace, seconds:
         "date": today(),
         "seconds": round(seconds, 1),
         "machine": machine(),
-        "options": {name: value for name, value in vars(options).items() if name not in ("out", "only", "store")},
+        "options": {name: _without_folder(value) for name, value in vars(options).items() if name not in _NOT_STORED},
         "rows": rows,
     }
     folder.mkdir(parents=True, exist_ok=True)

@@ -93,8 +93,9 @@ def export(given: ExportOptions) -> Answer:
         found = read_json(given.camera_isd, "ISD")
         rows = found.get("image_lines")
         motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)
-        of_isd: Table = {"frame": given.frame, "model": given.model, "tolerance": given.tolerance}
-        written = exports.write_isd(out, motion, timing, found, **of_isd)
+        written = exports.write_isd(
+            out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
+        )
         frame = "frame camera with jitter polynomials"
         form = frame if written == "frame" else "line scanner with one quaternion per row"
         data |= {"model": written, "frame": given.frame}

@@ -124,13 +124,26 @@ def live_session(given: LiveOptions) -> Answer:
                 check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
                 video.save_spectrogram(given.spectrogram, spectrogram)
 
-        chosen: Table = restoration | given.tracker | {"method": method, "channels": "first"}
-        scale = source.full_scale if given.full_scale is None or given.file else given.full_scale
-        steadied: Table = {"steady": given.steady, "wobble": given.steady > 0}
-        tracker = tracking.VibrationTracker(settings.timing, **chosen, **steadied, full_scale=scale)
-        limits: Table = {"drops": drops, "waiting": given.waiting, "max_frames": given.num_frames}
-        sinks: Table = {"spectrogram": spectrogram, "progress": _state_text(shown[0]) if shown else None, "save": save}
-        report = video.run_live(source, tracker, outputs, border=video.VideoBorder(given.border), **limits, **sinks)
+        tracker = tracking.VibrationTracker(
+            settings.timing,
+            **restoration | given.tracker | {"method": method},
+            steady=given.steady,
+            wobble=given.steady > 0,
+            full_scale=source.full_scale if given.full_scale is None or given.file else given.full_scale,
+            channels="first",
+        )
+        report = video.run_live(
+            source,
+            tracker,
+            outputs,
+            border=video.VideoBorder(given.border),
+            drops=drops,
+            waiting=given.waiting,
+            max_frames=given.num_frames,
+            spectrogram=spectrogram,
+            progress=_state_text(shown[0]) if shown else None,
+            save=save,
+        )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
     slow = "dropped, because processing was too slow (fewer --columns)"
@@ -156,6 +169,8 @@ def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
 
 def _check_options(given: LiveOptions) -> None:
     """Refuse options that do not go with the source."""
+    if given.source == "-" and given.size is None:
+        raise ValueError("--size WIDTHxHEIGHT is required for raw frames on standard input")
     if given.source != "-" and given.size is not None:
         raise ValueError(f"--size goes with frames on standard input (-), not with {given.source}")
     if given.realtime and given.file is None:

@@ -169,19 +169,31 @@ def known(given: KnownOptions) -> Answer:
     results: dict[str, list[str]] = {}
     data: Table = {"alignment": None, "check": None}
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
-        fitted: Table = {
-            **{"camera": _camera(given, info), "offsets": given.offsets, "ignore": ignore},
-            **{"fit_gain": given.fit_gain, "fit_row_time": given.fit_row_time},
-        }
         with working("aligning the recording"):
-            found = stacks.align_stack(given.stack, info, timing, recorded, **fitted)
-        results["Recording on the clock of the frames"], data["alignment"] = [found.summary()], _without_curve(found)
+            found = stacks.align_stack(
+                given.stack,
+                info,
+                timing,
+                recorded,
+                camera=_camera(given, info),
+                offsets=given.offsets,
+                ignore=ignore,
+                fit_gain=given.fit_gain,
+                fit_row_time=given.fit_row_time,
+            )
+        results["Recording on the clock of the frames"] = [found.summary()]
+        data["alignment"] = _without_curve(found)
         _refuse(given, found.reasons)
         placed = found.motion
         if given.fit_row_time and isinstance(found, gyroscope.RotationAlignment):  # times in s stay the same
             rows = timing.row_time / found.row_time
-            in_rows: Table = {"exposure_rows": rows * timing.exposure_rows, "frame_rows": rows * timing.frame_rows}
-            timing = replace(timing, row_time=found.row_time, **in_rows, row_time_std=found.row_time_std)
+            timing = replace(
+                timing,
+                row_time=found.row_time,
+                exposure_rows=rows * timing.exposure_rows,
+                frame_rows=rows * timing.frame_rows,
+                row_time_std=found.row_time_std,
+            )
     else:
         placed = recorded.retimed(given.offset)
         starts = io.timing_from_first_frame(timing, info).frame_starts(info.shape[0])
@@ -224,8 +236,9 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
         if given.fit_row_time or given.lens_profile is not None:
             raise ValueError("--fit-row-time and --lens-profile are for a gyroscope, without --unit")
         signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-        units: Table = {"unit": given.unit, "focal_length": given.focal_length, "time_unit": given.time_unit}
-        return rsvib_torch.read_motion(given.motion, **units, signs=signs)
+        return rsvib_torch.read_motion(
+            given.motion, unit=given.unit, focal_length=given.focal_length, time_unit=given.time_unit, signs=signs
+        )
     if given.flip_x or given.flip_y or given.offset is not None or given.time_unit != "s":
         raise ValueError(
             "--flip-x, --flip-y, --offset and --time-unit are for a CSV file with the columns time, x and y, and need "
@@ -329,11 +342,12 @@ def compare(given: CompareOptions) -> Answer:
         shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-    record = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
     found = detection.DetectionResult.load(given.vibration)
-    stated: Table = {"pixel_size": given.pixel_size, "offset": given.offset, "offsets": given.offsets}
     with working("comparing"):
-        result = gyroscope.compare_accelerometer(found, *record, **stated)
+        result = gyroscope.compare_accelerometer(
+            found, times, acceleration, pixel_size=given.pixel_size, offset=given.offset, offsets=given.offsets
+        )
         if given.out is not None:
             result.plot(given.out)
     files = [] if given.out is None else [given.out]
@@ -414,18 +428,26 @@ def calibrate(given: CalibrateOptions) -> Answer:
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
     with working("measuring the motion" if given.by_motion else "measuring the flicker"):
         if given.by_motion:
-            exposure = given.exposure[0] if given.exposure else None
-            limits = (given.row_time[0], given.row_time[1]) if given.row_time else None
-            known: Table = {"row_time": limits, "exposure_time": exposure, "readout_direction": given.readout_direction}
-            frame_rate = given.frame_rate or 0.0
-            result = row_time.calibrate_row_time_by_motion(stack, frame_rate=frame_rate, scan_axis=axis, **known)
+            result = row_time.calibrate_row_time_by_motion(
+                stack,
+                frame_rate=given.frame_rate or 0.0,
+                row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
+                exposure_time=given.exposure[0] if given.exposure else None,
+                scan_axis=axis,
+                readout_direction=given.readout_direction,
+            )
         elif given.flicker_frequency is None:
             exposures = given.exposure or []
             result = row_time.calibrate_row_time_by_exposure(stack, exposures, scan_axis=axis, gamma=given.gamma)
         else:
-            known = {"on_fraction": given.on_fraction, "light_contrast": given.light_contrast, "gamma": given.gamma}
             result = row_time.calibrate_row_time(
-                stack, given.flicker_frequency, frame_rate=given.frame_rate, scan_axis=axis, **known
+                stack,
+                given.flicker_frequency,
+                frame_rate=given.frame_rate,
+                on_fraction=given.on_fraction,
+                light_contrast=given.light_contrast,
+                scan_axis=axis,
+                gamma=given.gamma,
             )
     if result.row_time is None or result.row_time_std is None or not result.reliable:
         raise ValueError(f"the row time is not certain: {'; '.join(result.reasons)}")

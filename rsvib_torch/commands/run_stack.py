@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 
 _RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
-_USUAL = (None, False, 1, "pass")  # values of options that change nothing
 _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
@@ -84,6 +83,8 @@ def run(given: RunOptions) -> Answer:
     settings, frames, out, output = given.settings, given.stack, given.out, given.output.removesuffix("/")
     if given.moved and not given.video:
         raise ValueError(f"--{next(iter(given.moved)).replace('_', '-')} goes with --video")
+    if "lens_profile" in given.moved and "gyroscope" not in given.moved:
+        raise ValueError("--lens-profile goes with --gyroscope")
     if given.require_reliable and "gyroscope" in given.moved:
         problem = "does not go with --gyroscope, which searches for no tones; leave one of them out"
         raise ValueError(f"--require-reliable {problem}")
@@ -175,9 +176,9 @@ def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) ->
 def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
     """Process a video from frame to frame."""
     settings, frames, out, restoration = given.settings, given.stack, given.out, common["restoration"]
-    stated = given.windows | given.processing | restoration
-    of_windows = ("window", "follow", "bad_frames", "scheduler", "compression", "joint", "scale", "mosaic", "optics")
-    changed = [name for name in of_windows if stated.get(name) is True or stated.get(name) not in _USUAL]
+    changed = [name for name, value in given.windows.items() if value not in (False, "pass")]
+    changed += [name for name in ("scheduler", "compression") if name in given.processing]
+    changed += ["optics_sigma" if name == "optics" else name for name in stacks.options_of_windows(restoration)]
     refused = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
     if refused:
         remedy = "give --output restored.mp4 instead of --video, which processes windows"

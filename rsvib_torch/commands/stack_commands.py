@@ -125,9 +125,15 @@ def simulate(given: SimulateOptions) -> Answer:
     io.check_stack_target(frames, (simulation.num_frames, *image.shape[1:]), dtype=dtype, full_scale=scale)
     with working("simulating the frames"):
         generator = torch.Generator(target).manual_seed(simulation.seed if given.seed is None else given.seed)
-        form: Table = {"frame_size": simulation.frame_size, "noise": simulation.noise, "generator": generator}
-        still, count = image[0].to(target), simulation.num_frames
-        simulated = imaging.simulate_frames(still, settings.timing, vibration, count, **form)
+        simulated = imaging.simulate_frames(
+            image[0].to(target),
+            settings.timing,
+            vibration,
+            simulation.num_frames,
+            frame_size=simulation.frame_size,
+            noise=simulation.noise,
+            generator=generator,
+        )
     with working(f"writing {frames}"):
         stated = io.StackInfo(tuple(simulated.shape), dtype, scale, frame_rate=settings.timing.frame_rate)
         io.write_stack(frames, simulated, dtype=dtype, full_scale=scale, like=stated)
@@ -217,10 +223,17 @@ def _detect_windows(given: DetectOptions, info: io.StackInfo, manifest: Path, wi
     """Detect the vibration in the windows of a stack, and write the manifest."""
     settings, frames = given.settings, given.stack
     scale = shared.full_scale_of(frames, info, settings, given.full_scale)
-    common: Table = {"full_scale": scale, "device": str(given.torch_device)}
-    common["detection"] = None if windows.get("follow") is True else settings.detection
     with working(f"detecting in {frames.name}", counts=True) as progress:
-        stacks.detect_stack(frames, manifest, settings.timing, **windows, **common, progress=progress)
+        stacks.detect_stack(
+            frames,
+            manifest,
+            settings.timing,
+            **windows,
+            detection=None if windows.get("follow") is True else settings.detection,
+            full_scale=scale,
+            device=str(given.torch_device),
+            progress=progress,
+        )
     return stacks.read_manifest(manifest)
 
 

@@ -75,7 +75,7 @@ class CameraTrack:
 def read_camera_track(path: Path) -> CameraTrack | None:
     """What the GPMF track of a video states about its frames; None for other files, without one, or a damaged one.
 
-    Of a damaged one, a ``UserWarning`` says so.
+    A damaged one causes a ``UserWarning``.
     """
     if not path.is_file():
         return None

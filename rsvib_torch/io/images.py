@@ -28,7 +28,7 @@ from rsvib_torch.numerics.tables import Array
 
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file
 _LARGEST_RATIO = 1100  # of pixels to bytes of a PNG file; deflate reaches 1032
-_CHANNELS = {"L": 1, "I;16": 1, "RGB": 3, "RGBA": 4}  # by mode
+_CHANNELS = {"1": 1, "L": 1, "I;16": 1, "P": 3, "RGB": 3, "LA": 4, "RGBA": 4}  # of decoded pixels, by mode
 _LONGEST_HEADER = 2**24  # bytes before the pixels: EXIF data and previews have 64 KB each, colour profiles 3 MB
 _PNG_HEADER = 8 + 25  # bytes of the signature and the chunk with the size
 

@@ -13,7 +13,6 @@ from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.files.atomic import check_target, check_tree, check_writable, whole
 from rsvib_torch.files.outputs import check_outputs
-from rsvib_torch.files.reading import Table
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range
@@ -64,9 +63,15 @@ def _planned(shape: tuple[int, ...], dtype: str | None, full_scale: float | None
     if like is None:
         return info
     kept = like.with_frames(shape[0])
-    stated: Table = {"shape": info.shape, "dtype": info.dtype, "full_scale": full_scale}
-    times, metadata = None if kept.time_error else kept.frame_times, like.metadata_for(info.shape, info.dtype)
-    return replace(kept, **stated, frame_times=times, time_error=0.0, metadata=metadata)
+    return replace(
+        kept,
+        shape=info.shape,
+        dtype=info.dtype,
+        full_scale=full_scale,
+        frame_times=None if kept.time_error else kept.frame_times,
+        time_error=0.0,
+        metadata=like.metadata_for(info.shape, info.dtype),
+    )
 
 
 def check_stack_target(

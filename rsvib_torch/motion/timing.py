@@ -155,8 +155,15 @@ class SensorTiming:
         row_time = check_number("row_time", row_time, above=0.0)
         exposure = check_number("exposure_time", exposure_time, above=0.0)
         period = 1 / check_number("frame_rate", frame_rate, above=0.0)
-        others = scan_axis, readout_direction, frame_start_times, row_time_std
-        return cls(row_time, exposure / row_time, period / row_time, *others)
+        return cls(
+            row_time,
+            exposure / row_time,
+            period / row_time,
+            scan_axis,
+            readout_direction,
+            frame_start_times,
+            row_time_std,
+        )
 
     @staticmethod
     def from_file(path: str | os.PathLike[str]) -> SensorTiming:
@@ -287,8 +294,13 @@ class SensorTiming:
 
     def in_row_order(self) -> RowTiming:
         """The same timing for frames already turned to row order (rows on axis -2, first row read first)."""
-        times = self.row_time, self.exposure_rows, self.frame_rows
-        return RowTiming(*times, frame_start_times=self.frame_start_times, row_time_std=self.row_time_std)
+        return RowTiming(
+            self.row_time,
+            self.exposure_rows,
+            self.frame_rows,
+            frame_start_times=self.frame_start_times,
+            row_time_std=self.row_time_std,
+        )
 
 
 class SensorSection(Section):

@@ -169,10 +169,15 @@ class StackJob:
             if found is None or self.restoration is None:
                 missing = "no detection was given for this window" if found is None else None
                 return replace(as_taken, detection=detection, error=missing)
-            first_frames = len(kept) if len(kept) > 1 and not self.chosen.joint else None
-            most_pairs = 8 if window.alone else 2  # limits the time of the verdict
-            limits = {"first_frames": first_frames, "most_pairs": most_pairs}
-            restoration = restore_trusted(frames, timing, found, self.restoration, force=self.force, **limits)
+            restoration = restore_trusted(
+                frames,
+                timing,
+                found,
+                self.restoration,
+                force=self.force,
+                first_frames=len(kept) if len(kept) > 1 and not self.chosen.joint else None,
+                most_pairs=8 if window.alone else 2,  # limits the time of the verdict
+            )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
         one_image = self.chosen.joint is True and restoration.restored
@@ -315,15 +320,15 @@ def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Wi
 _TOGETHER = ("joint", "scale", "mosaic", "optics")  # options of restore that frames one by one do not have
 
 
-def _together(restoration: OptionTable) -> list[str]:
-    """Those of ``_TOGETHER`` that change something."""
+def options_of_windows(restoration: OptionTable) -> list[str]:
+    """Given options of ``restore`` that frames which are restored one by one do not have."""
     given = restoration or {}
     return [name for name in _TOGETHER if given.get(name) is True or given.get(name) not in (None, False, 1)]
 
 
 def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
     """Options of ``restore`` without those that frames which are restored one by one do not have."""
-    for name in _together(restoration):
+    for name in options_of_windows(restoration):
         raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
     return {name: value for name, value in (restoration or {}).items() if name not in _TOGETHER}
 
@@ -337,7 +342,7 @@ def _follows(
             raise ValueError("follow=True has no options of detection, and no given detections")
         single_frame_options(restoration)
     elif options.follow == "auto":
-        return False if detection or given is not None or _together(restoration) else "auto"
+        return False if detection or given is not None or options_of_windows(restoration) else "auto"
     return options.follow
 
 
@@ -367,9 +372,21 @@ def plan_job(
     run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
     restoration = None if restored is None else dict(restored.restoration or {})
     follow = _follows(options, restoration, detection, run.given if run.motion is None else run.motion)
-    given, force = None if run.given is None else dict(enumerate(run.given)), restored is not None and restored.force
-    of_run = (given, run.motion, run.bad_frames, force, device, options.window, follow)
-    job = StackJob(Path(source), info, timing, full_scale, detection, restoration, *of_run)
+    job = StackJob(
+        Path(source),
+        info,
+        timing,
+        full_scale,
+        detection,
+        restoration,
+        given=None if run.given is None else dict(enumerate(run.given)),
+        motion=run.motion,
+        bad_frames=run.bad_frames,
+        force=restored is not None and restored.force,
+        device=device,
+        window=options.window,
+        follow=follow,
+    )
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)

@@ -216,8 +216,8 @@ def _planned(
     stated = None if exposures is None else exposures.tolist()
     profile, (height, width) = options.lens_profile, frames.size
     camera = None if profile is None else Camera.from_gyroflow(profile, width, height)
-    steadied = options.steady, options.crop_limit
-    return VideoPasses(frames, starts.tolist(), *steadied, rates, camera, stated, stabilised), at_once
+    passes = VideoPasses(frames, starts.tolist(), options.steady, options.crop_limit, rates, camera, stated, stabilised)
+    return passes, at_once
 
 
 def _restored_parts(

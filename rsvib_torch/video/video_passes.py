@@ -223,10 +223,11 @@ class VideoPasses:
     def verdict(self, frames: list[tuple[FrameTrack, Frame | str]]) -> RestorationVerdict | None:
         """Whether restoration helps, from two neighbouring frames before they are steadied; None if unknown."""
         usable = (pair for pair in pairwise(frames) if all(track.fault is None for track, _ in pair))
-        (first, one), (second, other) = next(usable, ((None, ""), (None, "")))
-        if first is None or second is None or isinstance(one, str) or isinstance(other, str):
+        pair = next(usable, None)
+        if pair is None:
             return None
-        if not isinstance(first.motion, Vibration):
+        (first, one), (second, other) = pair
+        if isinstance(one, str) or isinstance(other, str) or not isinstance(first.motion, Vibration):
             return None
         pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
         images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)

@@ -71,7 +71,7 @@ def test_a_file_at_its_own_rate(clip, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("-",), "--size must be WIDTHxHEIGHT in px such as 1024x768"),
+        (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input"),
         (("-", "--size", "12"), "--size must be WIDTHxHEIGHT in px such as 1024x768, got '12'"),
         (("0", "--size", "4x4"), "--size goes with frames on standard input (-), not with 0"),
         (("0", "--realtime"), "--realtime goes with a file, not with 0"),

@@ -50,6 +50,17 @@ def test_grey_png_with_a_transparent_value(tmp_path, dtype, full_scale):
     np.testing.assert_array_equal((read * full_scale).round().numpy(), counts)
 
 
+@pytest.mark.parametrize(("mode", "channels"), [("1", 1), ("P", 3), ("LA", 4)])
+def test_png_with_few_bits_a_palette_or_alpha(tmp_path, mode, channels):
+    image = Image.fromarray(np.arange(0, 240, 4, dtype=np.uint8).reshape(6, 10))
+    image = image.convert("RGB").quantize(64) if mode == "P" else image.convert(mode)
+    image.save(tmp_path / "a.png")
+    pixels = rsv.read_stack(tmp_path / "a.png")[0]
+    expected = np.asarray(image.convert({1: "L", 3: "RGB", 4: "RGBA"}[channels])) / 255
+    assert pixels.shape == ((6, 10) if channels == 1 else (channels, 6, 10))
+    np.testing.assert_allclose(pixels.numpy(), expected if channels == 1 else np.moveaxis(expected, -1, 0), atol=1e-6)
+
+
 def test_animated_png_is_refused(tmp_path):
     frames = [Image.fromarray((counts // 16).astype(np.uint8)) for counts in COUNTS[:3]]
     frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])

@@ -315,6 +315,18 @@ def test_the_end_of_a_reader_ends_a_session():
     assert report.frames == 0
 
 
+class Broken:
+    """An output that cannot write."""
+
+    closed = None
+
+    def write(self, frame, index):
+        raise OSError("disk full")
+
+    def close(self):
+        self.closed = True
+
+
 def test_frames_before_an_error_of_the_source_are_not_lost(tmp_path):
     source = Numbers(3, error=OSError("unplugged"))
     output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
@@ -356,3 +368,11 @@ def test_the_motion_of_late_frames_is_predicted(drops):
     report = video.run_live(Shaking(frames), SlowTracker(TIMING, columns=None), [], drops=drops)
     assert (report.frames, report.dropped) == (40, 0)
     assert (report.predicted > 5) == drops
+
+
+def test_an_error_of_an_output_ends_the_session(tmp_path):
+    source, output = Numbers(), Broken()
+    with pytest.raises(OSError, match="disk full"):
+        video.run_live(source, rsv.VibrationTracker(TIMING), [output], drops=False)
+    assert output.closed
+    assert source.closed

@@ -84,7 +84,7 @@ def test_a_fisheye_lens(place, tmp_path, capsys):
     steadied = ["run", str(tmp_path / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "0.333"]
     steadied += ["--method", "dewarp", "--device", "cpu", "--lens-profile", str(tmp_path / "lens.json")]
     assert run_command(steadied) == 2
-    assert "lens_profile belongs to a gyroscope" in capsys.readouterr().err
+    assert "--lens-profile goes with --gyroscope" in capsys.readouterr().err
     assert run_command([*steadied, "--gyroscope", str(place / "rates.csv")]) == 0
     assert shaking(tmp_path / "out" / "restored.mp4") < 0.15  # 0.54 without, or the alignment is refused
     assert rsv.read_manifest(tmp_path / "out" / "manifest.json").gyroscope["focal_length"] == FOCAL_LENGTH

@@ -161,8 +161,9 @@ def whole_frame(report: Report, index: int, frames: tuple[Tensor, ...], names: t
         caption += ", and one image restored jointly from all frames"
     if pair.scale < 1:
         caption += f", reduced to {100 * pair.scale:.2g} %"
-    if (full := pair.full) is not None:
-        caption += f". The magnifier shows {_region(full.top, full.left, full.height, full.width)}"
+    if pair.full is not None:
+        part = _region(pair.full.top, pair.full.left, pair.full.height, pair.full.width)
+        caption += f". The magnifier shows {part}"
     (black, white), (low, high) = pair.levels, PERCENTILES
     levels = f"black is {black:.3f} and white {white:.3f} of full scale, the percentiles {low:g} and {high:g}"
     both = " of both images" if len(frames) > 1 else ""
