@@ -245,8 +245,9 @@ class _WindowFit:
                 residual[part] -= (both @ solution[index]).reshape(2, -1).T
             length = np.hypot(*residual.T)
             self.sigma = max(float(np.median(length)) / 1.177, 1e-3)  # of two normal components: 1.177 std
-            self.weights = self._weights(length, self.sigma, 1 / 1.177)
-            self.unexplained = float(np.mean([np.median(length[part]) ** 2 for part, *_ in self.pairs]))
+            medians = self._medians(length)
+            self.weights = self._weights(length, self.sigma, medians / 1.177)
+            self.unexplained = float(np.square(medians).mean())
             for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
                 real, imaginary = solution[first : first + of_tone].reshape(2, -1)
                 tone.knots = real + 1j * imaginary
@@ -256,13 +257,17 @@ class _WindowFit:
             part = slice(of_tone * number, of_tone * (number + 1))
             tone.set_std(covariance[part, part])
 
-    def _weights(self, distance: Array, std: float, factor: float) -> Array:
-        """Weights of residuals with a standard deviation, or that of their pair: ``factor`` times the median.
+    def _medians(self, distance: Array) -> Array:
+        """Median of every pair of frames."""
+        return np.array([np.median(distance[part]) for part, *_ in self.pairs])
+
+    def _weights(self, distance: Array, std: float, of_pairs: Array) -> Array:
+        """Weights of residuals with a standard deviation, or that of their pair if it is larger.
 
         A vibration that is not found yet displaces all corners of a pair.
         """
-        of_pairs = [max(std, factor * float(np.median(distance[part]))) for part, *_ in self.pairs]
-        return _robust_weights(distance, np.repeat(of_pairs, [part.stop - part.start for part, *_ in self.pairs]))
+        counts = [part.stop - part.start for part, *_ in self.pairs]
+        return _robust_weights(distance, np.repeat(np.maximum(std, of_pairs), counts))
 
     def _regularise(self, gram: Array, size: int) -> None:
         """Add the stiffness of the path, whose columns are the first ones, and a little for what is not determined."""
@@ -301,7 +306,7 @@ class _WindowFit:
         order, sizes = np.lexsort((offsets, cell)), np.bincount(cell)
         middle = np.cumsum(sizes) - sizes + (sizes - 1) // 2
         apart = np.abs(offsets - offsets[order[middle]][cell])
-        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5)
+        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5 * self._medians(apart))
         total = np.maximum(np.bincount(cell, weights), 1e-9)
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)

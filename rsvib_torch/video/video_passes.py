@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from rsvib_torch.execution.prefetch import prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
@@ -32,7 +33,7 @@ from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import window_record
 from rsvib_torch.video import Margins
-from rsvib_torch.video.camera_path import CameraPath, Tone, camera_path, shake
+from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
@@ -96,37 +97,20 @@ class VideoPasses:
         times = np.array(self.starts) + half
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
-        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
-        compared: dict[int, Corners] = {}  # with a gyroscope, corners between the chosen frames and the next ones
+        compared: dict[int, Corners] = {}  # with a gyroscope, corners between some frames and the next ones
 
         def pairs() -> Iterator[Corners | None]:
-            before: tuple[int, NDArray[np.uint8]] | None = None
-            follower = CornerFollower(self.frames.job.timing)
-            with closing(self.decoded()) as frames:
-                for index, frame in enumerate(frames):
+            with closing(
+                prefetched(self._followed(times, faults, shakes, compared), WINDOW_FRAMES)
+            ) as frames:  # a window is fitted in this thread meanwhile
+                for corners in frames:
                     progress()
-                    if isinstance(frame, str):
-                        faults[index] = frame
-                        continue
-                    grey = self.frames.grey(frame)
-                    if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
-                        faults[index] = f"frame {index} is constant, or a copy of the frame before"
-                        continue
-                    corners = follower.next(grey, self.starts[index])
-                    if before is not None:
-                        if corners is not None and before[0] == index - 1:
-                            shakes[index - 1] = shake(corners)
-                        if before[0] == index - 1 in chosen:
-                            starts = self.starts[index - 1 : index + 1]
-                            compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
-                        if corners is not None and self.stabilised:
-                            both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
-                            corners = replace(corners, times=both)
-                        yield corners
-                    before = index, grey
+                    yield from corners
 
         if self.rates is None:
-            path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
+            # Threads of BLAS wait for each other after every pair of frames: 3 to 20 times the processor time.
+            with threadpool_limits(limits=1, user_api="blas"):
+                path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
             places = path.places(times)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])
             polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
@@ -142,6 +126,41 @@ class VideoPasses:
         rotation = RecordedRotation.aligned(self.rates, found, times)
         turned = self._to_steady(times, rotation.apart)
         return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
+
+    def _followed(
+        self,
+        times: Array,
+        faults: dict[int, str],
+        shakes: dict[int, tuple[Array, float]],
+        compared: dict[int, Corners],
+    ) -> Generator[tuple[Corners | None, ...], None, None]:
+        """Of every frame, the corners between it and the usable frame before, if there is one; fills the tables."""
+        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
+        before: tuple[int, NDArray[np.uint8]] | None = None
+        follower = CornerFollower(self.frames.job.timing)
+        with closing(self.decoded()) as frames:
+            for index, frame in enumerate(frames):
+                if isinstance(frame, str):
+                    faults[index] = frame
+                    yield ()
+                    continue
+                grey = self.frames.grey(frame)
+                if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
+                    faults[index] = f"frame {index} is constant, or a copy of the frame before"
+                    yield ()
+                    continue
+                corners = follower.next(grey, self.starts[index])
+                if before is not None:
+                    if corners is not None and before[0] == index - 1:
+                        shakes[index - 1] = shake(corners)
+                    if before[0] == index - 1 in chosen:
+                        starts = self.starts[index - 1 : index + 1]
+                        compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
+                    if corners is not None and self.stabilised:
+                        both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
+                        corners = replace(corners, times=both)
+                yield () if before is None else (corners,)
+                before = index, grey
 
     def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
         return steady_shifts(times, apart, self.steady, self.frames.size, self.crop_limit)
