@@ -12,6 +12,8 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.execution.prefetch import prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -307,10 +309,23 @@ class VideoPasses:
         velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = tuple(self._findings(axis, tones) for axis in (0, 1))
+        timing, std = self.frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
+        coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
+        fit = ToneFit(
+            coefficients=coefficients[None],
+            frequencies=frequency[None],
+            active=amplitude[None] > 0,
+            drift=velocity[None, :, None],
+            covariance=np.empty((1, 0, 0)),
+            centre=np.zeros(1),
+            model=MotionModel(),
+        )
+        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
+        sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(tracks), rows)[0]
         return DetectedVibration(
             vibration=vibration,
-            std=VibrationStd(*(torch.from_numpy(np.array(value)) for value in values)),
-            gain=vibration.gain(self.frames.job.timing.frame_period),
+            std=with_row_time_std(std, vibration, sensitivity, timing),
+            gain=vibration.gain(timing.frame_period),
             residual=torch.full((2,), window.residual, dtype=torch.float64),
             reliable=torch.tensor([not reasons for reasons in findings]),
             findings=findings,
