@@ -195,11 +195,15 @@ class VideoPasses:
         return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
 
     def left_alone(self, track: FrameTrack) -> FrameTrack:
-        """What is removed from a frame of a part that restoration makes worse: no vibration."""
+        """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
         if not isinstance(track.motion, Vibration):
             return track
-        still = track.motion.scaled(0.0) if self.steady == 0 else track.motion
-        return replace(track, motion=replace(still, amplitude=torch.zeros_like(still.amplitude)))
+        return replace(track, motion=replace(track.motion.scaled(0.0), image_shift=track.motion.image_shift))
+
+    def is_explained(self, motion: VideoMotion, part: int) -> bool:
+        """Whether the path of the camera and tones explain the corners of a part."""
+        path, frames = motion.path, motion.times[part * PART_FRAMES : (part + 1) * PART_FRAMES]
+        return not isinstance(path, CameraPath) or path.nearest(frames[len(frames) // 2]).residual < path.allowed
 
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
@@ -309,6 +313,9 @@ class VideoPasses:
         velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = tuple(self._findings(axis, tones) for axis in (0, 1))
+        if window.residual > path.allowed:
+            unexplained = Reason("corners_unexplained", None, window.residual, path.allowed)
+            findings = tuple((*(one for one in of if one.code != "no_tone"), unexplained) for of in findings)
         timing, std = self.frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
         coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
         fit = ToneFit(
