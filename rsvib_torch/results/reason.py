@@ -325,14 +325,6 @@ _SHAPES = {
         "the motion is determined to {value:.3g} px only, {limit:g} px are needed: frames may show different scenes",
         compares="rms standard deviation of the visible part of the motion, above 0.3 px",
     ),
-    "motion_blind": _px(
-        "the motion is concentrated near {frequency:.4g} Hz, a multiple of the frame rate, where {value:.2g} px are seen "
-        "and every frame is displaced alike: its size may be many times the standard deviation of {limit:.2g} px",
-        "use frames at other or unequal intervals; the displacement between frames is known (std_seen)",
-        compares="amplitude of the motion near a multiple of the frame rate in four or more frames, above half of the "
-        "standard deviation of the displacement common to all frames, a fifth of the rms motion without a straight line, "
-        "and twice the amplitude at frequencies beside it",
-    ),
     "too_few_frames_for_sweep": ReasonKind(
         "{value:g} frames do not determine decay and sweep of a tone, {limit:g} are needed: several swept tones fit",
         "use more frames, or a steady tone (detect_vibration)",
