@@ -144,11 +144,12 @@ class VideoFrames:
                     values[:2] = 0.0
                 motion = replace(motion, amplitude=torch.zeros_like(motion.amplitude), **rest)
             offsets, weights = recorded_offsets(motion, timing, plane.shape[-2:])
-            if len(weights) == 1:
-                results.append(_with_rows_moved(plane, offsets[..., 0], rows_first=timing.scan_axis == -2))
-            if len(weights) > 1 or self.masks:
+            is_rowwise = len(weights) == 1  # all columns are displaced alike
+            if self.masks or not is_rowwise:
                 source = places(offsets, weights, timing, plane.shape[-2:])
-            if len(weights) > 1:
+            if is_rowwise:
+                results.append(_with_rows_moved(plane, offsets[..., 0], rows_first=timing.scan_axis == -2))
+            else:
                 results.append(_with_pixels_moved(plane, source, _KERNELS[number]))
             if self.masks:
                 limits = np.array(plane.shape[:-3:-1], dtype=np.float32)[:, None, None] - 1
