@@ -11,8 +11,6 @@ from typing import Any
 from attacks.small_runs import FORMATS, Reference, completed_or_refused, content, fork, kill_run, resume
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
 _JOURNAL = "journal"
 _VALUES: dict[str, str] = {
     "null": "null", "true": "true", "text": '"text"', "empty text": '""', "negative": "-1", "fraction": "0.5",

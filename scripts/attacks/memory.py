@@ -14,8 +14,6 @@ from attacks.trial import Trial, outcome_of_command, rsvib, run_watched
 import rsvib_torch as rsv
 from rsvib_torch.stacks.memory import memory_needed
 
-__all__ = ["LAYOUTS", "trials"]
-
 _SIZE, _FRAMES, _WINDOW = 512, 64, 4  # px; 34 MB of 16 bits
 _FRAME, _STACK = (1, _SIZE, _SIZE), (_FRAMES, _SIZE, _SIZE)  # shapes of chunks
 _TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=560)
