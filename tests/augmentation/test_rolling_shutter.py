@@ -376,8 +376,7 @@ def test_in_a_chain_with_other_augmentations():
     ],
 )
 def test_bad_options(options, error, match):
-    with pytest.raises(error, match=match):
-        RollingShutterVibration(TIMING, **options)
+    refuses(lambda: RollingShutterVibration(TIMING, **options), match, error)
 
 
 def test_wrong_use_is_refused():

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.frames.prepare import as_float_frames, prepare_frames
@@ -99,8 +100,7 @@ def test_masks_that_broadcast(shape):
 )
 def test_bad_input(options, error, message):
     arguments = {"frames": 0.1 + torch.rand(2, 4, 6), "timing": sensor(), **options}
-    with pytest.raises(error, match=message):
-        prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments)
+    refuses(lambda: prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments), message, error)
 
 
 def test_float_frames_are_not_scaled():
@@ -138,5 +138,4 @@ def test_integer_frames_are_scaled():
     ],
 )
 def test_bad_frames(frames, options, error, message):
-    with pytest.raises(error, match=message):
-        as_float_frames(frames, **options)
+    refuses(lambda: as_float_frames(frames, **options), message, error)
