@@ -22,11 +22,7 @@ NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time af
 
 
 def compute_here(
-    job: StackJob,
-    windows: Sequence[Window],
-    finish: Callable[[WindowResult, WindowFrames], _Result],
-    *,
-    at_once: int,
+    job: StackJob, windows: Sequence[Window], finish: Callable[[WindowResult, WindowFrames], _Result], *, at_once: int
 ) -> Generator[_Result, None, None]:
     """Compute windows in this process; ``finish`` gets a result and its frames in the thread that computed it."""
 

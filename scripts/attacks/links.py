@@ -8,23 +8,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import (
-    FORMATS,
-    Child,
-    Reference,
-    completed_or_refused,
-    content,
-    fork,
-    kill_run,
-    process,
-    resume,
-)
+from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, fork, kill_run, process, resume
 from attacks.trial import Trial
 
-_TARGETS = dict.fromkeys(
-    ("TIFF", "npy, frames skipped", "video"),
-    ("journal", "000000.npy", "000004.npy", "out.tif"),
-)
+_TARGETS = dict.fromkeys(("TIFF", "npy, frames skipped", "video"), ("journal", "000000.npy", "000004.npy", "out.tif"))
 
 
 def _victim(folder: Path) -> Path:

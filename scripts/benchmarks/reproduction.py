@@ -64,10 +64,7 @@ AMPLITUDE, FREQUENCY = {"x": 3.1, "y": 5.2}, {"x": 50.0, "y": 30.0}  # px, Hz
 PERIOD = {"x": 20.0, "y": 33.33}  # ms, as printed in Table 1
 DETECTED = {
     "chart": {"x": Detected(20.048, 3.147, 0.653, 0.242, 1.526), "y": Detected(33.280, 5.195, 1.234, 0.161, 0.096)},
-    "landscape": {
-        "x": Detected(19.890, 3.084, 0.638, 0.551, 0.519),
-        "y": Detected(33.122, 5.211, 1.227, 0.635, 0.218),
-    },
+    "landscape": {"x": Detected(19.890, 3.084, 0.638, 0.551, 0.519), "y": Detected(33.122, 5.211, 1.227, 0.635, 0.218)},
 }
 RESTORED = {
     "chart": {

@@ -21,10 +21,7 @@ import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.video import process_video
 
-OPTIONS = {
-    "video_frames": (300, "video: frames"),
-    "video_rows": (1080, "video: rows, 16:9"),
-}
+OPTIONS = {"video_frames": (300, "video: frames"), "video_rows": (1080, "video: rows, 16:9")}
 QUICK = {"video_frames": 12, "video_rows": 180}
 MARGIN, SEED, NOISE = 32, 3, 0.004
 EXPOSURE_ROWS = 15

@@ -140,8 +140,7 @@ def test_tags_of_pages_written_one_by_one(tmp_path):
     given, found = values(tmp_path / "in.tif"), values(tmp_path / "out.tif", 4)
     assert all(found[code] == given[code] for code, *_ in GEOREFERENCE.values())
     write_pages(
-        tmp_path / "in.tif",
-        lambda i: {"description": "orbit 7", "metadata": {"camera": "K1"}, "contiguous": False},
+        tmp_path / "in.tif", lambda i: {"description": "orbit 7", "metadata": {"camera": "K1"}, "contiguous": False}
     )
     assert copied(tmp_path) == ()
     with tifffile.TiffFile(tmp_path / "out.tif") as tif:
