@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from benchmarks import independent_camera
 from benchmarks.independent_camera import Array, Shake, closed, fine_rows
+from benchmarks.pipeline import camera
 from harness import Rows, one_thread, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from skimage.registration import phase_cross_correlation
@@ -137,12 +138,6 @@ def draw(target: str, size: Sequence[int], image_motion: float = 0.0) -> Scene:
     samples = closed(drawn.double().numpy(), (BORDER - 8) * PITCH)
     still = samples[down : height - down : PITCH, across : width - across : PITCH]
     return Scene(samples, fine_rows(samples, CAMERA["between"]), still)
-
-
-def camera(rows: int, exposure_rows: float = EXPOSURE_ROWS) -> rsv.SensorTiming:
-    """The paper's camera; fewer rows are slower, so that frame period and exposure time are unchanged."""
-    slower = FRAME_ROWS / rows
-    return rsv.SensorTiming(row_time=ROW_TIME * slower, exposure_rows=exposure_rows / slower, frame_rows=rows)
 
 
 def taken(scene: Scene, shake: Shake, timing: Any, count: int = 2) -> Array:
@@ -282,7 +277,7 @@ def trials(
 ) -> Rows:
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
-    clean = taken(scene, shake, camera(len(scene.still)))
+    clean = taken(scene, shake, camera(EXPOSURE_ROWS, len(scene.still)))
     return [row for noise in noises for row in trial(scene, shake, clean, case | {"noise": noise}, edges)]
 
 
@@ -291,7 +286,7 @@ def trial(
 ) -> Rows:
     """Detection and restoration of two frames with one noise."""
     array = counts_of(clean, case["noise"], case["seed"])
-    frames, timing = torch.from_numpy(array).float(), camera(len(scene.still))
+    frames, timing = torch.from_numpy(array).float(), camera(EXPOSURE_ROWS, len(scene.still))
     found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
     results = [
         {"part": "detection", **case, "method": name, "axis": axis, **values}
