@@ -39,8 +39,6 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         ends = [child.ended(0.0) for child in children]
         difference = incomplete or reference.difference(place, name)
         found = {one.outcome: one for one in (completed_or_refused(title, *end, difference) for end in ends)}
-        worst = next(
-            (found[outcome] for outcome in ("hang", "traceback", "wrong", "completed") if outcome in found), None
-        )
+        worst = next((found[one] for one in ("hang", "traceback", "wrong", "completed") if one in found), None)
         yield worst or Trial(title, "wrong", f"no run succeeded: {ends}")
         shutil.rmtree(place)

@@ -24,12 +24,8 @@ def _unshare() -> list[str] | None:
         return None
     for options in ("-m", "-rm"):
         command = ["unshare", options, "sh", "-c"]
-        if (
-            subprocess.run(
-                [*command, "mount -t tmpfs -o size=64k none /mnt"], capture_output=True, check=False
-            ).returncode
-            == 0
-        ):
+        mount = [*command, "mount -t tmpfs -o size=64k none /mnt"]
+        if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
             return command
     return None
 

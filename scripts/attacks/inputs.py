@@ -120,9 +120,8 @@ def _attempts(place: Path) -> Iterator[tuple[str, Callable[..., None], tuple[obj
     for stack in ("frames.tif", "pngs"):
         for alias, output in _aliases(place / stack, ending=".csv").items():
             yield command(f"motion: {alias}", "motion", place / stack, "--out", output, *config)
-            yield command(
-                f"calibrate: {alias}", "calibrate", place / stack, "--frequency", 100, "--out", output, config[2]
-            )
+            light = ("--frequency", 100, "--out", output, config[2])
+            yield command(f"calibrate: {alias}", "calibrate", place / stack, *light)
             camera = ("--row-time", "1e-4", "--exposure", "6e-4", "--frame-rate", 130, "--out", output, config[2])
             yield command(f"init: {alias}", "init", place / stack, *camera)
         _remove_links(place)

@@ -123,7 +123,5 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 def _listing(folder: Path) -> dict[str, Any]:
     """Names, kinds and content of everything in a folder."""
     files = {str(path.relative_to(folder)): path.lstat().st_mode for path in folder.rglob("*")}
-    regular = {
-        name: mode for name, mode in files.items() if (folder / name).is_file() and not (folder / name).is_symlink()
-    }
+    regular = [name for name in files if (folder / name).is_file() and not (folder / name).is_symlink()]
     return {**files, "content": {name: content(folder / name) for name in regular}}

@@ -210,9 +210,7 @@ def plain_rows(options: argparse.Namespace) -> Rows:
         taken = frames.to(device)
         tasks = {"round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]))}
         for method, count in itertools.product(("bands", "direct"), (2, 4)):
-            tasks[f"{method}, {count} frames"] = lambda m=method, f=taken[:count]: rsv.detect_vibration(
-                f, timing, method=m
-            )
+            tasks[f"{method}, {count} frames"] = partial(rsv.detect_vibration, taken[:count], timing, method=method)
         done = in_turns(tasks, options.runs)
         unit = done["round trip"].seconds
         results += [

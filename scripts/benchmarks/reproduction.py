@@ -323,9 +323,7 @@ def global_shutter(frames: int = 24, candidates: int = 4000) -> Rows:
     images = counts_of(taken(scene, shake, GlobalShutter(0.0, EXPOSURE_ROWS * ROW_TIME, period), frames), 0.005, 0)
     fade = np.outer(*(np.hanning(size) for size in scene.still.shape))
     windowed = [(frame - frame.mean()) * fade for frame in images]
-    apart = [
-        phase_cross_correlation(frame, windowed[0], upsample_factor=100, normalization=None)[0] for frame in windowed
-    ]
+    apart = [phase_cross_correlation(one, windowed[0], upsample_factor=100, normalization=None)[0] for one in windowed]
     times, results = np.arange(frames) * period, []
     for axis, moved in zip("yx", np.array(apart).T, strict=True):
         left = []
@@ -412,9 +410,7 @@ def restoration_cells(results: Rows) -> list[list[Any]]:
                 of_frame = chosen(results, target=target, frame=frame)
                 before = [row[name] for row in chosen(of_frame, method=DEGRADED)]
                 after = {m: [row[name] for row in chosen(of_frame, method=m)] for m in (*METHODS, JOINT)}
-                gains = {
-                    m: [100 * (a / b - 1) for a, b in zip(found, before, strict=True)] for m, found in after.items()
-                }
+                gains = {m: [100 * (a / b - 1) for a, b in zip(of_m, before, strict=True)] for m, of_m in after.items()}
                 still = chosen(results, target=target, method=STILL)[0][name]
                 digits, first = 2 if name == "psnr" else 4, [TARGETS[target], METRICS[name], column]
                 better, spreads = compared(printed.restored[frame], after, digits, higher=True)

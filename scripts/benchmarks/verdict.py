@@ -112,9 +112,7 @@ def cases(draw: int) -> Rows:
                 "reason": verdict.reasons[0],
                 "predicted_gain": float(verdict.predicted_gain),
                 "chi_square": float(verdict.chi_square),
-                **{
-                    name: getattr(verdict, name)[0].tolist() for name in ("misfit_before", "misfit_after", "resolution")
-                },
+                **{key: getattr(verdict, key)[0].tolist() for key in ("misfit_before", "misfit_after", "resolution")},
             }
         )
     return found

@@ -8,7 +8,6 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -74,14 +73,10 @@ def rows(options: argparse.Namespace) -> Rows:
         clip = Path(folder) / "clip.mp4"
         luma, *chroma = planes
         width = luma.shape[-1]
-        pictures = [
-            np.concatenate([luma[i], *(plane[i].reshape(-1, width) for plane in chroma)]) for i in range(len(luma))
-        ]
+        pictures = [np.concatenate([luma[i], *(one[i].reshape(-1, width) for one in chroma)]) for i in range(len(luma))]
         repeated = (pictures[index % len(pictures)] for index in range(count))
         write_h264(clip, repeated, RATE, crf=CRF, preset="veryfast")
-        results: list[dict[str, Any]] = [
-            {"name": "as taken", "psnr": psnr_of(clip, still), "size": clip.stat().st_size}
-        ]
+        results: Rows = [{"name": "as taken", "psnr": psnr_of(clip, still), "size": clip.stat().st_size}]
         for method in METHODS:
             target = Path(folder) / f"{method}.mp4"
             begin, cpu = time.perf_counter(), time.process_time()

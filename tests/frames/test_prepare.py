@@ -62,9 +62,8 @@ def test_masks_follow_the_frames():
     assert bool((prepared.images[prepared.missing] == 0).all())
     assert torch.allclose(prepared.filled[prepared.missing], torch.tensor(0.5), atol=0.05)
     counts = torch.tensor([[[0, 255], [17, 3]]], dtype=torch.uint8)
-    assert prepare_frames(counts, sensor(), saturation="auto").saturated.flatten().tolist() == [False, True] + 2 * [
-        False
-    ]
+    saturated = prepare_frames(counts, sensor(), saturation="auto").saturated
+    assert saturated.flatten().tolist() == [False, True, False, False]
     assert prepare_frames(counts.float(), sensor(), saturation="auto").saturated is None
     assert prepare_frames(counts, sensor()).saturated is None
     deep = counts.to(torch.int32)

@@ -41,9 +41,8 @@ def test_run_with_threads_is_resumed_with_dask(whole, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         process_small(whole / "frames.tif", tmp_path / "out.tif", progress=stop)
     with cluster_of(1) as cluster:
-        report = process_small(
-            whole / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address, resume=True
-        )
+        options = {"scheduler": cluster.scheduler_address, "resume": True}
+        report = process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
     assert report.resumed > 2
     check_same(whole, tmp_path)
 

@@ -84,9 +84,7 @@ def test_each_frame_has_the_vibration_at_its_time(place):
 
 def test_a_batch_of_stacks_read_from_below_is_followed(place):
     frames = np.load(place / "frames.npy")[:16]
-    turned = rsv.SensorTiming(
-        row_time=1e-4, exposure_rows=12, frame_rows=500, scan_axis="x", readout_direction="reverse"
-    )
+    turned = rsv.SensorTiming(1e-4, 12, 500, scan_axis="x", readout_direction="reverse")
     batch = np.stack([frames[:, ::-1].transpose(0, 2, 1)[:, None]] * 2)
     found = rsv.follow_vibration(batch, turned)
     assert tuple(found.reliable.shape) == (2, 16, 2)
@@ -108,13 +106,9 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
     found = rsv.follow_vibration(frames, TIMING)
     rows = np.arange(128) * TIMING.row_time + 0.5 * TIMING.exposure_time
     for number, axis in np.argwhere(found.reliable.numpy()):
-        error = (
-            found.vibration[int(number)]
-            .translation()
-            .displacement(torch.from_numpy(number * TIMING.frame_period + rows))
-        )
-        error = error.numpy()[:, axis] - moved(number * TIMING.frame_period + rows)[:, axis]
-        assert np.std(error) < 0.1
+        times = number * TIMING.frame_period + rows
+        shown = found.vibration[int(number)].translation().displacement(torch.from_numpy(times))
+        assert np.std(shown.numpy()[:, axis] - moved(times)[:, axis]) < 0.1
 
 
 def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
