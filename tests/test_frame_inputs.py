@@ -213,9 +213,7 @@ def test_files_are_read(grey, tmp_path):
         assert torch.equal(dewarp(frames, TIMING, VIBRATION, full_scale=65535), expected)
         found = rsv.detect_vibration(frames, TIMING, tones=1, full_scale=65535)
         torch.testing.assert_close(found.vibration.amplitude[:, 0], VIBRATION.amplitude[:, 0], rtol=0.02, atol=0)
-        assert torch.equal(
-            rsv.read_stack(frames, full_scale=65535), torch.from_numpy(counts.astype(np.float32)) / 65535
-        )
+        assert torch.equal(rsv.read_stack(frames, full_scale=65535), torch.from_numpy(np.float32(counts)) / 65535)
     rsv.write_stack(tmp_path / "floats.tif", grey)
     assert torch.equal(dewarp([tmp_path / "floats.tif"], TIMING, VIBRATION), dewarp(grey, TIMING, VIBRATION))
     for frames, error, message in (

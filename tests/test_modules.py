@@ -32,9 +32,7 @@ def frames(scene):
 @pytest.fixture(scope="module")
 def vibration():
     both = [motion.vibration() for motion in MOTIONS]
-    return rsv.Vibration(
-        *(torch.stack([getattr(v, name) for v in both]) for name in ("amplitude", "frequency", "phase"))
-    )
+    return rsv.Vibration(*(torch.stack([getattr(v, key) for v in both]) for key in ("amplitude", "frequency", "phase")))
 
 
 @pytest.fixture(scope="module")
