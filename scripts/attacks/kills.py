@@ -39,12 +39,9 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
                 call = choice.randint(1, calls_of(reference, kind))
                 fork(counted_run, *arguments, call)
                 moments.append(f"call {call}")
-        yield _resumed(reference, place, kind, f"{kind}, killed at {' and '.join(moments)}")
+        title, out = f"{kind}, killed at {' and '.join(moments)}", place / name
+        if kind != "PNG folder" and out.exists() and content(out) != content(reference.whole / name):
+            yield Trial(title, "wrong", "an incomplete output has its name")
+        else:
+            yield resumed_trial(reference, place, kind, title, finished_windows(place, name))
         shutil.rmtree(place)
-
-
-def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
-    name = FORMATS[kind][0]
-    if kind != "PNG folder" and (place / name).exists() and content(place / name) != content(reference.whole / name):
-        return Trial(title, "wrong", "an incomplete output has its name")
-    return resumed_trial(reference, place, kind, title, finished_windows(place, name))

@@ -27,6 +27,7 @@ OPTIONS = {
 }
 QUICK = {"cost_size": 128, "cost_inputs": 2}
 SEED, NOISE = 5, 0.005
+CITY = partial(city_and_fields, seed=SEED)
 PLAIN_SEED, MARGIN = 11, 40  # of the plain vibration whose time is measured in round trips; px
 BOUND = 3.0  # times the time of the plain recording
 OF_CLASSES = {  # recordings (class, number) of honesty_cases
@@ -83,15 +84,11 @@ def _of_class(size: int, name: str, number: int) -> Input:
     return Input(_frames(taken.frames), taken.timing, *_plain(size, len(taken.frames)))
 
 
-def _city(height: int, width: int) -> torch.Tensor:
-    return city_and_fields(height, width, seed=SEED)
-
-
 def _simulated(
     size: int,
     height: int = 0,
     width: int = 0,
-    draw: Callable[[int, int], torch.Tensor] = _city,
+    draw: Callable[[int, int], torch.Tensor] = CITY,
     exposure: float = 20.0,
     amplitude: tuple[float, ...] = (1.5, 1.2),
 ) -> Input:
