@@ -226,7 +226,6 @@ def known(given: KnownOptions) -> Answer:
 
 
 def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
-    """The recording."""
     if given.offset is not None and given.offsets is not None:
         raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
     if given.lens_profile is not None and given.focal_length is not None:

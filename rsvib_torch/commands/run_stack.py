@@ -112,7 +112,6 @@ def run(given: RunOptions) -> Answer:
 
 
 def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions) -> Answer:
-    """Process a stack in windows."""
     settings, frames, out = given.settings, given.stack, given.out
     common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none

@@ -184,7 +184,6 @@ def _undetermined(reason: Reason) -> RowTimeFit:
 
 
 def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:
-    """The calibration with its verdict."""
     findings = list(found.findings)
     known = math.isfinite(found.row_time)
     if found.others:

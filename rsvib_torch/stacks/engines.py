@@ -40,7 +40,6 @@ def _distributed() -> Any:
 
 
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
-    """Read and compute one window on a Dask worker."""
     share_one_heap(keep_freed=True)
     default_threads = torch.get_num_threads()
     if one_thread:
