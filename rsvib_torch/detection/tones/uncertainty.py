@@ -40,8 +40,6 @@ from rsvib_torch.detection.tones.fit import (
     displacement_jacobian,
     displacement_std,
     displacements,
-    fit_tones,
-    is_bounded,
     model_displacements,
     offset_gain,
     residual_of,
@@ -53,7 +51,6 @@ from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import (
     Array,
     pseudo_inverse,
-    select_stacks,
     split_axis,
     tensor,
     unit_wave,
@@ -196,20 +193,20 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     )
 
 
-def with_weak_aliasing(measurements: Measurements, fit: ToneFit, unknown: Array) -> tuple[Measurements, ToneFit]:
-    """The measurements in which aliasing of single blocks of rows is weakened to their noise, and the fit to them.
+def with_weak_aliasing(measurements: Measurements, fit: ToneFit) -> Measurements:
+    """The measurements in which aliasing of single blocks of rows is weakened to their noise.
 
     The ratio of c and s to the noise of a block is random, of a variance that all blocks of an axis have in common. It
     is the one of the largest likelihood, given the residuals along ``cos 2 pi d`` and ``sin 2 pi d`` and across them.
     In two frames, the difference of a block contains both, and the columns of a roll have other phases: such
-    measurements are not changed. ``unknown`` (B, A P, A P) is a further covariance of the fit.
+    measurements are not changed.
 
     Rms errors over the bound of 190 axes in eight frames of a camera that aliases, without and with it: amplitude 10.5,
     6.5; frequency 7.5, 4.0; standard deviations over the bound 3.6, 2.5. Of 234 axes in four frames: 8.9, 9.0; 5.2,
     4.3; 4.9, 3.5.
     """
     if fit.drift.shape[1] > 2 or measurements.visible.shape[2] == 2:
-        return measurements, fit
+        return measurements
     # 1. Orthogonal directions of the errors of each block over the frames, their power, and the residuals along them.
     turn = unit_wave(2 * math.pi * displacements(measurements, fit))
     waves = measurements.relative(np.stack([turn.real, turn.imag], -1))  # (B, N, G, A, 2)
@@ -227,13 +224,10 @@ def with_weak_aliasing(measurements: Measurements, fit: ToneFit, unknown: Array)
         left = np.maximum(whole - (squares * errors / (1 + errors)).sum((1, 3)), 1e-12 * whole + 1e-300)
         likelihoods.append(-0.5 * count * np.log(left) - 0.5 * np.log1p(errors).sum((1, 3)))
     errors = ratios[np.argmax(likelihoods, 0), 0, 0][:, None, :, None] * power
-    # 3. Whiten the residuals, and fit again.
+    # 3. Whitening of the residuals.
     vectors = directions * np.sqrt(1 - 1 / np.sqrt(1 + errors))[..., None, :]
     weakened = replace(measurements, weakened=np.moveaxis(vectors, 3, 2))
-    weakened = replace(weakened, displacements=weakened.relative(measurements.displacements))
-    exact = fit_tones(weakened, fit, fit.active, fit.model)
-    exact = replace(exact, covariance=exact.covariance + unknown)
-    return weakened, select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
+    return replace(weakened, displacements=weakened.relative(measurements.displacements))
 
 
 def _unit_bias(measurements: Measurements, fit: ToneFit) -> Array:
