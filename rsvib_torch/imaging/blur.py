@@ -168,8 +168,9 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
     The ``taps`` (..., R, J, N) are those of ``row_taps``; ``along`` (..., R, N) is the displacement x_n in px.
     """
     angle = (-2 * math.pi) * along[..., None] * frequencies
-    taps = taps.to(angle.dtype)
-    return torch.complex(taps @ angle.cos(), taps @ angle.sin())
+    waves = torch.cat([angle.cos(), angle.sin()], -1)
+    parts = torch.bmm(taps.to(angle.dtype).flatten(0, -3), waves.flatten(0, -3)).view(*taps.shape[:-1], -1)
+    return torch.complex(*parts.chunk(2, -1))
 
 
 def form_rows(
@@ -190,7 +191,7 @@ def form_rows(
     other in ``spectra``; places and displacements are then (B, R, N).
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
-    source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)
+    source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
     num_rows = spectra.shape[-2] // num_scenes
     source = mirrored(source, num_rows)
     if num_scenes > 1:
