@@ -40,6 +40,9 @@ class Measurements:
     independent: float | Array = 1.0
     # groups of frames whose rows follow each other: rows N / groups apart show the same part of the scene
     groups: int = 1
+    # (B, N, G, A, Q) vectors v over the frames of each row; displacements and models are multiplied by 1 - sum v v^T,
+    # which weakens errors that have their direction. None for none
+    weakened: Array | None = None
 
     @classmethod
     def of_pairs(
@@ -93,8 +96,8 @@ class Measurements:
 
     @cached_property
     def drifts(self) -> Array:
-        """(B, N, G, 2) relative displacements by unit drifts t and t^2 / 2 from the centre, averaged over exposures."""
-        time = self.middles[..., 0, 0]
+        """(B, N, G, 1 or A, 2) relative displacements by drifts t and t^2 / 2 from the centre, mean over exposures."""
+        time = self.middles[..., 0]
         return self.relative(np.stack([time, 0.5 * np.square(time) + self.exposure_time**2 / 24.0], -1))
 
     @property
@@ -178,6 +181,9 @@ class Measurements:
         mean = np.einsum("bng,bng...->bn...", self._mean_weights, values)  # over the frames g
         relative: Array = values - mean[:, :, None]
         relative *= self.visible.reshape(*self.visible.shape, *(1,) * (values.ndim - 3))
+        if self.weakened is not None:
+            along = np.einsum("bngaq,bnga...->bnaq...", self.weakened, relative)
+            relative = relative - np.einsum("bngaq,bnaq...->bnga...", self.weakened, along)
         return relative
 
     # Residuals of a fit, (B, N, G, 2) px

@@ -14,7 +14,7 @@ import numpy as np
 
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.refinement import FittedRows, refine
+from rsvib_torch.detection.refinement import FittedRows, covariance_of_changes, refine
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
 from rsvib_torch.detection.start import BandStart, band_start, field_start
@@ -23,6 +23,8 @@ from rsvib_torch.detection.tones.fit import (
     MotionModel,
     ToneFit,
     displacement_std,
+    fit_tones,
+    is_bounded,
     motion_of_fit,
     residual_of,
     shrunk,
@@ -30,13 +32,18 @@ from rsvib_torch.detection.tones.fit import (
     with_errors_of_blocks,
     with_unknown_errors,
 )
-from rsvib_torch.detection.tones.selection import find_tones, robust_fit
-from rsvib_torch.detection.tones.uncertainty import with_further_tones, with_unknown_amplitudes, without_aliasing
+from rsvib_torch.detection.tones.selection import find_tones, robust_fit, significant_only
+from rsvib_torch.detection.tones.uncertainty import (
+    with_further_tones,
+    with_unknown_amplitudes,
+    with_weak_aliasing,
+    without_aliasing,
+)
 from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_reasons, with_reasons_of_all
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
-from rsvib_torch.numerics.tables import Array, table, tables
+from rsvib_torch.numerics.tables import Array, select_stacks, table, tables
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
@@ -141,17 +148,17 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # record may contain a further tone. The displacement is that of every eighth row of all frames.
     intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
+    measurements = fitted.measurements
     if fitted.refined is None:
-        fit = with_unknown_errors(fitted.measurements, fitted.fit)
+        fit = with_unknown_errors(measurements, fitted.fit)
     else:
-        fit = with_errors_of_blocks(fitted.measurements, fitted.fit)
-        aliasing = fitted.refined.aliasing
-        fit = without_aliasing(fitted.measurements, fit, aliasing)
-        fit = with_unknown_amplitudes(fit, aliasing, intervals, timing.exposure_time)
+        measurements, fit = _without_aliasing(fitted.refined, fitted.fit, intervals, timing)
+        if options.tones is None:  # aliasing may have been taken for further tones
+            kept = significant_only(measurements, fit, intervals)
+            if kept is not fit:
+                measurements, fit = _without_aliasing(fitted.refined, kept, intervals, timing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
-    stated, if_hidden = with_further_tones(
-        fitted.measurements, fit, row_starts, number_is_known=options.tones is not None
-    )
+    stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
     vibration, std = stated.vibration()
     fit, std_if_hidden_tone = if_hidden.fit, if_hidden.vibration()[1]
 
@@ -184,6 +191,19 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
         findings=findings,
         interval=float(intervals[0]),
     )
+
+
+def _without_aliasing(
+    refined: FittedRows, fit: ToneFit, intervals: Array, timing: RowTiming
+) -> tuple[Measurements, ToneFit]:
+    """The rows in which aliasing has less weight, and the fit with what it and the scene add to its uncertainty."""
+    measurements = with_weak_aliasing(refined.measurements, fit)
+    exact = fit_tones(measurements, fit, fit.active, fit.model)
+    exact = replace(exact, covariance=exact.covariance + covariance_of_changes(refined.unknown))
+    fit = select_stacks(is_bounded(exact, timing.exposure_time), exact, fit)
+    fit = with_errors_of_blocks(measurements, fit)
+    fit = without_aliasing(measurements, fit, refined.aliasing)
+    return measurements, with_unknown_amplitudes(fit, refined.aliasing, intervals, timing.exposure_time)
 
 
 def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:

@@ -56,6 +56,15 @@ def test_direct_is_more_accurate_than_bands(paper_camera):
     assert direct.offsets.rows.diff().tolist() == [8.0] * (len(direct.offsets.rows) - 1)
 
 
+def test_fast_tone_along_the_scan_in_many_frames():
+    """Bands that move by pixels within their height contain twice its frequency, seven times the frame rate."""
+    timing = SensorTiming(row_time=6e-5, exposure_rows=2, frame_rows=270)
+    frequency = (0.73 * timing.frame_rate, 3.49 * timing.frame_rate)
+    motion = Motion((0.9, 3.7), frequency, (0.3, 1.0))
+    frames = take_frames(draw_scene(320, 280, 12), timing, motion, 8, 0.004)
+    check(detect_vibration(torch.from_numpy(frames).float(), timing), motion, 0.01, 0.1, 0.001)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("num_frames", [2, 10])  # 10 frames are compared in two groups
 def test_offsets_of_the_direct_method_are_its_measurements(num_frames, turned):

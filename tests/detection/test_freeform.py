@@ -189,6 +189,26 @@ def test_offsets_of_all_pairs_are_measured_despite_an_unobservable_tone():
     assert found.reliable.all()
 
 
+class Humming(Motion):
+    """Tones at 1.04 and 0.96 times the frame rate beside an image motion."""
+
+    def displacement(self, times):
+        angle = 2 * np.pi * times / TIMING.frame_period
+        x = 1.5 * np.sin(1.04 * angle + 0.4) + 0.2 * angle
+        return np.stack([x, 1.5 * np.sin(0.96 * angle + 2.0)], axis=-1)
+
+
+def test_nearly_blind_motion_has_an_unknown_common_part():
+    scene = draw_scene(HEIGHT + 2 * MARGIN, 112 + 2 * MARGIN, 12)
+    frames = torch.from_numpy(take_frames(scene, TIMING, Humming(), 5, 0.005)).float()
+    found = rsv.detect_motion(frames, TIMING)
+    truth = Humming().displacement(found.times.numpy())
+    error = found.displacement.numpy() - (truth - truth.mean((0, 1)))
+    assert (rms(error) > 0.3).all()
+    assert (rms(error) < 1.5 * rms(found.std.numpy())).all()
+    assert (rms(found.std.numpy()) < 2.0).all()  # four times the motion says nothing
+
+
 @pytest.mark.parametrize(("size", "seed"), [(128, 4), (256, 3)])
 def test_frames_of_independent_noise_have_no_motion(size, seed):
     """The spline explains the few rows that happen to agree, and there is no residual."""

@@ -109,7 +109,7 @@ def model_displacements(measurements: Measurements, fit: ToneFit) -> Array:
 
 def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
     """Residual displacements (B, N, G, 2) in px of a fit."""
-    return measurements.relative(measurements.displacements - model_displacements(measurements, fit))
+    return measurements.displacements - model_displacements(measurements, fit)
 
 
 # --- Weighted least squares ---
@@ -189,8 +189,8 @@ class _Problem:
         place = np.arange(exists.shape[-1])
         self.is_frequency = (place < 3 * self.tones) & (place % 3 == 2)  # (P,)
         self.free, self.linear = (self._of_free(these) for these in (exists, exists & ~self.is_frequency))  # (B, M)
-        drift = measurements.drifts[..., None, :order]
-        self.drift_columns = np.repeat(drift, self.axes, -2)  # (B, N, G, A, J)
+        drifts = measurements.drifts[..., :order]
+        self.drift_columns = np.broadcast_to(drifts, (*drifts.shape[:3], self.axes, order))
         self.root = measurements.root[:, :, None]  # (B, N, 1, A, A)
 
     def _of_free(self, parameters: Array) -> Array:
@@ -425,7 +425,7 @@ def with_unknown_errors(measurements: Measurements, fit: ToneFit) -> ToneFit:
         return fit
     fit = fit.about(measurements.centre)
     state = problem.evaluate(fit.parameters)
-    whole = measurements.square(measurements.relative(measurements.displacements))
+    whole = measurements.square(measurements.displacements)
     largest = whole / np.maximum(measurements.num_measurements, 1.0)
     variances = np.where(unknown, largest, problem.variances(state))
     return replace(fit, covariance=problem.covariance(state, np.sqrt(variances)))

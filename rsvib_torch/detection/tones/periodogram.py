@@ -40,7 +40,7 @@ def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Ar
     seen, time = measurements.visible, measurements.middles[..., 0, 0]
     of_rows = weights.swapaxes(2, 3)  # (B, S, A, N)
     frame_weights = of_rows[..., None] * seen[:, None, None]  # (B, S, A, N, G)
-    drift = measurements.drifts[:, None, None, ..., 0]
+    drift = measurements.drifts[:, None, None, :, :, 0, 0]
     values = np.moveaxis(measurements.displacements, -1, 1)[:, None]  # (B, 1, A, N, G)
     of_drift = frame_weights * drift
     drift_drift, drift_value = ((of_drift * factor).sum((-2, -1))[..., None] for factor in (drift, values))
