@@ -167,10 +167,10 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
 
     The ``taps`` (..., R, J, N) are those of ``row_taps``; ``along`` (..., R, N) is the displacement x_n in px.
     """
-    angle = (-2 * math.pi) * along[..., None] * frequencies
-    waves = torch.cat([angle.cos(), angle.sin()], -1)
-    parts = torch.bmm(taps.to(angle.dtype).flatten(0, -3), waves.flatten(0, -3)).view(*taps.shape[:-1], -1)
-    return torch.complex(*parts.chunk(2, -1))
+    angle = ((-2 * math.pi) * along[..., None] * frequencies).flatten(0, -3)
+    weights = taps.to(angle.dtype).flatten(0, -3)
+    transfer = torch.complex(torch.bmm(weights, angle.cos()), torch.bmm(weights, angle.sin()))
+    return transfer.view(*taps.shape[:-1], -1)
 
 
 def form_rows(
