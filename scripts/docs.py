@@ -177,9 +177,7 @@ def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, o
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--out", type=Path, default=ROOT / "out" / "site", help="folder of the site (default: out/site)"
-    )
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
     options = parser.parse_args(arguments)
     if any(find_spec(name) is None for name in BUILDERS):
         parser.error("MkDocs is missing: .venv/bin/python -m pip install -c scripts/constraints.txt -e '.[docs]'")

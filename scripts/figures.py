@@ -14,6 +14,7 @@ from benchmarks import live, mosaic
 from benchmarks.finer import EXPOSURE_ROWS, FADE, ROW_TIME, SHAKE, decibel, interpolated
 from benchmarks.finer import MARGIN as FINER_MARGIN
 from benchmarks.independent_camera import ALIASING, POINTS_PER_PX, Array, after_optics, closed, still_image, take_frames
+from benchmarks.pipeline import camera
 from kornia.augmentation import AugmentationSequential
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -29,11 +30,6 @@ FRAME_ROWS = 2048
 VIBRATION = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, -1.9])  # amplitudes and frequencies of Liu et al. 2023
 MARGIN = 32  # px of scene around the frame
 COLOURS = ("#14487a", "#c8102e")
-
-
-def camera(exposure_rows: int) -> rsv.SensorTiming:
-    """The camera of Liu et al. 2023 with another exposure."""
-    return rsv.SensorTiming(row_time=ROW_TIME, exposure_rows=exposure_rows, frame_rows=FRAME_ROWS)
 
 
 def taken(scene: Tensor, timing: rsv.SensorTiming, noise: float) -> Tensor:
@@ -251,9 +247,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {  # by the path in docs/
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/figures"), help="folder, e.g. docs (default: out/figures)"
-    )
+    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="folder (default: out/figures)")
     parser.add_argument("--only", choices=PICTURES, nargs="+", default=list(PICTURES), help="figures to draw")
     options = parser.parse_args(arguments)
     for name in options.only:

@@ -38,11 +38,7 @@ RESULTS = Path(__file__).parent / "benchmarks" / "results"
 # Environment variables that must be set before a process starts. PyTorch uses huge pages, as NumPy does by default.
 # glibc keeps freed memory of all threads for the next call; virtual machines may take long to provide memory again.
 HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"
-KEPT = {
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 40),
-    "MALLOC_TRIM_THRESHOLD_": str(1 << 40),
-    "MALLOC_TOP_PAD_": str(1 << 26),
-}
+KEPT = {"MALLOC_MMAP_THRESHOLD_": str(1 << 40), "MALLOC_TRIM_THRESHOLD_": str(1 << 40), "MALLOC_TOP_PAD_": str(1 << 26)}
 ENVIRONMENT = {HUGE_PAGES: "1", **KEPT}
 _LIBRARIES = {
     "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),

@@ -101,9 +101,8 @@ def main() -> int:
     for name, seed in itertools.product(options.only, options.seeds):
         attack, begin, trials = ATTACKS[name], time.perf_counter(), []
         with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
-            for trial in importlib.import_module(f"attacks.{name}").trials(
-                Path(folder), options.count or attack.count, seed
-            ):
+            run = importlib.import_module(f"attacks.{name}").trials
+            for trial in run(Path(folder), options.count or attack.count, seed):
                 trials.append(trial)
                 if trial.outcome in FAILURES:
                     failed = True

@@ -13,10 +13,7 @@ from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
 import rsvib_torch as rsv
 
 TIMING = rsv.SensorTiming(row_time=40e-6, exposure_rows=30, frame_rows=320)
-MOTIONS = (
-    Motion((3.1, 4.2), (130.0, 90.0), (0.4, 1.3)),
-    Motion((2.2, 1.4), (70.0, 210.0), (-1.0, 2.0)),
-)
+MOTIONS = (Motion((3.1, 4.2), (130.0, 90.0), (0.4, 1.3)), Motion((2.2, 1.4), (70.0, 210.0), (-1.0, 2.0)))
 METHODS = ("exact", "banded", "dewarp")
 
 
@@ -35,9 +32,7 @@ def frames(scene):
 @pytest.fixture(scope="module")
 def vibration():
     both = [motion.vibration() for motion in MOTIONS]
-    return rsv.Vibration(
-        *(torch.stack([getattr(v, name) for v in both]) for name in ("amplitude", "frequency", "phase"))
-    )
+    return rsv.Vibration(*(torch.stack([getattr(v, key) for v in both]) for key in ("amplitude", "frequency", "phase")))
 
 
 @pytest.fixture(scope="module")

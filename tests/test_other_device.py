@@ -91,8 +91,8 @@ WORK = {
     "colour, batch": lambda images, timing: rsv.restore(images[None, :, None].expand(2, -1, 3, -1, -1), timing, SHAKE),
     "across columns": lambda images, timing: rsv.restore(images, replace(timing, scan_axis=-1), SHAKE),
     "dewarp": lambda images, timing: rsv.restore(images, timing, SHAKE, method="dewarp"),
-    "richardson-lucy": lambda images, timing: rsv.restore(
-        images, timing, SHAKE, method="richardson-lucy", iterations=5
+    "richardson-lucy": lambda frames, timing: rsv.restore(
+        frames, timing, SHAKE, method="richardson-lucy", iterations=5
     ),
     "gradient": gradient,
     "gradient of the motion": gradient_of_motion,

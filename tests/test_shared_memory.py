@@ -115,10 +115,7 @@ CASES = {
     "simulate_frames, still": (lambda scene: rsv.simulate_frames(scene, TIMING, STILL), FRAMES[0]),
     "restore_block": (lambda frames: rsv.restore_block(np.asarray(frames), TIMING), FRAMES),
     "restore, no axis": (lambda frames: rsv.restore(frames, TIMING, REFUSED), FRAMES),
-    "restore, no axis, last": (
-        lambda frames: rsv.restore(frames, TIMING, REFUSED, channels="last"),
-        FRAMES[..., None],
-    ),
+    "restore, no axis, last": (lambda frames: rsv.restore(frames, TIMING, REFUSED, channels="last"), FRAMES[..., None]),
     "restore, mosaic": (lambda frames: rsv.restore(frames, TIMING, REFUSED, mosaic="RGGB"), FRAMES),
 } | {
     f"restore, {method}, {name}": (lambda frames, m=method, v=motion: rsv.restore(frames, TIMING, v, method=m), FRAMES)

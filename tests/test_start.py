@@ -12,14 +12,7 @@ import pytest
 import rsvib_torch as rsv
 from rsvib_torch.detection import pipeline
 from rsvib_torch.motion import recorded
-from rsvib_torch.options import (
-    METHOD_OPTIONS,
-    BadFrames,
-    DetectionMethod,
-    MotionUnit,
-    PriorName,
-    Registration,
-)
+from rsvib_torch.options import METHOD_OPTIONS, BadFrames, DetectionMethod, MotionUnit, PriorName, Registration
 from rsvib_torch.registration.methods import BAND_METHODS
 from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.restoration.restore import METHODS

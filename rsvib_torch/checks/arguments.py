@@ -86,9 +86,7 @@ def check_shapes(values: Mapping[str, Any], shapes: Mapping[str, str]) -> None:
         batches = {"": [()], "...": [known.get("...", batch)], "[...]": [known.get("...", batch), ()]}[lead]
         if not fits or batch not in batches:
             names = [lead.strip("[]")] * bool(lead) + [axis for axis, _, _ in axes]
-            limits = {
-                axis: f"{low} to {high}" for axis, low, high in axes if math.isfinite(high) and low < high
-            } | known
+            limits = {axis: f"{low} to {high}" for axis, low, high in axes if low < high < math.inf} | known
             where = ", ".join(f"{axis} = {limits[axis]}" for axis in names if axis in limits)
             expected = f"({', '.join(names)}{',' * (len(names) == 1)}){' with ' * bool(where)}{where}"
             raise ValueError(f"{name} must have shape {expected}, got {shape}")

@@ -51,7 +51,6 @@ def _is_array(value: object) -> bool:
 
 
 def _stacked(name: str, items: Sequence[Tensor]) -> Tensor:
-    """The tensors of a list in one tensor."""
     kinds = [f"{tuple(item.shape)} {str(item.dtype).removeprefix('torch.')} on {item.device}" for item in items]
     for index, kind in enumerate(kinds):
         if kind != kinds[0]:

@@ -143,13 +143,10 @@ def fields_of(group: type) -> Table:
     return dict(vars(group)["__pydantic_fields__"])
 
 
-def flat_options(
-    group: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None
-) -> Callable[..., Any]:
+def flat_options(group: Any, function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with the fields of a group of options as keyword arguments, instead of its argument ``options``.
 
-    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced. ``build`` makes the
-    options of the arguments, if it is not the group.
+    Its signature and its docstring list them; the line ``options:`` of the docstring is replaced.
     """
     direct = [one for name, one in inspect.signature(function).parameters.items() if name != "options"]
     names = {parameter.name for parameter in direct}
@@ -157,7 +154,7 @@ def flat_options(
     @wraps(function)
     def flat(*args: object, **given: object) -> object:
         stated = {name: given.pop(name) for name in names & given.keys()}
-        return function(*args, **stated, options=(build or group)(**given))
+        return function(*args, **stated, options=group(**given))
 
     kind = inspect.Parameter.KEYWORD_ONLY
     of_group = [

@@ -155,7 +155,6 @@ def live_session(given: LiveOptions) -> Answer:
 
 
 def _source(given: LiveOptions, settings: Config) -> video.FrameSource:
-    """The source of the frames."""
     if given.is_camera:
         return video.CameraSource(int(given.source) if given.source.isdecimal() else given.source, settings.timing)
     if given.file is None:
@@ -182,7 +181,6 @@ def _check_options(given: LiveOptions) -> None:
 
 
 def _outputs(given: LiveOptions, settings: Config, stream: BinaryIO | None) -> list[video.FrameOutput]:
-    """The outputs that the options name."""
     outputs: list[video.FrameOutput] = []
     if given.written is not None:
         outputs.append(video.VideoOutput(given.written, settings.timing.frame_rate, overwrite=given.overwrite))

@@ -161,9 +161,8 @@ def known(given: KnownOptions) -> Answer:
     info, scale, options = given.planned_restoration()
     info, timing = replace(info, full_scale=scale), given.settings.timing
     ignore = _ignored(given.ignore or (), (info.shape[-2], info.shape[-1]))
-    io.check_stack_target(
-        given.restored, shared.restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info
-    )
+    shape = shared.restored_shape(info, options)
+    io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     print_notes(info, given.settings)
     # 1. The motion on the clock of the frames.
     results: dict[str, list[str]] = {}
@@ -227,7 +226,6 @@ def known(given: KnownOptions) -> Answer:
 
 
 def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.AngularRates:
-    """The recording."""
     if given.offset is not None and given.offsets is not None:
         raise ValueError("--offset states the clock and --offsets limits its estimate: give one of them")
     if given.lens_profile is not None and given.focal_length is not None:

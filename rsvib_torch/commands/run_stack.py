@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rsvib_torch import detection, io, stacks, video
+from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
@@ -89,12 +90,10 @@ def run(given: RunOptions) -> Answer:
         problem = "does not go with --gyroscope, which searches for no tones; leave one of them out"
         raise ValueError(f"--require-reliable {problem}")
     if given.video:
-        from rsvib_torch.io.stack_info import H264, split_range  # noqa: PLC0415 - loads PyTorch
-
         if output != "restored.tif":
             raise ValueError(f"--video and --output {output} are two names for the restored stack; give one of them")
-        ending = split_range(frames)[0].suffix.lower()
-        output = f"restored{ending if ending in H264 else '.mkv'}"
+        ending = io.split_range(frames)[0].suffix.lower()
+        output = f"restored{ending if ending in io.H264 else '.mkv'}"
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
     written.check_folder(out, _RESULTS, given.overwrite or "resume" in given.processing, given.inputs, out / output)
@@ -113,7 +112,6 @@ def run(given: RunOptions) -> Answer:
 
 
 def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: Table, chosen: WindowOptions) -> Answer:
-    """Process a stack in windows."""
     settings, frames, out = given.settings, given.stack, given.out
     common |= {"window": chosen.window, "follow": chosen.follow, "force": given.force}
     common["detection"] = None if chosen.follow is True else settings.detection  # a tracker has none
@@ -160,15 +158,12 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
 
 def _comparison(given: RunOptions, common: Table, first: stacks.WindowResult) -> Figure:
     """Draw the first restored frame of a stack beside the frame of the input."""
-    from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
-    from rsvib_torch.frames.pixels import enlarged  # noqa: PLC0415
-
     index = first.indices[0] if first.indices else (first.window.first + first.window.last + 1) // 2
     raw = read_frame(given.stack, index, common["full_scale"])
     pattern = common["restoration"].get("mosaic")
     if pattern is not None:
-        raw = colour_frames(raw[None], pattern)[0]
-    raw = enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
+        raw = preparation.colour_frames(raw[None], pattern)[0]
+    raw = preparation.enlarged(raw, first.frames.shape[-1] // raw.shape[-1])
     names = ("input", "restored" if first.restored else "unchanged")
     return reports.comparison_figure(raw, first.frames[0].cpu().nan_to_num(0.0), names=names)
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from rsvib_torch import frames as preparation
 from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
@@ -339,9 +340,7 @@ def _restoration_options(
     if info.is_integer and full_scale is not None:  # of frames whose full scale is 1
         options["saturation"] = (options.get("saturation") or full_scale) / full_scale
     if checked.mosaic is not None:
-        from rsvib_torch.frames.mosaic import check_mosaic  # noqa: PLC0415
-
-        check_mosaic(checked.mosaic, info.shape)
+        preparation.check_mosaic(checked.mosaic, info.shape)
     if checked.optics is not None:
         from rsvib_torch.restoration.restore import check_optics  # noqa: PLC0415
 

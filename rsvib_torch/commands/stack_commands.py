@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 import rsvib_torch
-from rsvib_torch import detection, imaging, io, stacks
+from rsvib_torch import detection, imaging, io, stacks, video
+from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
@@ -45,12 +46,10 @@ class Stack:
 
 def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
     """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows."""
-    from rsvib_torch.stacks.memory import check_stack_fits  # noqa: PLC0415
-
     path, config = given.stack, given.settings
     info = io.read_stack_info(path)
     scale = shared.full_scale_of(path, info, config, given.full_scale)
-    check_stack_fits(info, restoration, on_gpu=given.torch_device.type != "cpu")
+    stacks.check_stack_fits(info, restoration, on_gpu=given.torch_device.type != "cpu")
     with working(f"reading {path}"):
         frames = io.read_stack(path, full_scale=scale)
     timing = io.timing_from_first_frame(config.timing, info)
@@ -62,11 +61,9 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
 
 def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
     """A frame of a stack, with 0 for missing pixels."""
-    from rsvib_torch.io.full_scale import counts_to_frames  # noqa: PLC0415
-
     with closing(io.open_stack(path)) as reader:
         scale, pixels = full_scale or reader.info.full_scale, reader.frame(index)[None]
-    return counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
+    return io.counts_to_frames(pixels, scale, str(path), reader.info.nodata)[0].nan_to_num(0.0)
 
 
 def print_notes(info: io.StackInfo, config: Config) -> None:
@@ -354,8 +351,6 @@ def report(given: ReportOptions) -> Answer:
         forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
         steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
     steps += answers.steps_after_detection(detection, frames, settings)
-    from rsvib_torch.frames.mosaic import colour_frames  # noqa: PLC0415
-
     answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
     if windows is not None and windows.output is not None:  # restored by windows, here as a whole
         title = "Restoration of the page, of one vibration in all frames"
@@ -366,7 +361,7 @@ def report(given: ReportOptions) -> Answer:
         given,
         windows,
         answer,
-        frames=stack.frames if pattern is None else colour_frames(stack.frames, pattern),
+        frames=stack.frames if pattern is None else preparation.colour_frames(stack.frames, pattern),
         restored=result.frames,
         was_restored=result.restored,
         timing=stack.timing,
@@ -382,8 +377,6 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
     """The page of a run that followed the vibration: two frames in the middle, before and after it."""
     import torch  # noqa: PLC0415
 
-    from rsvib_torch.video import Margins  # noqa: PLC0415
-
     first, scale = max(windows.input["shape"][0] // 2 - 1, 0), windows.settings["full_scale"]
     of_both = ((given.stack, scale), (made, None if io.is_video(made) else scale))
     before, after = (torch.stack([read_frame(path, first + n, full) for n in (0, 1)]) for path, full in of_both)
@@ -393,7 +386,7 @@ def _report_of_run(given: ReportOptions, windows: stacks.StackManifest, made: Pa
         given,
         windows,
         answer,
-        frames=before if windows.margins is None else Margins(**windows.margins).cut(before),
+        frames=before if windows.margins is None else video.Margins(**windows.margins).cut(before),
         restored=after,
         was_restored=True,
         timing=given.settings.timing,

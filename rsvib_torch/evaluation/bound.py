@@ -242,10 +242,8 @@ def gradient_information(recording: Recording, noise: float | None = None) -> Te
     products = _gradient_products(recording.scene, factors, window.double(), noise, count)  # (S, A, A)
     times, weights = (value.to(begin.device) for value in exposure_nodes(timing, "gauss", 8))
     means = recording.sensitivity(moments[..., None] + times) @ weights  # over the exposures, (P, S, T)
-    sensitivity = (
-        means[..., None]
-        * functional.one_hot(torch.tensor(recording.axes, device="cpu"), factors.shape[-1]).to(means)[:, None, None]
-    )
+    axes = functional.one_hot(torch.tensor(recording.axes, device="cpu"), factors.shape[-1]).to(means)
+    sensitivity = means[..., None] * axes[:, None, None]
     mean = (seen[..., None] * sensitivity).sum(2, keepdim=True) / seen.sum(1).clamp(min=1e-300)[:, None, None]
     shared = seen * ((seen > 0).sum(1, keepdim=True) > 1)
     relative = sensitivity - mean

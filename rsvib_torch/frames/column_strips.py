@@ -33,20 +33,20 @@ class ColumnStrips:
         """
         count = max(1, math.ceil(frame_width / max_pitch))
         step = frame_width / count
-        width = min(frame_width, math.ceil(2 * step) + 2 * margin)
-        middles = tuple((number + 0.5) * step - 0.5 for number in range(count))
-        firsts = tuple(min(max(round(middle - 0.5 * (width - 1)), 0), frame_width - width) for middle in middles)
-        return cls(frame_width, width, firsts, middles)
+        return cls._around(frame_width, step, margin, [(number + 0.5) * step - 0.5 for number in range(count)])
 
     @classmethod
     def between_ends(cls, frame_width: int, max_pitch: float, margin: int) -> "ColumnStrips":
         """Strips as from ``of``, but the middles of the first and the last are the ends of the frame."""
         count = max(1, math.ceil((frame_width - 1) / max_pitch))
         step = (frame_width - 1) / count
+        return cls._around(frame_width, step, margin, [number * step for number in range(count + 1)])
+
+    @classmethod
+    def _around(cls, frame_width: int, step: float, margin: int, middles: list[float]) -> "ColumnStrips":
         width = min(frame_width, math.ceil(2 * step) + 2 * margin)
-        middles = tuple(number * step for number in range(count + 1))
         firsts = tuple(min(max(round(middle - 0.5 * (width - 1)), 0), frame_width - width) for middle in middles)
-        return cls(frame_width, width, firsts, middles)
+        return cls(frame_width, width, firsts, tuple(middles))
 
     @property
     def columns(self) -> Tensor:

@@ -121,7 +121,7 @@ class TimedModule(nn.Module):
         return ", ".join(stated)
 
 
-def entry_point(options: Any, function: Callable[..., Any], build: Callable[..., Any] | None = None) -> Any:
+def entry_point(options: Any, function: Callable[..., Any]) -> Any:
     """A function with flat options, outside of compiled graphs; arguments as of ``flat_options``."""
 
     @wraps(function)
@@ -141,4 +141,4 @@ def entry_point(options: Any, function: Callable[..., Any], build: Callable[...,
                 "derivatives, and a batch (B, T, C, H, W) instead of vmap"
             ) from error
 
-    return outside_graphs(flat_options(options, solved, build))
+    return outside_graphs(flat_options(options, solved))

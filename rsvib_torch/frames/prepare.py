@@ -6,7 +6,7 @@ invariants (docs/architecture.md) begin here: rows lie on axis -2 in readout ord
 the user gave float64).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -65,10 +65,6 @@ class PreparedFrames:
         if self.colours is None:
             return self.filled, restored
         return mosaic_free(self.filled), mosaic_free(luminance(restored))
-
-    def with_images(self, images: Tensor) -> "PreparedFrames":
-        """The same frames with other pixel values (B, T, C, H, W') in row order; masks must be None or fit them."""
-        return replace(self, images=images)
 
     def from_row_order(self, images: Tensor) -> Tensor:
         """Images (B, T', C, H', W') in row order with the axes, orientation and dtype of the user's frames.

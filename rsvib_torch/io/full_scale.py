@@ -67,9 +67,7 @@ def counts_to_frames(counts: Array, full_scale: float | None, name: str, nodata:
     narrow = counts.dtype.itemsize <= 2  # float32 holds 16-bit counts exactly
     # torch does not compute with all unsigned types
     signed = counts if counts.dtype == np.uint8 else counts.astype(np.int32 if narrow else np.int64)
-    floats = torch.from_numpy(np.require(signed, requirements=["C", "W"])).to(
-        torch.float32 if narrow else torch.float64
-    )
+    floats = torch.from_numpy(np.require(signed, None, ["C", "W"])).to(torch.float32 if narrow else torch.float64)
     return floats.div_(full_scale).to(torch.float32)
 
 

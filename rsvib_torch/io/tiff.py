@@ -284,11 +284,7 @@ def storage_of(path: Path) -> Table:
 
 
 def write_tiff(
-    path: Path,
-    info: StackInfo,
-    frames: Iterator[Array],
-    compression: str | None,
-    storage: Mapping[str, Any] = {},
+    path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None, storage: Mapping[str, Any] = {}
 ) -> None:
     """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``, and from ``storage_of``."""
     stored, options = _layout(info)

@@ -224,7 +224,6 @@ class VideoReader:
         return planes
 
     def _decoded(self, index: int) -> Any:
-        """A frame of FFmpeg."""
         if index < self._next:
             self._restart()
         frame = None
@@ -341,7 +340,6 @@ class VideoEncoder:
         self._container.mux(self._stream.encode(encoded))
 
     def _converted(self, frame: NDArray[Any]) -> Any:
-        """A frame of FFmpeg."""
         if self._picture is not None:
             return _av().VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="yuv420p")
         counts = np.moveaxis(frame, 0, -1) if frame.shape[:-2] == (3,) else frame.reshape(frame.shape[-2:])

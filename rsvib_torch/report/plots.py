@@ -250,10 +250,7 @@ def offset_figure(result: DetectionResult) -> Figure:
 
 @checks_arguments
 def windows_figure(
-    times: Sequence[float],
-    detections: Sequence[DetectedVibration | None],
-    *,
-    time_label: str = "time (s)",
+    times: Sequence[float], detections: Sequence[DetectedVibration | None], *, time_label: str = "time (s)"
 ) -> Figure:
     """Draw amplitude and frequency of the detected tones over windows or stacks, with error bars of two stds.
 

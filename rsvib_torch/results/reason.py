@@ -172,8 +172,7 @@ _TONES = {
         "than independent noise, below 0.5",
     ),
     "no_tone": ReasonKind(
-        "no significant tone: the offsets are those of a uniform motion, or below their noise",
-        _MAY_BE_STILL,
+        "no significant tone: the offsets are those of a uniform motion, or below their noise", _MAY_BE_STILL
     ),
     "too_many_tones": ReasonKind(
         "{value:g} tones, of at most {limit:g}, do not explain the motion: it is not a sum of few tones, or the timing "
@@ -308,8 +307,7 @@ _FOLLOWED = {
         "not_followed, above 7 %",
     ),
     "other_tone": ReasonKind(
-        "a tone of {frequency:.4g} Hz explains the frames as well",
-        "use more frames, or frames at other intervals",
+        "a tone of {frequency:.4g} Hz explains the frames as well", "use more frames, or frames at other intervals"
     ),
 }
 _SHAPES = {

@@ -39,23 +39,17 @@ SHORTEST_READOUT = 0.1  # of the frame period, if no row times are given
 class RowTimeOptions(OffsetOptions):
     """Options of ``calibrate_row_time_by_motion``; bands are those of the start."""
 
-    frame_rate: Positive = Field(description="Frames per second.")
-    row_time: tuple[Number, Number] | None = Field(
-        default=None,
-        strict=False,
-        description="Shortest and longest possible row time in s. By default the rows of a frame are read within a "
-        "tenth to the whole of the frame period.",
-    )
-    exposure_time: Positive | None = Field(
-        default=None,
-        description="Exposure in s. None to measure it from the blur, if possible; it hardly affects the row time.",
-    )
-    scan_axis: Literal[-2, -1, "y", "x"] = Field(
-        default=-2, description="Axis along which rows follow each other, as in ``SensorTiming``."
-    )
-    readout_direction: Literal["forward", "reverse"] | None = Field(
-        default=None, description="None to determine it as well."
-    )
+    frame_rate: Positive
+    """Frames per second."""
+    row_time: tuple[Number, Number] | None = Field(default=None, strict=False)
+    """Shortest and longest possible row time in s. By default the rows of a frame are read within a tenth to the whole
+    of the frame period."""
+    exposure_time: Positive | None = None
+    """Exposure in s. None to measure it from the blur, if possible; it hardly affects the row time."""
+    scan_axis: Literal[-2, -1, "y", "x"] = -2
+    """Axis along which rows follow each other, as in ``SensorTiming``."""
+    readout_direction: Literal["forward", "reverse"] | None = None
+    """None to determine it as well."""
 
 
 class _CalibratesByMotion(Protocol[P]):
@@ -190,7 +184,6 @@ def _undetermined(reason: Reason) -> RowTimeFit:
 
 
 def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:
-    """The calibration with its verdict."""
     findings = list(found.findings)
     known = math.isfinite(found.row_time)
     if found.others:

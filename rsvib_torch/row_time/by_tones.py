@@ -131,9 +131,7 @@ def row_time_of_tones(
 
 def _possible(tones: list[RowTones], clock: CameraClock, direction: float = 1.0) -> list[Candidate]:
     """Row times that agree with the tones of frames whose rows are in an assumed readout order, the best first."""
-    frequencies, covariances = (
-        np.concatenate(values) for values in zip(*(one.frequencies() for one in tones), strict=True)
-    )
+    frequencies, covariances = map(np.concatenate, zip(*(one.frequencies() for one in tones), strict=True))
     found = candidates(frequencies, covariances, clock.period, clock.low, clock.high)
     found = [replace(one, row_time=direction * one.row_time) for one in found]
     return [one for one in found if clock.allows(one.row_time)]

@@ -5,6 +5,7 @@ from .job import options_of_windows as options_of_windows
 from .job import restore_block as restore_block
 from .manifest import StackManifest as StackManifest
 from .manifest import read_manifest as read_manifest
+from .memory import check_stack_fits as check_stack_fits
 from .process import detect_stack as detect_stack
 from .process import iterate_stack as iterate_stack
 from .process import process_stack as process_stack

@@ -22,11 +22,7 @@ NO_WORKERS_SECONDS = 60.0  # workers of a batch system start within this time af
 
 
 def compute_here(
-    job: StackJob,
-    windows: Sequence[Window],
-    finish: Callable[[WindowResult, WindowFrames], _Result],
-    *,
-    at_once: int,
+    job: StackJob, windows: Sequence[Window], finish: Callable[[WindowResult, WindowFrames], _Result], *, at_once: int
 ) -> Generator[_Result, None, None]:
     """Compute windows in this process; ``finish`` gets a result and its frames in the thread that computed it."""
 
@@ -44,7 +40,6 @@ def _distributed() -> Any:
 
 
 def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> StoredWindow:
-    """Read and compute one window on a Dask worker."""
     share_one_heap(keep_freed=True)
     default_threads = torch.get_num_threads()
     if one_thread:

@@ -26,8 +26,6 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 
-__all__ = ["calls", "trials"]
-
 SECONDS, MEMORY = 10.0, 2 << 30  # limits of one trial; bytes in addition to those of the valid calls
 _NOT_CALLED = {"RestorationWarning", "TimingWarning"}  # categories of warnings
 _OF_THE_PACKAGE = {"codes", "from_parameters", "mapped"}  # methods that only the package calls
@@ -101,17 +99,15 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     values = (0.0, 1e-4, 1.0, 1e-4, unit, unit, 500.0, 1.0, 1e-4, 1e-6, pairs, unit, 0.01, unit[:2])
     rotation = rsv.RotationAlignment(recorded, "YxZ", *values, pairs, pairs, True, ())
     rsv.write_vibration(folder / "vibration.json", detected)
-    options: dict[str, Any] = {
-        "detection": DETECTION,
-        "restoration": {"method": "dewarp"},
-    }
+    options: dict[str, Any] = {"detection": DETECTION, "restoration": {"method": "dewarp"}}
     options |= {"full_scale": None, "force": False, "device": "cpu"}
     windows = {"window": 3, "memory": "1GB", "workers": 1, **options}
     rsv.process_stack(stack, folder / "out.npy", timing, **windows)
     manifest = rsv.read_manifest(folder / "out.npy.manifest.json")
     psf = rsv.row_psf(vibration, timing.row_starts(1, 96)[0], timing)
     blur = rsv.RowVaryingBlur(psf, frame_width=64)
-    augmentation = rsv.RollingShutterVibration(timing, amplitude=(0.5, 2.0), frequency=(40.0, 200.0))
+    random_tones = {"amplitude": (0.5, 2.0), "frequency": (40.0, 200.0)}
+    augmentation = rsv.RollingShutterVibration(timing, **random_tones)
     detector = rsv.VibrationDetector(timing, **DETECTION)
     restorer = rsv.VibrationRestorer(timing, method="dewarp", check=False)
     check = rsv.check_motion(frames, timing, recorded, **BANDS)
@@ -132,22 +128,9 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     components = torch.zeros(2, 3, dtype=torch.float64)
     # values of the parameters of all functions and methods, by name
     pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **BANDS}
-    pool |= {
-        "recorded": recorded,
-        "acceleration": path,
-        "offsets": (-0.001, 0.001),
-        "camera": camera,
-        "info": info,
-        "manifest": manifest,
-    }
-    pool |= {
-        "detected": detected,
-        "detection": detected,
-        "result": detected,
-        "restored": restored,
-        "figure": figure,
-        "psf": psf,
-    }
+    pool |= {"recorded": recorded, "acceleration": path, "offsets": (-0.001, 0.001), "camera": camera, "info": info}
+    pool |= {"manifest": manifest, "detected": detected, "detection": detected, "result": detected}
+    pool |= {"restored": restored, "figure": figure, "psf": psf}
     pool |= {"scene": scene, "noise": sensor_noise, "image": image, "reference": image, "roi": edge, "rim": 4}
     pool |= {"data_range": 1.0, "raw": frames[0], "measured": path, "truth": path * 0.9, "curves": {"raw": [curve]}}
     pool |= {"times": times, "starts": times, "later_starts": times + 0.01, "start": times, "end": times + 0.01}
@@ -159,15 +142,8 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     pool |= {"line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0, "size": (96, 64)}
     pool |= {"height": 24, "width": 16, "u": times * 10, "v": times * 10, "input": frames[:, None], "index": 0}
     pool |= {"count": 2, "shape": (3, 96, 64), "dtype": "float32", "frame": frames[0].numpy(), "x": scene}
-    pool |= {
-        "y": frames[0],
-        "scene_shape": (160, 128),
-        "tones": None,
-        "flicker_frequency": 1000.0,
-        "isd": isd,
-        "results": [detected.std] * 2,
-        "images": frames,
-    }
+    pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0, "isd": isd}
+    pool |= {"results": [detected.std] * 2, "images": frames}
     pool |= {"visible": torch.ones(96, 64, dtype=torch.bool), "other": rsv.Margins(1, 2, 3, 4), "place": torch.zeros(2)}
     pool |= {"stated": timing, "agreeing": timing, "row_time": 1e-4, "pixel_size": 5e-6}
     pool |= {"exposure_times": [1e-3, 2.5e-4], "frame_rate": 30.0, "detections": [detected], "source": stack}
@@ -238,18 +214,10 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     constructed: dict[str, Call] = {
         "FixedDewarp": call(rsv.FixedDewarp, num_frames=3),
         "FreeMotion": call(rsv.FreeMotion, coefficients=recorded.coefficients, start=0.0, tones=vibration),
-        "RollingShutterVibration": call(
-            rsv.RollingShutterVibration,
-            amplitude=(0.5, 2.0),
-            frequency=(40.0, 200.0),
-            exposure_rows=(4.0, 8.0),
-            tones=1,
-        ),
+        "RollingShutterVibration": call(rsv.RollingShutterVibration, **random_tones, exposure_rows=(4.0, 8.0), tones=1),
         "RowVaryingBlur": call(rsv.RowVaryingBlur, frame_width=64, origin=(4, 4), scene_size=(160, 128)),
         "SensorTiming": _with_fields(timing),
-        "Vibration": call(
-            rsv.Vibration, amplitude=vibration.amplitude, frequency=[130.0, 170.0], image_motion=(5.0, 3.0)
-        ),
+        "Vibration": call(rsv.Vibration, amplitude=[1.2, 0.8], frequency=[130.0, 170.0], image_motion=(5.0, 3.0)),
         "VibrationDetector": call(rsv.VibrationDetector, **fast),
         "VibrationRestorer": call(rsv.VibrationRestorer, joint=False),
         "VideoBorder": call(rsv.VideoBorder),
@@ -289,66 +257,49 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     return result
 
 
+def _expressions(text: str) -> list[str]:
+    return text.strip().replace("\n", " | ").split(" | ")
+
+
 # Hostile values: expressions, which are evaluated for each trial and name it; ``t`` is the valid tensor.
-_VALUES = (
-    *("0", "-1", "math.nan", "math.inf", "-math.inf", "1e300", "-1e300", "5e-324", "1e-40", "1e308", "1e9", "10**9"),
-    *("10**30", "2**63", "-10**30", "0.5", "True", "np.int64(3)", "np.float32(np.nan)", "None", "'nonsense'", "''"),
-    *(
-        r"'a\0b'",
-        "'x' * 100_000",
-        r"b'\xff\x00'",
-        "1 + 2j",
-        "object()",
-        "[]",
-        "[[1, [2, 3]], 'x']",
-        "{'a': 1}",
-        "{1, 2}",
-    ),
-    *(
-        "len",
-        "rsv.Vibration",
-        "[[1.0], [1.0, 2.0]]",
-        "[None, None]",
-        "[math.nan, math.nan]",
-        "[1e300, 1e300]",
-        "[0, 0]",
-    ),
-    *("[-1, -1]", "[10**9, 10**9]", "[2, 2, 2]", "(2, 3, 4, 5, 6)", "(number for number in (1.0, 2.0))"),
-    *("torch.zeros(0)", "torch.tensor(2.0)", "torch.zeros((), device='meta')", "'/'", "'/dev/zero'", "b'/tmp/x'"),
-    *("'/tmp/' + 'x' * 5000", "rsv.Vibration.still()", "rsv.Vibration.still((4,))", "rsv.Vibration(1e5, 50.0)"),
-    *("rsv.Vibration(1.0, 1e8)", "rsv.Vibration(1.0, 50.0, image_motion=(1e5, 1e5))"),
-    "rsv.Vibration(torch.tensor([1.0, 1.0], requires_grad=True), 50.0)",
-    *("rsv.SensorTiming(1e-9, 1.0, 104.0)", "rsv.SensorTiming(1e-4, 1.0, 10.0)"),
-    "rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0])",
-    "rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[1e9, 1e9 + 1, 1e9 + 2])",
-    "rsv.SensorTiming(1e-4, 6, 104, scan_axis='x', readout_direction='reverse')",
-)
-_TENSORS = (
-    *("t.to('meta')", "t.to_sparse()", "t.flatten(0, -2).to_sparse_csr() if t.ndim > 1 else t.to_sparse()"),
-    "torch.nested.nested_tensor([t.float(), t.float()[:1]])",
-    "torch.nested.nested_tensor([t.float(), t.float()[:1]], layout=torch.jagged)",
-    "torch.quantize_per_tensor(t.float(), 0.01, 0, torch.quint8)",
-    *("t.to(torch.complex64)", "t > 0.5", "(100 * t).nan_to_num().to(torch.int64)"),
-    *("(100 * t.abs()).nan_to_num().to(torch.uint32)", "(100 * t.abs()).nan_to_num().to(torch.uint16)"),
-    *("t.half()", "t.bfloat16()", "t.float().to(torch.float8_e4m3fn)", "t.double()"),
-    *("t.float().requires_grad_()", "torch.full_like(t, math.inf, dtype=torch.float32)"),
-    "torch.full_like(t, math.nan, dtype=torch.float32)",
-    "t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.nan).reshape(t.shape)",
-    "t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.inf).reshape(t.shape)",
-    *("t.float() * 1e38", "torch.full_like(t, 3e38, dtype=torch.float32)", "t.double() * 1e300", "t.float() * 1e-40"),
-    *("t.double() * 1e-300", "torch.zeros_like(t)", "-t.float()", "t[:0]", "t[..., :0]", "t[:1]", "t[..., :1]"),
-    *("t[None, None, None]", "t[0] if t.ndim else t", "t.transpose(0, -1) if t.ndim else t", "t[:1].expand(t.shape)"),
-    *("t.numpy()[..., ::-1]", "t.numpy().astype(object)", "np.ma.masked_invalid(t.numpy())", "t.numpy().astype(str)"),
-    *("(1000 * t.numpy()).astype('datetime64[s]')", "np.zeros(tuple(t.shape), dtype=[('a', 'f4'), ('b', 'f4')])"),
-    *("t.numpy().astype(np.float16)", "t.numpy().astype(np.longdouble)", "t.numpy().astype('>f8')"),
-    *("np.broadcast_to(t.numpy()[:1], t.shape)", "list(t)", "[t, t[:1]]", "torch.nn.Parameter(t.float())"),
-)
+_VALUES = _expressions(r"""
+0 | -1 | math.nan | math.inf | -math.inf | 1e300 | -1e300 | 5e-324 | 1e-40 | 1e308 | 1e9 | 10**9 | 10**30 | 2**63
+-10**30 | 0.5 | True | np.int64(3) | np.float32(np.nan) | None | 'nonsense' | '' | 'a\0b' | 'x' * 100_000 | b'\xff\x00'
+1 + 2j | object() | [] | [[1, [2, 3]], 'x'] | {'a': 1} | {1, 2} | len | rsv.Vibration | [[1.0], [1.0, 2.0]]
+[None, None] | [math.nan, math.nan] | [1e300, 1e300] | [0, 0] | [-1, -1] | [10**9, 10**9] | [2, 2, 2] | (2, 3, 4, 5, 6)
+(number for number in (1.0, 2.0)) | torch.zeros(0) | torch.tensor(2.0) | torch.zeros((), device='meta') | '/'
+'/dev/zero' | b'/tmp/x' | '/tmp/' + 'x' * 5000 | rsv.Vibration.still() | rsv.Vibration.still((4,))
+rsv.Vibration(1e5, 50.0) | rsv.Vibration(1.0, 1e8) | rsv.Vibration(1.0, 50.0, image_motion=(1e5, 1e5))
+rsv.Vibration(torch.tensor([1.0, 1.0], requires_grad=True), 50.0) | rsv.SensorTiming(1e-9, 1.0, 104.0)
+rsv.SensorTiming(1e-4, 1.0, 10.0) | rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[0.0])
+rsv.SensorTiming(1e-4, 6, 104, frame_start_times=[1e9, 1e9 + 1, 1e9 + 2])
+rsv.SensorTiming(1e-4, 6, 104, scan_axis='x', readout_direction='reverse')
+""")
+_TENSORS = _expressions(r"""
+t.to('meta') | t.to_sparse() | t.flatten(0, -2).to_sparse_csr() if t.ndim > 1 else t.to_sparse()
+torch.nested.nested_tensor([t.float(), t.float()[:1]])
+torch.nested.nested_tensor([t.float(), t.float()[:1]], layout=torch.jagged)
+torch.quantize_per_tensor(t.float(), 0.01, 0, torch.quint8) | t.to(torch.complex64) | t > 0.5
+(100 * t).nan_to_num().to(torch.int64) | (100 * t.abs()).nan_to_num().to(torch.uint32)
+(100 * t.abs()).nan_to_num().to(torch.uint16) | t.half() | t.bfloat16() | t.float().to(torch.float8_e4m3fn)
+t.double() | t.float().requires_grad_() | torch.full_like(t, math.inf, dtype=torch.float32)
+torch.full_like(t, math.nan, dtype=torch.float32)
+t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.nan).reshape(t.shape)
+t.float().flatten().index_fill(0, torch.tensor([t.numel() // 2]), math.inf).reshape(t.shape) | t.float() * 1e38
+torch.full_like(t, 3e38, dtype=torch.float32) | t.double() * 1e300 | t.float() * 1e-40 | t.double() * 1e-300
+torch.zeros_like(t) | -t.float() | t[:0] | t[..., :0] | t[:1] | t[..., :1] | t[None, None, None]
+t[0] if t.ndim else t | t.transpose(0, -1) if t.ndim else t | t[:1].expand(t.shape) | t.numpy()[..., ::-1]
+t.numpy().astype(object) | np.ma.masked_invalid(t.numpy()) | t.numpy().astype(str)
+(1000 * t.numpy()).astype('datetime64[s]') | np.zeros(tuple(t.shape), dtype=[('a', 'f4'), ('b', 'f4')])
+t.numpy().astype(np.float16) | t.numpy().astype(np.longdouble) | t.numpy().astype('>f8')
+np.broadcast_to(t.numpy()[:1], t.shape) | list(t) | [t, t[:1]] | torch.nn.Parameter(t.float())
+""")
 
 
 def _candidates(value: Any) -> list[str]:
     """The hostile values for an argument with this valid value."""
     of_tensor = isinstance(value, (Tensor, np.ndarray))  # damaged tensors are most likely to pass the first checks
-    return [*_VALUES, *(_TENSORS * 2 if of_tensor else ())]
+    return _VALUES + (_TENSORS * 2 if of_tensor else [])
 
 
 def _hostile(expression: str, value: Any) -> Any:

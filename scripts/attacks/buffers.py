@@ -12,8 +12,6 @@ from test_shared_memory import CASES, FRAMES, ONLY_TENSORS, TIMING, test_results
 
 import rsvib_torch as rsv
 
-__all__ = ["attempt", "trials"]
-
 Item = tuple[str, int]  # case, and whether its arguments are arrays; or "tracker" and the number of buffers
 
 

@@ -7,31 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import FORMATS, Reference, content, process, server
+from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, process
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
-_READ_AT_ALL_TIMES = (
-    "TIFF",
-    "TIFF, zlib",
-    "npy",
-    "npy, frames skipped",
-    "HDF5",
-    "video",
-)  # one file, which is replaced
+# one file, which is replaced
+_READ_AT_ALL_TIMES = ("TIFF", "TIFF, zlib", "npy", "npy, frames skipped", "HDF5", "video")
 
 
-def _run(source: Path, sink: Path, options: dict[str, Any], delay: float, answers: Any) -> None:
+def _run(source: Path, sink: Path, options: dict[str, Any], delay: float) -> None:
     time.sleep(delay)
-    try:
-        process(source, sink, resume=True, **options)
-    except (OSError, ValueError) as error:
-        answers.put(("refused", str(error)))
-    except BaseException as error:
-        answers.put(("traceback", repr(error)))
-    else:
-        answers.put(("completed", ""))
+    process(source, sink, resume=True, **options)
 
 
 def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
@@ -40,33 +25,20 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
     for number in range(count):
         kind = list(FORMATS)[number % len(FORMATS)]
         name, options = FORMATS[kind]
-        place, answers = folder / "trial", server().SimpleQueue()
+        place = folder / "trial"
         place.mkdir()
         whole = content(reference.whole / name)
         delays = [choice.uniform(0.0, 0.3) for _ in range(3)]
-        arguments = [(reference.source, place / name, options, delay, answers) for delay in delays]
-        children = [server().Process(target=_run, args=one) for one in arguments]
-        for child in children:
-            child.start()
+        children = [Child(_run, reference.source, place / name, options, delay) for delay in delays]
         incomplete, end = "", time.monotonic() + 120.0
-        while any(child.exitcode is None for child in children) and time.monotonic() < end:
+        while any(child.runs for child in children) and time.monotonic() < end:
             if kind in _READ_AT_ALL_TIMES and (place / name).exists() and content(place / name) != whole:
                 incomplete = "a reader saw an incomplete output"
             time.sleep(0.002)
         title = f"{kind}: three runs after {', '.join(f'{delay:.3f}' for delay in delays)} s"
-        if any(child.exitcode is None for child in children):
-            for child in children:
-                child.kill()
-            yield Trial(title, "hang")
-            shutil.rmtree(place)
-            continue
-        found = [answers.get() for _ in children]
-        tracebacks = [detail for outcome, detail in found if outcome == "traceback" or "\n" in detail]
+        ends = [child.ended(0.0) for child in children]
         difference = incomplete or reference.difference(place, name)
-        if tracebacks:
-            yield Trial(title, "traceback", tracebacks[0])
-        elif difference or ("completed", "") not in found:
-            yield Trial(title, "wrong", difference or f"no run succeeded: {found}")
-        else:
-            yield Trial(title, "completed")
+        found = {one.outcome: one for one in (completed_or_refused(title, *end, difference) for end in ends)}
+        worst = next((found[one] for one in ("hang", "traceback", "wrong", "completed") if one in found), None)
+        yield worst or Trial(title, "wrong", f"no run succeeded: {ends}")
         shutil.rmtree(place)

@@ -24,8 +24,6 @@ from rsvib_torch.config import read_config
 from rsvib_torch.report.results import read_vibration
 from rsvib_torch.stacks import read_manifest
 
-__all__ = ["CASES", "crafted", "trials"]
-
 _SECONDS, _BYTES = 20.0, 2 * 10**9  # limits of one file: processor time, and memory for data
 _CAMERA = "[sensor]\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 104\nfull_scale = 4095\n"
 _DEEP = 20_000
@@ -47,15 +45,9 @@ def case(name: str) -> Callable[[Case], Case]:
     return add
 
 
-def _text(name: str, text: str, folder: Path) -> Path:
+def _data(name: str, data: str | bytes, folder: Path) -> Path:
     path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-def _data(name: str, data: bytes, folder: Path) -> Path:
-    path = folder / name
-    path.write_bytes(data)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
     return path
 
 
@@ -80,13 +72,8 @@ def _npy(shape: str, dtype: str = "'<u2'", order: str = "False", held: int = 100
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(held)
 
 
-for _order, _shape in product(
-    ("False", "True"),
-    (
-        *("(1000000000000, 64, 64)", "(9223372036854775807, 2, 2)", "(2, 0, 4)", "(-5, 8, 8)", f"({'9' * 400}, 8, 8)"),
-        *(f"({'2, ' * 60})", "(True, 8, 8)"),
-    ),
-):
+_SHAPES = ("(1000000000000, 64, 64)", f"({2**63 - 1}, 2, 2)", "(2, 0, 4)", "(-5, 8, 8)", f"({'9' * 400}, 8, 8)")
+for _order, _shape in product(("False", "True"), (*_SHAPES, f"({'2, ' * 60})", "(True, 8, 8)")):
     _case_of(f"npy: shape {_shape[:30]}, Fortran order {_order}", _npy(_shape, order=_order))
 for _dtype in ("'O'", "'<U1000000000'", "('<f4', (100000, 100000))", "'|S0'"):
     _case_of(f"npy: type {_dtype}", _npy("(2, 64, 64)", _dtype))
@@ -101,7 +88,7 @@ CASES["npy: 10^8 frames of one pixel"] = partial(_sparse, "a.npy", _npy("(100000
 def _raw(folder: Path, *, size: int = 1000, **keys: object) -> Path:
     content: dict[str, object] = {"format": "rsvib raw", "version": 1, "shape": [2, 16, 16], "axes": "THW"}
     content |= {"dtype": "uint16"} | keys
-    _text("a.raw.json", json.dumps(content), folder)
+    _data("a.raw.json", json.dumps(content), folder)
     return _sparse("a.raw", b"", size, folder)
 
 
@@ -111,7 +98,7 @@ for _offset in (2**32 - 1, 2**64 - 1):
     CASES[f"raw: offset {_offset}"] = partial(_raw, offset=_offset)
 CASES["raw: 10^6 frame times"] = partial(_raw, frame_times=[0.1 * i for i in range(10**6)])
 CASES["raw: sparse file of 64 GB"] = partial(_raw, size=2**36, shape=[8, 65536, 65536])
-CASES["raw: sidecar nested"] = lambda folder: (_raw(folder), _text("a.raw.json", "[" * _DEEP, folder))[0]
+CASES["raw: sidecar nested"] = lambda folder: (_raw(folder), _data("a.raw.json", "[" * _DEEP, folder))[0]
 CASES["raw: sidecar of 2 GB"] = lambda folder: (_raw(folder), _sparse("a.raw.json", b"{", 2 * 10**9, folder))[0]
 
 # --- PNG and JPEG -------------------------------------------------------------------------------------------------
@@ -131,14 +118,9 @@ def _png(width: int, height: int, bits: int = 8, colour: int = 0, pixels: int = 
 
 for _width, _height in ((2**31 - 1, 2**31 - 1), (1, 2**31 - 1), (10**6, 10**6), (0, 0)):
     for _bits, _colour in ((8, 0), (16, 6)):
-        _case_of(
-            f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}", _png(_width, _height, _bits, _colour)
-        )
-
-
-@case("PNG: 30000 x 30000 px in 1 MB")
-def _png_bomb(folder: Path) -> Path:
-    return _data("a.png", _png(30000, 30000, pixels=30001 * 30000), folder)
+        _named = f"PNG: {_width} x {_height} px, {_bits} bits, colour type {_colour}"
+        _case_of(_named, _png(_width, _height, _bits, _colour))
+CASES["PNG: 30000 x 30000 px in 1 MB"] = lambda folder: _data("a.png", _png(30000, 30000, pixels=30001 * 30000), folder)
 
 
 @case("PNG: folder of 200 bombs")
@@ -146,7 +128,7 @@ def _png_folder(folder: Path) -> Path:
     (folder / "frames").mkdir()
     bomb = _png(12000, 12000, pixels=12001 * 12000)
     for index in range(200):
-        (folder / "frames" / f"{index}.png").write_bytes(bomb)
+        _data(f"frames/{index}.png", bomb, folder)
     return folder / "frames"
 
 
@@ -292,24 +274,17 @@ def _links_to_root(file: h5py.File, count: int) -> None:
         file[f"link{index}"] = file["/"]
 
 
-def _chain(file: h5py.File, count: int) -> None:
-    group = file
-    for _ in range(count):
-        group = group.create_group("a")
-
-
 def _groups(file: h5py.File, count: int) -> None:
     for index in range(count):
         file.create_group(f"g{index}")
 
 
-def _zeros(file: h5py.File, shape: tuple[int, ...], **options: object) -> None:
-    file.create_dataset("frames", shape=shape, dtype="u2", **options)
+def _zeros(file: h5py.File, shape: tuple[int, ...], **options: object) -> h5py.Dataset:
+    return file.create_dataset("frames", shape=shape, dtype="u2", **options)
 
 
-def _filled(file: h5py.File, shape: tuple[int, ...], **options: object) -> None:
-    data = file.create_dataset("frames", shape=shape, dtype="u2", **options)
-    data[: max(1, shape[0] // 2)] = 1
+def _filled(file: h5py.File) -> None:
+    _zeros(file, (8, 64, 64), chunks=(1, 1, 1))[:4] = 1
 
 
 def _virtual(file: h5py.File, source: str) -> None:
@@ -319,31 +294,27 @@ def _virtual(file: h5py.File, source: str) -> None:
 
 
 def _times(file: h5py.File) -> None:
-    file.create_dataset("frames", data=np.zeros((4, 16, 16), "u2"))
+    _zeros(file, (4, 16, 16))[:] = 0
     file.create_dataset("timestamps", shape=(2**40,), dtype="f8", chunks=(1024,))
-
-
-def _external(file: h5py.File, name: str) -> None:
-    file.create_dataset("frames", shape=(4, 16, 16), dtype="u2", external=[(name, 0, h5py.h5f.UNLIMITED)])
 
 
 for _name, _write in {
     "25 groups linked to the root": partial(_links_to_root, count=25),
-    "2000 groups in each other": partial(_chain, count=2000),
+    "2000 groups in each other": lambda file: file.create_group("/".join("a" * 2000)),
     "20000 groups": partial(_groups, count=20_000),
     "no pixels stored, 2^60 bytes": partial(_zeros, shape=(2**25, 2**17, 2**17)),
     "chunk of 4 GB": partial(_zeros, shape=(100, 4000, 4000), chunks=(100, 4000, 4000), compression="gzip"),
-    "chunks of 1 x 1 x 1": partial(_filled, shape=(8, 64, 64), chunks=(1, 1, 1)),
+    "chunks of 1 x 1 x 1": _filled,
     "virtual dataset of a device": partial(_virtual, source="/dev/urandom"),
     "virtual dataset of itself": partial(_virtual, source="a.h5"),
     "2^40 times": _times,
-    "external file /dev/urandom": partial(_external, name="/dev/urandom"),
+    "external file /dev/urandom": partial(
+        _zeros, shape=(4, 16, 16), external=[("/dev/urandom", 0, h5py.h5f.UNLIMITED)]
+    ),
     "external link": lambda file: file.__setitem__("frames", h5py.ExternalLink("/dev/urandom", "/a")),
     "soft link to itself": lambda file: file.__setitem__("frames", h5py.SoftLink("/frames")),
     "dataset of type object": lambda file: file.create_dataset("frames", data=["a"] * 4, dtype=h5py.string_dtype()),
-    "attribute axes of 60 KB": lambda file: file.create_dataset("frames", data=np.zeros((2, 8, 8), "u2")).attrs.update(
-        {"axes": "T" * 60_000}
-    ),
+    "attribute axes of 60 KB": lambda file: _zeros(file, (2, 8, 8)).attrs.update({"axes": "T" * 60_000}),
 }.items():
     CASES[f"HDF5: {_name}"] = partial(_hdf5, write=_write)
 
@@ -373,21 +344,13 @@ CASES["Zarr: 96 KB that expand to 6.3 GB"] = partial(
     _zarr, held=96_000, shape=(96, 6000, 5500), chunk_grid=_chunks(1, 6000, 5500)
 )
 CASES["Zarr: chunk of 1 GB"] = partial(_zarr, held=96_000, shape=(512, 1024, 1024), chunk_grid=_chunks(512, 1024, 1024))
-CASES["Zarr: codecs in each other"] = partial(
-    _zarr,
-    codecs=json.loads(
-        '[{"name":"sharding_indexed","configuration":{"chunk_shape":[1,16,16],"codecs":' * 200
-        + '[{"name":"bytes"}]'
-        + "}}]" * 200
-    ),
-)
+_NESTED = '[{"name":"sharding_indexed","configuration":{"chunk_shape":[1,16,16],"codecs":' * 200
+_NESTED += '[{"name":"bytes"}]' + "}}]" * 200
+CASES["Zarr: codecs in each other"] = partial(_zarr, codecs=json.loads(_NESTED))
 CASES["Zarr: unknown codec"] = partial(_zarr, codecs=[{"name": "pickle"}])
 CASES["Zarr: attribute of 20 MB"] = partial(_zarr, attributes={"axes": "T" * (20 * 10**6)})
 for _header in ("[" * _DEEP, '{"a":' * _DEEP, '{"shape": ' + "9" * 10**6 + "}"):
-    CASES[f"Zarr: header {_header[:15]}"] = lambda folder, text=_header: (
-        _zarr(folder),
-        _text("a.zarr/zarr.json", text, folder),
-    )[0]
+    CASES[f"Zarr: header {_header[:15]}"] = lambda folder, text=_header: _data("zarr.json", text, _zarr(folder)).parent
 CASES["Zarr: header is a pipe"] = lambda folder: _piped(_zarr(folder), "zarr.json")
 CASES["Zarr: chunk is a pipe"] = lambda folder: _piped(_zarr(folder), "c/0/0/0")
 CASES["Zarr: chunk is a link to a device"] = lambda folder: _linked(_zarr(folder), "c/0/0/0", "/dev/urandom")
@@ -457,8 +420,8 @@ def _video_frames(folder: Path) -> Path:
     return _data("a.avi", bytes(data), folder)
 
 
-CASES["video: playlist"] = partial(_text, "a.mp4", "#EXTM3U\n/dev/urandom\n")
-CASES["video: list of files"] = partial(_text, "a.mkv", "ffconcat version 1.0\nfile /dev/urandom\n")
+CASES["video: playlist"] = partial(_data, "a.mp4", "#EXTM3U\n/dev/urandom\n")
+CASES["video: list of files"] = partial(_data, "a.mkv", "ffconcat version 1.0\nfile /dev/urandom\n")
 CASES["video: zeros"] = partial(_sparse, "a.mp4", b"", 10**9)
 CASES["video: zeros after a header of .ts"] = partial(_sparse, "a.mts", b"G" + bytes(187), 10**9)
 
@@ -501,7 +464,7 @@ for _name, _words in {
     "amplitude = [1.0, 1.0]\nfrequency = [50.0, 50.0]\n",
     "zero bytes": "\0" * 10**6,
 }.items():
-    CASES[f"TOML: {_name}"] = partial(_text, "a.toml", _words)
+    CASES[f"TOML: {_name}"] = partial(_data, "a.toml", _words)
 CASES["TOML: 64 GB"] = partial(_sparse, "a.toml", b"#", 2**36)
 for _kind in ("vibration", "manifest"):
     for _name, _words in {
@@ -514,7 +477,7 @@ for _kind in ("vibration", "manifest"):
         + ",".join(["[" + ",".join(["1.0"] * 10**5) + "]"] * 2)
         + "]}}",
     }.items():
-        CASES[f"{_kind}: {_name}"] = partial(_text, f"a.{_kind}.json", _words)
+        CASES[f"{_kind}: {_name}"] = partial(_data, f"a.{_kind}.json", _words)
 for _name, _words in {
     "field of 10 MB": 'time,x,y\n"' + "1" * 10**7,
     "times of 10^300 s": "time,x,y\n" + "".join(f"{n}e300,0,0\n" for n in range(5)),
@@ -522,7 +485,7 @@ for _name, _words in {
     "10^5 lines": "time,x,y\n" + "".join(f"{n / 1000},0,0\n" for n in range(10**5)),
     "open quotation": 'time,x,y\n"' + "\n" * 10**5,
 }.items():
-    CASES[f"CSV: {_name}"] = partial(_text, "a.csv", _words)
+    CASES[f"CSV: {_name}"] = partial(_data, "a.csv", _words)
 
 
 def attempt(folder: Path, path: Path) -> str:

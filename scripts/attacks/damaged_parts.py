@@ -8,8 +8,6 @@ from pathlib import Path
 from attacks.small_runs import FORMATS, Reference, kill_run, resumed_trial
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
 _DAMAGES = ("deleted", "truncated", "emptied", "zeroed", "bit flipped", "swapped", "extended")
 
 

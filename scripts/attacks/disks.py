@@ -15,8 +15,6 @@ from pathlib import Path
 from attacks.small_runs import FORMATS, Reference, content, fork, process
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
 _TESTS = Path(__file__).parents[2] / "tests"
 _PAGES = (2, 9, 20, 37, 52, 58, 70, 106, 114, 125)  # of 4 KiB that are left; windows and output have 55 to 60 each
 
@@ -26,12 +24,8 @@ def _unshare() -> list[str] | None:
         return None
     for options in ("-m", "-rm"):
         command = ["unshare", options, "sh", "-c"]
-        if (
-            subprocess.run(
-                [*command, "mount -t tmpfs -o size=64k none /mnt"], capture_output=True, check=False
-            ).returncode
-            == 0
-        ):
+        mount = [*command, "mount -t tmpfs -o size=64k none /mnt"]
+        if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
             return command
     return None
 

@@ -16,8 +16,6 @@ from torch import Tensor
 
 import rsvib_torch as rsv
 
-__all__ = ["attempt", "trials"]
-
 _FUNCTIONS = (rsv.detect_vibration, rsv.detect_motion, rsv.detect_swept_tone)
 _SIZE = 128  # px
 # images of rows y, columns x and a random number n, which move by a few px per frame

@@ -11,8 +11,6 @@ from typing import Any
 from attacks.small_runs import FORMATS, Reference, completed_or_refused, content, fork, kill_run, resume
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
 _JOURNAL = "journal"
 _VALUES: dict[str, str] = {
     "null": "null", "true": "true", "text": '"text"', "empty text": '""', "negative": "-1", "fraction": "0.5",
@@ -45,10 +43,6 @@ def _of_window(work: Path, change: Callable[[bytes], bytes]) -> None:
     _of_lines(work, lambda lines: [lines[0], change(lines[1]), *lines[2:]])
 
 
-def _copied(work: Path, source: str, target: str) -> None:
-    shutil.copyfile(work / source, work / target)
-
-
 def _as(work: Path, name: str, make: Callable[[Path], Any]) -> None:
     (work / name).unlink()
     make(work / name)
@@ -58,7 +52,7 @@ def _attacks() -> dict[str, Callable[[Path], None]]:
     """Changes of a work folder, by name."""
     found: dict[str, Callable[[Path], None]] = {}
 
-    def add(title: str, function: Callable[..., None], *arguments: Any) -> None:
+    def add(title: str, function: Callable[..., Any], *arguments: Any) -> None:
         found[title] = lambda work: function(work, *arguments)
 
     for value, text in _VALUES.items():
@@ -86,7 +80,7 @@ def _attacks() -> dict[str, Callable[[Path], None]]:
     add("windows in another order", _of_lines, lambda lines: [lines[0], *lines[:0:-1]])
     add("window 0 again at the end", _of_lines, lambda lines: [*lines, lines[1]])
     add("last line is incomplete", _of_lines, lambda lines: [*lines[:-1], lines[-1][:-9]])
-    add("a file of another name", _copied, _JOURNAL, "more.txt")
+    add("a file of another name", lambda work: shutil.copyfile(work / _JOURNAL, work / "more.txt"))
     for name in (_JOURNAL, "000000.npy"):
         add(f"{name} is a folder", _as, name, lambda path: path.mkdir())
         add(f"{name} is a pipe", _as, name, os.mkfifo)
@@ -125,7 +119,5 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 def _listing(folder: Path) -> dict[str, Any]:
     """Names, kinds and content of everything in a folder."""
     files = {str(path.relative_to(folder)): path.lstat().st_mode for path in folder.rglob("*")}
-    regular = {
-        name: mode for name, mode in files.items() if (folder / name).is_file() and not (folder / name).is_symlink()
-    }
+    regular = [name for name in files if (folder / name).is_file() and not (folder / name).is_symlink()]
     return {**files, "content": {name: content(folder / name) for name in regular}}

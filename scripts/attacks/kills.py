@@ -7,6 +7,7 @@ from pathlib import Path
 
 from attacks.small_runs import (
     FORMATS,
+    Child,
     Reference,
     calls_of,
     content,
@@ -16,8 +17,6 @@ from attacks.small_runs import (
     resumed_trial,
 )
 from attacks.trial import Trial
-
-__all__ = ["trials"]
 
 _LONGEST = 0.6  # s; a run takes 0.2 to 0.5 s on an idle core
 
@@ -30,22 +29,19 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         name, options = FORMATS[kind]
         place = folder / "trial"
         place.mkdir()
-        moments = []
+        moments, arguments = [], (reference.source, place / name, {**options, "resume": True})
         for _ in range(2 if number % 3 == 0 else 1):
             if number % 2:
                 moment = choice.uniform(0.0, _LONGEST)
-                fork(counted_run, reference.source, place / name, {**options, "resume": True}, 0, seconds=moment)
+                Child(counted_run, *arguments, 0).ended(moment)
                 moments.append(f"{moment:.4f} s")
             else:
                 call = choice.randint(1, calls_of(reference, kind))
-                fork(counted_run, reference.source, place / name, {**options, "resume": True}, call)
+                fork(counted_run, *arguments, call)
                 moments.append(f"call {call}")
-        yield _resumed(reference, place, kind, f"{kind}, killed at {' and '.join(moments)}")
+        title, out = f"{kind}, killed at {' and '.join(moments)}", place / name
+        if kind != "PNG folder" and out.exists() and content(out) != content(reference.whole / name):
+            yield Trial(title, "wrong", "an incomplete output has its name")
+        else:
+            yield resumed_trial(reference, place, kind, title, finished_windows(place, name))
         shutil.rmtree(place)
-
-
-def _resumed(reference: Reference, place: Path, kind: str, title: str) -> Trial:
-    name = FORMATS[kind][0]
-    if kind != "PNG folder" and (place / name).exists() and content(place / name) != content(reference.whole / name):
-        return Trial(title, "wrong", "an incomplete output has its name")
-    return resumed_trial(reference, place, kind, title, finished_windows(place, name))

@@ -8,26 +8,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from attacks.small_runs import (
-    FORMATS,
-    Reference,
-    completed_or_refused,
-    content,
-    counted_run,
-    fork,
-    kill_run,
-    process,
-    resume,
-    server,
-)
+from attacks.small_runs import FORMATS, Child, Reference, completed_or_refused, content, fork, kill_run, process, resume
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
-_TARGETS = dict.fromkeys(
-    ("TIFF", "npy, frames skipped", "video"),
-    ("journal", "000000.npy", "000004.npy", "out.tif"),
-)
+_TARGETS = dict.fromkeys(("TIFF", "npy, frames skipped", "video"), ("journal", "000000.npy", "000004.npy", "out.tif"))
 
 
 def _victim(folder: Path) -> Path:
@@ -74,17 +58,14 @@ def trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
 def _of_the_folder(folder: Path, reference: Reference) -> Iterator[Callable[[], Trial]]:
     """The name of the work folder belongs to something else."""
     place, victim = folder / "trial", folder / "victim"
+    links = {"link to a folder": "", "link to a file": "precious.txt", "link to nothing": "missing"}
 
     def attack(kind: str, what: str, again: bool) -> Trial:
         name, options = FORMATS[kind]
         place.mkdir()
         work, before = place / f".{name}.rsvib", content(_victim(victim))
-        if what == "link to a folder":
-            work.symlink_to(victim)
-        elif what == "link to a file":
-            work.symlink_to(victim / "precious.txt")
-        elif what == "link to nothing":
-            work.symlink_to(victim / "missing")
+        if what in links:
+            work.symlink_to(victim / links[what])
         elif what == "file":
             os.link(victim / "precious.txt", work)
         elif what == "pipe":
@@ -92,17 +73,13 @@ def _of_the_folder(folder: Path, reference: Reference) -> Iterator[Callable[[], 
         else:  # a folder of the user
             victim.rename(work)
         watched = work if what == "folder of the user" else victim
-        code, result = fork(resume if again else process, reference.source, place / name, **_arguments(options, again))
+        resumed = {"resume": True} if again else {}
+        code, result = fork(process, reference.source, place / name, **options, **resumed)
         return _judged(f"{kind}: work folder is a {what}", watched, before, code, result, "written nevertheless")
 
-    whats = ("link to a folder", "link to a file", "link to nothing", "file", "pipe", "folder of the user")
-    for number, what in enumerate(whats):
+    for number, what in enumerate((*links, "file", "pipe", "folder of the user")):
         for kind in list(FORMATS)[number % 2 :: 2]:
             yield lambda kind=kind, what=what, again=bool(number % 2): attack(kind, what, again)
-
-
-def _arguments(options: dict[str, Any], again: bool) -> dict[str, Any]:
-    return {"options": options} if again else options
 
 
 def _in_the_folder(folder: Path, reference: Reference, choice: random.Random) -> Iterator[Callable[[], Trial]]:
@@ -133,9 +110,8 @@ def _replaced_meanwhile(folder: Path, reference: Reference, moment: float) -> Ca
         name, options = FORMATS[kind]
         place.mkdir()
         work, before = place / f".{name}.rsvib", content(_victim(victim))
-        child = server().Process(target=counted_run, args=(reference.source, place / name, options, 0))
-        child.start()
-        while not work.exists() and child.exitcode is None:
+        child = Child(process, reference.source, place / name, **options)
+        while not work.exists() and child.runs:
             time.sleep(0.001)
         time.sleep(moment)
         try:
@@ -143,10 +119,9 @@ def _replaced_meanwhile(folder: Path, reference: Reference, moment: float) -> Ca
             work.symlink_to(victim)
         except OSError:
             pass  # the run has ended
-        child.join(60)
-        code = 0 if child.exitcode == 0 else 2 if child.exitcode == 1 else None
+        code, result = child.ended()
         difference = "" if content(place / name) == content(reference.whole / name) else "the output differs"
         title = f"{kind}: work folder replaced by a link after {moment:.3f} s"
-        return _judged(title, victim, before, code, "", difference if code == 0 else "")
+        return _judged(title, victim, before, code, result, difference if code == 0 else "")
 
     return attack

@@ -22,8 +22,6 @@ import cv2
 import numpy as np
 from attacks.trial import Outcome, Process, Trial, outcome_of_command, rsvib
 
-__all__ = ["trials"]
-
 _SIZE, _RATE = 128, 30  # px, frames/s
 _RECORDED = (12, 40)  # frames in the file, after which a session is ended
 _WAITING = 4  # frames that may be missing at the end of a recording: those in queues, and an incomplete one

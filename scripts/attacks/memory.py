@@ -14,8 +14,6 @@ from attacks.trial import Trial, outcome_of_command, rsvib, run_watched
 import rsvib_torch as rsv
 from rsvib_torch.stacks.memory import memory_needed
 
-__all__ = ["LAYOUTS", "trials"]
-
 _SIZE, _FRAMES, _WINDOW = 512, 64, 4  # px; 34 MB of 16 bits
 _FRAME, _STACK = (1, _SIZE, _SIZE), (_FRAMES, _SIZE, _SIZE)  # shapes of chunks
 _TIMING = rsv.SensorTiming(row_time=4e-5, exposure_rows=20, frame_rows=560)
@@ -34,17 +32,13 @@ tones = 1
 """
 
 
-def _write_fortran(path: Path, counts: Counts) -> None:
-    np.save(path, np.asfortranarray(counts))
-
-
 # Layout, name of the file, and function that writes it.
 LAYOUTS: dict[str, tuple[str, Callable[[Path, Counts], None]]] = {
     "TIFF, contiguous": ("a.tif", partial(write_tiff, contiguous=True)),
     "TIFF, pages, zlib": ("b.tif", partial(write_tiff, metadata={}, compression="zlib")),
     "TIFF, tiled, zlib": ("c.tif", partial(write_tiff, metadata={}, compression="zlib", tile=(64, 64))),
     "npy, C order": ("f.npy", np.save),
-    "npy, Fortran order": ("g.npy", _write_fortran),
+    "npy, Fortran order": ("g.npy", lambda path, counts: np.save(path, np.asfortranarray(counts))),
     "HDF5, contiguous": ("h.h5", write_hdf5),
     "HDF5, chunk per frame": ("i.h5", partial(write_hdf5, chunks=_FRAME, compression="gzip")),
     "HDF5, one chunk": ("j.h5", partial(write_hdf5, chunks=_STACK, compression="gzip", compression_opts=1)),

@@ -35,8 +35,6 @@ from rsvib_torch.config import read_config
 from rsvib_torch.io import open_stack
 from rsvib_torch.report.results import read_vibration
 
-__all__ = ["ORIGINALS", "attempt", "damage", "trials", "write_originals"]
-
 SECONDS, MEMORY = 10.0, 1 << 30  # limits of one trial
 CONFIG = """
 [sensor]

@@ -29,8 +29,6 @@ from attacks.small_runs import (
 )
 from attacks.trial import Trial
 
-__all__ = ["trials"]
-
 
 def _recorded_run(source: Path, sink: Path, options: dict[str, Any], root: Path, records: Path, die_at: int) -> int:
     """Process the stack; record what is synchronised below ``root``, and die at a call."""

@@ -4,6 +4,4 @@ from functools import partial
 
 from attacks import mutated
 
-__all__ = ["trials"]
-
 trials = partial(mutated.trials, run_every=0, names=("motion.csv", "rates.csv", "clip.gcsv", "clip.mp4"))

@@ -122,35 +122,47 @@ def _call(function: Callable[..., Any], arguments: tuple[Any, ...], options: dic
     try:
         result = function(*arguments, **options)
     except (ValueError, TypeError, OSError) as error:
-        channel.send(("refused", str(error)))
+        channel.send((2, str(error)))
     except BaseException as error:
-        channel.send(("traceback", repr(error)))
+        channel.send((1, repr(error)))
     else:
-        channel.send(("completed", result if isinstance(result, (int, str)) else ""))
+        channel.send((0, result if isinstance(result, (int, str)) else ""))
 
 
-def fork(
-    function: Callable[..., Any], *arguments: Any, seconds: float | None = None, **options: Any
-) -> tuple[Any, Any]:
-    """Call a function in a child process; returns its exit code, and its result or message.
+class Child:
+    """A function that runs in a child process."""
 
-    The code is 0 after a success, 2 after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another exception,
-    and None if the process was killed after ``seconds``.
-    """
-    receiving, sending = server().Pipe(duplex=False)
-    child = server().Process(target=_call, args=(function, arguments, options, sending))
-    child.start()
-    sending.close()
-    child.join(LIMIT if seconds is None else seconds)
-    if child.exitcode is None:
-        child.kill()
-        child.join()
-        return (None, "killed after the time limit")
-    try:
-        outcome, result = receiving.recv()
-    except EOFError:
-        return child.exitcode, ""
-    return {"completed": 0, "refused": 2, "traceback": 1}[outcome], result
+    def __init__(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+        self._answer, sending = server().Pipe(duplex=False)
+        self._process = server().Process(target=_call, args=(function, arguments, options, sending))
+        self._process.start()
+        sending.close()
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended yet."""
+        return self._process.exitcode is None
+
+    def ended(self, seconds: float = LIMIT) -> tuple[Any, Any]:
+        """Exit code, and result or message, of a process that is killed after some seconds.
+
+        The code is 0 after a success, 2 after a ``ValueError``, ``TypeError`` or ``OSError``, 1 after another
+        exception, and None if the process was killed.
+        """
+        self._process.join(seconds)
+        if self.runs:
+            self._process.kill()
+            self._process.join()
+            return (None, "killed after the time limit")
+        try:
+            return self._answer.recv()
+        except EOFError:
+            return self._process.exitcode, ""
+
+
+def fork(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Any, Any]:
+    """Call a function in a child process; returns what ``Child.ended`` does."""
+    return Child(function, *arguments, **options).ended()
 
 
 def count_file_calls(die_at: int, after: Callable[[str, Any], None] | None = None) -> list[int]:

@@ -10,8 +10,6 @@ from typing import Literal, get_args
 
 import psutil
 
-__all__ = ["FAILURES", "OUTCOMES", "Outcome", "Process", "Trial", "outcome_of_command", "rsvib", "run_watched"]
-
 Outcome = Literal["completed", "refused", "lost", "wrong", "traceback", "hang", "memory"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 FAILURES = OUTCOMES[2:]

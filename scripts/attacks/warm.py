@@ -17,8 +17,6 @@ import psutil
 import torch
 from attacks.trial import Trial
 
-__all__ = ["in_warm_child"]
-
 Attempt = Callable[[Path, Any], str]
 
 

@@ -15,8 +15,6 @@ from attacks.trial import Trial
 import rsvib_torch as rsv
 from rsvib_torch.stacks import engines
 
-__all__ = ["trials"]
-
 _FRAMES, _WINDOW = 33, 3
 _SECONDS = 150.0  # limit of a trial
 

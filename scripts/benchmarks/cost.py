@@ -27,6 +27,7 @@ OPTIONS = {
 }
 QUICK = {"cost_size": 128, "cost_inputs": 2}
 SEED, NOISE = 5, 0.005
+CITY = partial(city_and_fields, seed=SEED)
 PLAIN_SEED, MARGIN = 11, 40  # of the plain vibration whose time is measured in round trips; px
 BOUND = 3.0  # times the time of the plain recording
 OF_CLASSES = {  # recordings (class, number) of honesty_cases
@@ -83,15 +84,11 @@ def _of_class(size: int, name: str, number: int) -> Input:
     return Input(_frames(taken.frames), taken.timing, *_plain(size, len(taken.frames)))
 
 
-def _city(height: int, width: int) -> torch.Tensor:
-    return city_and_fields(height, width, seed=SEED)
-
-
 def _simulated(
     size: int,
     height: int = 0,
     width: int = 0,
-    draw: Callable[[int, int], torch.Tensor] = _city,
+    draw: Callable[[int, int], torch.Tensor] = CITY,
     exposure: float = 20.0,
     amplitude: tuple[float, ...] = (1.5, 1.2),
 ) -> Input:
@@ -210,9 +207,7 @@ def plain_rows(options: argparse.Namespace) -> Rows:
         taken = frames.to(device)
         tasks = {"round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]))}
         for method, count in itertools.product(("bands", "direct"), (2, 4)):
-            tasks[f"{method}, {count} frames"] = lambda m=method, f=taken[:count]: rsv.detect_vibration(
-                f, timing, method=m
-            )
+            tasks[f"{method}, {count} frames"] = partial(rsv.detect_vibration, taken[:count], timing, method=method)
         done = in_turns(tasks, options.runs)
         unit = done["round trip"].seconds
         results += [

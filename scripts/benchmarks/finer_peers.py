@@ -68,8 +68,6 @@ def drizzled(frames: torch.Tensor, timing: rsv.SensorTiming, vibration: rsv.Vibr
     for fraction in FRACTIONS:
         drops = Drizzle(kernel="square", out_shape=shape, fillval="0")
         for frame, column, row in zip(frames.numpy(), columns, rows, strict=True):
-            drops.add_image(
-                frame.astype(np.float32), exptime=1.0, pixmap=np.stack([column, row], axis=-1), pixfrac=fraction
-            )
+            drops.add_image(frame.astype(np.float32), exptime=1.0, pixmap=np.stack([column, row], -1), pixfrac=fraction)
         image, weight = np.asarray(drops.out_img, float), np.asarray(drops.out_wht, float)
         yield np.where(weight > 0, image, _filled(image * weight, weight, 1.0))

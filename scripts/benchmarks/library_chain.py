@@ -129,9 +129,8 @@ def kernel_of_row(vibration: rsv.Vibration, start: float, timing: rsv.SensorTimi
     """
     count = int(np.ceil(timing.exposure_rows))
     times = start + (np.arange(count) + 0.5) / count * timing.exposure_time
-    amplitude, frequency, phase = (
-        values[:, 0].numpy() for values in (vibration.amplitude, vibration.frequency, vibration.phase)
-    )
+    tone = vibration.amplitude, vibration.frequency, vibration.phase
+    amplitude, frequency, phase = (values[:, 0].numpy() for values in tone)
     x, y = amplitude[:, None] * np.sin(2 * np.pi * frequency[:, None] * times + phase[:, None])
     y = y - moved
     half = [int(np.floor(np.abs(values).max())) + 1 for values in (y, x)]

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from benchmarks import independent_camera
 from benchmarks.independent_camera import Array, Shake, closed, fine_rows
+from benchmarks.pipeline import camera
 from harness import Rows, one_thread, table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from skimage.registration import phase_cross_correlation
@@ -64,10 +65,7 @@ AMPLITUDE, FREQUENCY = {"x": 3.1, "y": 5.2}, {"x": 50.0, "y": 30.0}  # px, Hz
 PERIOD = {"x": 20.0, "y": 33.33}  # ms, as printed in Table 1
 DETECTED = {
     "chart": {"x": Detected(20.048, 3.147, 0.653, 0.242, 1.526), "y": Detected(33.280, 5.195, 1.234, 0.161, 0.096)},
-    "landscape": {
-        "x": Detected(19.890, 3.084, 0.638, 0.551, 0.519),
-        "y": Detected(33.122, 5.211, 1.227, 0.635, 0.218),
-    },
+    "landscape": {"x": Detected(19.890, 3.084, 0.638, 0.551, 0.519), "y": Detected(33.122, 5.211, 1.227, 0.635, 0.218)},
 }
 RESTORED = {
     "chart": {
@@ -140,12 +138,6 @@ def draw(target: str, size: Sequence[int], image_motion: float = 0.0) -> Scene:
     samples = closed(drawn.double().numpy(), (BORDER - 8) * PITCH)
     still = samples[down : height - down : PITCH, across : width - across : PITCH]
     return Scene(samples, fine_rows(samples, CAMERA["between"]), still)
-
-
-def camera(rows: int, exposure_rows: float = EXPOSURE_ROWS) -> rsv.SensorTiming:
-    """The paper's camera; fewer rows are slower, so that frame period and exposure time are unchanged."""
-    slower = FRAME_ROWS / rows
-    return rsv.SensorTiming(row_time=ROW_TIME * slower, exposure_rows=exposure_rows / slower, frame_rows=rows)
 
 
 def taken(scene: Scene, shake: Shake, timing: Any, count: int = 2) -> Array:
@@ -285,7 +277,7 @@ def trials(
 ) -> Rows:
     """Detection and restoration of two frames by all methods for all noises; without edges (None) detection only."""
     shake = shake_of(case["seed"], case["speed"] * (-1) ** case["seed"])
-    clean = taken(scene, shake, camera(len(scene.still)))
+    clean = taken(scene, shake, camera(EXPOSURE_ROWS, len(scene.still)))
     return [row for noise in noises for row in trial(scene, shake, clean, case | {"noise": noise}, edges)]
 
 
@@ -294,7 +286,7 @@ def trial(
 ) -> Rows:
     """Detection and restoration of two frames with one noise."""
     array = counts_of(clean, case["noise"], case["seed"])
-    frames, timing = torch.from_numpy(array).float(), camera(len(scene.still))
+    frames, timing = torch.from_numpy(array).float(), camera(EXPOSURE_ROWS, len(scene.still))
     found = {name: rsv.detect_vibration(frames, timing, **options) for name, (options, _) in METHODS.items()}
     results = [
         {"part": "detection", **case, "method": name, "axis": axis, **values}
@@ -331,9 +323,7 @@ def global_shutter(frames: int = 24, candidates: int = 4000) -> Rows:
     images = counts_of(taken(scene, shake, GlobalShutter(0.0, EXPOSURE_ROWS * ROW_TIME, period), frames), 0.005, 0)
     fade = np.outer(*(np.hanning(size) for size in scene.still.shape))
     windowed = [(frame - frame.mean()) * fade for frame in images]
-    apart = [
-        phase_cross_correlation(frame, windowed[0], upsample_factor=100, normalization=None)[0] for frame in windowed
-    ]
+    apart = [phase_cross_correlation(one, windowed[0], upsample_factor=100, normalization=None)[0] for one in windowed]
     times, results = np.arange(frames) * period, []
     for axis, moved in zip("yx", np.array(apart).T, strict=True):
         left = []
@@ -420,9 +410,7 @@ def restoration_cells(results: Rows) -> list[list[Any]]:
                 of_frame = chosen(results, target=target, frame=frame)
                 before = [row[name] for row in chosen(of_frame, method=DEGRADED)]
                 after = {m: [row[name] for row in chosen(of_frame, method=m)] for m in (*METHODS, JOINT)}
-                gains = {
-                    m: [100 * (a / b - 1) for a, b in zip(found, before, strict=True)] for m, found in after.items()
-                }
+                gains = {m: [100 * (a / b - 1) for a, b in zip(of_m, before, strict=True)] for m, of_m in after.items()}
                 still = chosen(results, target=target, method=STILL)[0][name]
                 digits, first = 2 if name == "psnr" else 4, [TARGETS[target], METRICS[name], column]
                 better, spreads = compared(printed.restored[frame], after, digits, higher=True)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import psutil
+import torch
 from harness import Rows, plain_environment, table
 
 import rsvib_torch as rsv
@@ -48,14 +49,6 @@ RESTORATIONS: list[dict[str, Any]] = [
     {"method": "richardson-lucy"},
     {"method": "richardson-lucy", "joint": 3},
 ]
-_RUN = """
-import json, sys
-import torch
-from benchmarks import streaming
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    print(json.dumps(streaming.one_run(**json.loads(sys.argv[1]))))
-"""
 
 
 def timing_of(size: int) -> rsv.SensorTiming:
@@ -123,15 +116,9 @@ def one_run(source: str, sink: str, size: int, dask_workers: int = 0, **options:
 
 
 def run_apart(**arguments: Any) -> dict[str, Any]:
-    """``one_run`` in a separate process."""
-    with tempfile.NamedTemporaryFile("w", suffix=".py") as program:
-        program.write(_RUN)
-        program.flush()
-        folder = str(Path(__file__).parents[1])
-        environment = plain_environment()
-        environment["PYTHONPATH"] = f"{folder}:{environment.get('PYTHONPATH', '')}"
-        command = [sys.executable, program.name, json.dumps(arguments)]
-        done = subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True, text=True)
+    """``one_run`` in a separate process, which is this module as a program."""
+    command, folder = [sys.executable, "-m", "benchmarks.streaming", json.dumps(arguments)], Path(__file__).parents[1]
+    done = subprocess.run(command, cwd=folder, env=plain_environment(), check=True, capture_output=True, text=True)
     result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return result
 
@@ -184,3 +171,8 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
         "",
         *table(("run", *columns, "same bytes as without Dask"), cells),
     ]
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(json.dumps(one_run(**json.loads(sys.argv[1]))))

@@ -182,9 +182,7 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     chosen: dict[tuple[str, int], Rows] = {}
     for case in results:
         chosen.setdefault((case["mistake"], case["num_frames"]), []).append(case)
-    correct = {
-        (case["scene"], case["number"], case["num_frames"]): case for case in results if case["mistake"] == "none"
-    }
+    correct = {(one["scene"], one["number"], one["num_frames"]): one for one in results if one["mistake"] == "none"}
 
     def detected(name: str, cases: Rows) -> str:
         named = 100 * np.mean([one for case in cases for one in case["named"]])

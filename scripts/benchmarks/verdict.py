@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from benchmarks.finer import decibel
 from benchmarks.independent_camera import Shake, closed, take_frames
 from harness import Rows, one_thread, table
+from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 import rsvib_torch as rsv
@@ -77,12 +79,6 @@ def as_vibration(arrays: Arrays) -> rsv.Vibration:
     return rsv.Vibration(np.abs(arrays["amplitude"]).tolist(), arrays["frequency"].tolist(), phase.tolist())
 
 
-def psnr(images: Tensor, still: Tensor) -> float:
-    """PSNR in dB of all frames, without the rim."""
-    inner = (..., slice(RIM, -RIM), slice(RIM, -RIM))
-    return float(-10 * torch.log10((images[inner].double() - still[inner]).square().mean()))
-
-
 def cases(draw: int) -> Rows:
     """All hypotheses on one random recording of two frames: verdict, its scores, and the true gain in dB."""
     generator = np.random.default_rng(draw)
@@ -96,7 +92,7 @@ def cases(draw: int) -> Rows:
     taken = take_frames(periodic, Shake.of(vibration), timing, 2, (HEIGHT, WIDTH))
     frames = torch.from_numpy(taken + noise * generator.standard_normal(taken.shape)).float()
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN].double()
-    raw = psnr(frames, still)
+    raw = decibel(frames, still.numpy(), RIM)
     found = []
     for name, (group, hypothesis, options) in HYPOTHESES.items():
         claimed = as_vibration(hypothesis(truth, generator))
@@ -110,24 +106,16 @@ def cases(draw: int) -> Rows:
                 "exposure_rows": exposure,
                 "noise": noise,
                 "raw_db": raw,
-                "gain_db": psnr(restored, still) - raw,
+                "gain_db": decibel(restored, still.numpy(), RIM) - raw,
                 "moves": (claimed.amplitude[:, 0] > 0).tolist(),
                 "outcome": verdict.overall,
                 "reason": verdict.reasons[0],
                 "predicted_gain": float(verdict.predicted_gain),
                 "chi_square": float(verdict.chi_square),
-                **{
-                    name: getattr(verdict, name)[0].tolist() for name in ("misfit_before", "misfit_after", "resolution")
-                },
+                **{key: getattr(verdict, key)[0].tolist() for key in ("misfit_before", "misfit_after", "resolution")},
             }
         )
     return found
-
-
-def area_under_curve(score: Tensor, positive: Tensor) -> float:
-    """Probability that a positive case has a higher score than a negative one, ties counted by half."""
-    high, low = score[positive][:, None], score[~positive]
-    return float((high > low).double().mean() + 0.5 * (high == low).double().mean())
 
 
 def best_threshold(score: Tensor, positive: Tensor) -> tuple[float, float, float]:
@@ -183,7 +171,8 @@ def lines(results: Rows, options: argparse.Namespace, tie: float = 0.3) -> list[
         if not bool(truth.any()) or bool(truth.all()):
             continue  # no curve without both kinds of cases
         threshold, sensitivity, specificity = best_threshold(values, truth)
-        area = area_under_curve(values, truth)
+        # the probability that a positive case has a higher score than a negative one, ties counted by half
+        area = mannwhitneyu(values[truth], values[~truth]).statistic / (int(truth.sum()) * int((~truth).sum()))
         rates = (f"{value:.2f}" for value in (threshold, sensitivity, specificity))
         curves.append((name, f"{area:.3f}", *rates, len(truth)))
     heads = ("score", "area under the curve", "best threshold", "sensitivity", "specificity", "cases")

@@ -8,7 +8,6 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -21,10 +20,7 @@ import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
 from rsvib_torch.video import process_video
 
-OPTIONS = {
-    "video_frames": (300, "video: frames"),
-    "video_rows": (1080, "video: rows, 16:9"),
-}
+OPTIONS = {"video_frames": (300, "video: frames"), "video_rows": (1080, "video: rows, 16:9")}
 QUICK = {"video_frames": 12, "video_rows": 180}
 MARGIN, SEED, NOISE = 32, 3, 0.004
 EXPOSURE_ROWS = 15
@@ -77,14 +73,10 @@ def rows(options: argparse.Namespace) -> Rows:
         clip = Path(folder) / "clip.mp4"
         luma, *chroma = planes
         width = luma.shape[-1]
-        pictures = [
-            np.concatenate([luma[i], *(plane[i].reshape(-1, width) for plane in chroma)]) for i in range(len(luma))
-        ]
+        pictures = [np.concatenate([luma[i], *(one[i].reshape(-1, width) for one in chroma)]) for i in range(len(luma))]
         repeated = (pictures[index % len(pictures)] for index in range(count))
         write_h264(clip, repeated, RATE, crf=CRF, preset="veryfast")
-        results: list[dict[str, Any]] = [
-            {"name": "as taken", "psnr": psnr_of(clip, still), "size": clip.stat().st_size}
-        ]
+        results: Rows = [{"name": "as taken", "psnr": psnr_of(clip, still), "size": clip.stat().st_size}]
         for method in METHODS:
             target = Path(folder) / f"{method}.mp4"
             begin, cpu = time.perf_counter(), time.process_time()

@@ -186,9 +186,7 @@ def test_clips_of_a_batch_and_free_frames():
         alone |= {"forward_input_shape": torch.tensor([1, 1, 48, 40]), "video_batch_size": torch.tensor(1)}
         torch.testing.assert_close(augmentation(clips[clip], params=alone), taken[clip], rtol=0, atol=1e-3)
     drawn = augmentation.drawn_vibration(shared._params[0].data)
-    torch.testing.assert_close(
-        drawn.frequency.float(), shared._params[0].data["frequency"][[0, 3]]
-    )  # one sample per clip
+    torch.testing.assert_close(drawn.frequency.float(), shared._params[0].data["frequency"][[0, 3]])  # one per clip
     free = kornia_augmentation.VideoSequential(RollingShutterVibration(TIMING), same_on_frame=False)
     frames = free(clips)
     assert augmentation.drawn_vibration(free._params[0].data).frequency.shape == (6, 2, 1)
@@ -376,8 +374,7 @@ def test_in_a_chain_with_other_augmentations():
     ],
 )
 def test_bad_options(options, error, match):
-    with pytest.raises(error, match=match):
-        RollingShutterVibration(TIMING, **options)
+    refuses(lambda: RollingShutterVibration(TIMING, **options), match, error)
 
 
 def test_wrong_use_is_refused():

@@ -141,10 +141,7 @@ def test_pixels_beyond_all_scales(value):
         (lambda: blur().A_adjoint(torch.tensor(1.0)), r"y must have shape \(..., R, W\)"),
         (lambda: blur()(FRAMES[0].to(torch.uint16)), "scene must be a floating-point tensor, got torch.uint16"),
         (lambda: blur()((100 * FRAMES[0]).to(torch.int64)), "scene must be a floating-point tensor, got torch.int64"),
-        (
-            lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, interpolation="nearest"),
-            "interpolation must be one of 'linear'",
-        ),
+        (lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, interpolation="nearest"), "interpolation must be one of"),
         (lambda: rsv.row_psf(VIBRATION, STARTS, TIMING, quadrature="simpson"), "quadrature must be one of 'midpoint'"),
         (lambda: rsv.row_psf(ROLL, TIMING.row_starts(1, 8), TIMING), "not defined with roll, zoom or a camera"),
         (lambda: rsv.windows_figure([0.0], [math.nan]), r"detections\[0\] must be a DetectedVibration"),

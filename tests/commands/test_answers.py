@@ -353,9 +353,7 @@ def test_long_operations_report_their_progress(place, tmp_path):
     _, found = units(lambda: rsv.detect_swept_tone(frames, TIMING))
     assert found == {"steps"}
     for method, unit in (("exact", "frames"), ("banded", "chunks"), ("richardson-lucy", "iterations")):
-        restored, found = units(
-            lambda method=method: rsv.restore(frames, TIMING, detection, method=method, check=False)
-        )
+        restored, found = units(lambda m=method: rsv.restore(frames, TIMING, detection, method=m, check=False))
         assert unit in found
     _, found = units(lambda: rsv.judge_restoration(frames, restored, TIMING, detection))
     assert found == {"stacks"}

@@ -356,10 +356,7 @@ def test_usage_errors(capsys, tmp_path):
         (("detect", "f.tif"), "Missing option '--out'"),
         (("compare", "a.json", "b.csv"), "Missing option '--unit'. Choose from: g, m/s2"),
         (("detect", "f.tif", "--config", "c.toml", "--device", "tpu", "--out", tmp_path), "'tpu' is not one of"),
-        (
-            (*detect, "--exposure", "1ms"),
-            "the camera is not described: give --row-time, --frame-rate, or --config",
-        ),
+        ((*detect, "--exposure", "1ms"), "the camera is not described: give --row-time, --frame-rate, or --config"),
         ((*detect, "--row-time", "20um"), "expected a time such as 14.5us, 1/500 or 2e-5"),
         ((*detect, "--exposure", "1/0"), "expected a time such as"),
         ((*detect, "--frame-rate", "fast"), "expected a number such as 29.97 or 30000/1001"),

@@ -57,9 +57,8 @@ def test_restored_frames_are_those_of_the_part(place, tmp_path):
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["input"]["name"] == "frames.tif[5:9]"
     vibration = ("--vibration", tmp_path / "out" / "vibration.json")
     assert rsvib(*command(place, "restore", tmp_path / "again.tif", *vibration)) == 0
-    np.testing.assert_array_equal(
-        tifffile.imread(tmp_path / "again.tif"), tifffile.imread(tmp_path / "out" / "restored.tif")
-    )
+    written = [tifffile.imread(path) for path in (tmp_path / "again.tif", tmp_path / "out" / "restored.tif")]
+    np.testing.assert_array_equal(*written)
 
 
 @pytest.mark.parametrize(

@@ -72,9 +72,8 @@ def test_rotated_video(place, angle):
 
 def test_frame_times_and_full_scale_of_the_file(place, frames, capsys):
     times = (0.0, 0.04, 0.08, 0.16)  # a frame was dropped
-    write_stack(
-        "f.h5", frames, dtype="uint16", full_scale=4095, like=StackInfo(tuple(frames.shape), "uint16", 4095, times)
-    )
+    info = StackInfo(tuple(frames.shape), "uint16", 4095, times)
+    write_stack("f.h5", frames, dtype="uint16", full_scale=4095, like=info)
     assert init("f.h5", *TIMES) == 0
     config = read_config(place / "camera.toml")
     assert config.timing.frame_rate == pytest.approx(25.0)

@@ -11,10 +11,7 @@ from scipy.ndimage import gaussian_filter
 from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.datasets.drawing import bars, rectangle, rotated
 
-SCENES = {
-    "chart": resolution_chart,
-    "city": lambda height, width: city_and_fields(height, width, seed=11),
-}
+SCENES = {"chart": resolution_chart, "city": lambda height, width: city_and_fields(height, width, seed=11)}
 
 
 def blurred_shape(inside, size, sigma, fine=9):

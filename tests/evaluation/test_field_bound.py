@@ -70,11 +70,16 @@ def drawn(seed=3):
     return 0.5 + 0.15 * values / values.std()
 
 
-def bound_of(coefficients, truth, method):
+def recording_of(coefficients, truth):
+    """The scene and the motion."""
     places = (np.arange(-EDGE, n + EDGE).astype(float) for n in (HEIGHT, WIDTH))
     down, right = (weights(n, p) for n, p in zip((HEIGHT, WIDTH), places, strict=True))
     scene = torch.from_numpy(down @ coefficients @ right.T)
-    motion = rsv.Vibration(*(truth[:, i].tolist() for i in range(4)))
+    return scene, rsv.Vibration(*(truth[:, i].tolist() for i in range(4)))
+
+
+def bound_of(coefficients, truth, method):
+    scene, motion = recording_of(coefficients, truth)
     bound = cramer_rao_bound(scene, TIMING, motion, FRAMES, noise=NOISE, frame_size=(HEIGHT, WIDTH), method=method)
     return np.stack([getattr(bound, name).reshape(len(truth)).numpy() for name in FIELDS], 1)
 
@@ -127,21 +132,11 @@ def test_roll_is_measured_by_the_displacement_along_columns():
 @pytest.mark.parametrize("method", ["projection", "gradients"])
 def test_orientation(method):
     """The same camera, transposed and read in reverse."""
-    coefficients = drawn()
-    places = (np.arange(-EDGE, n + EDGE).astype(float) for n in (HEIGHT, WIDTH))
-    down, right = (weights(n, p) for n, p in zip((HEIGHT, WIDTH), places, strict=True))
-    scene = torch.from_numpy(down @ coefficients @ right.T)
-    motion = rsv.Vibration(*(TRUTH[:, i].tolist() for i in range(4)))
+    scene, motion = recording_of(drawn(), TRUTH)
     turned = rsv.SensorTiming(TIMING.row_time, 3, 70, scan_axis="x", readout_direction="reverse")
     options = {"noise": NOISE, "method": method}
     bound = cramer_rao_bound(scene, TIMING, motion, FRAMES, frame_size=(HEIGHT, WIDTH), **options)
-    aside = cramer_rao_bound(
-        scene.flip(0).T.contiguous(),
-        turned,
-        motion.from_row_order(turned),
-        FRAMES,
-        frame_size=(WIDTH, HEIGHT),
-        **options,
-    )
+    there, size = scene.flip(0).T.contiguous(), (WIDTH, HEIGHT)
+    aside = cramer_rao_bound(there, turned, motion.from_row_order(turned), FRAMES, frame_size=size, **options)
     for name in FIELDS:
         torch.testing.assert_close(getattr(aside, name)[[1, 0, 2, 3]], getattr(bound, name), rtol=1e-6, atol=0)

@@ -5,21 +5,12 @@ Model, with (0.5, 0.5) at the centre of the first pixel.
 """
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from scipy.spatial.transform import Rotation
 
 
-def matrix_of(quaternion):
-    """Rotation matrix of a quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (w * y + x * z)],
-            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (w * x + y * z), w * w - x * x - y * y + z * z],
-        ]
-    )
+def rotation_of(quaternions):
+    """The rotation of quaternions (w, x, y, z) of any length."""
+    return Rotation.from_quat(quaternions, scalar_first=True)
 
 
 def undistorted(isd, dx, dy):
@@ -80,10 +71,10 @@ class FrameModel:
     def __init__(self, isd):
         self.isd = isd
         self.centre = 1000.0 * np.array(isd["instrument_position"]["positions"][0])
-        to_sensor = matrix_of(np.array(isd["instrument_pointing"]["quaternions"][0]))
+        to_sensor = rotation_of(isd["instrument_pointing"]["quaternions"][0]).as_matrix()
         if "constant_rotation" in isd["instrument_pointing"]:
             to_sensor = np.reshape(isd["instrument_pointing"]["constant_rotation"], (3, 3)) @ to_sensor
-        to_body = matrix_of(np.array(isd["body_rotation"]["quaternions"][0]))
+        to_body = rotation_of(isd["body_rotation"]["quaternions"][0]).as_matrix()
         self.to_body = to_body @ to_sensor.T  # from the sensor
 
     def without_jitter(self, line, sample):
@@ -148,11 +139,8 @@ class LineScanModel:
         self.step = (times[-1] - times[0]) / (len(times) - 1)
         assert np.allclose(steps, self.step, rtol=1e-9, atol=0)
         self.start = times[0] - isd["center_ephemeris_time"]
-        products = []
-        for to_sensor, to_body in zip(pointing["quaternions"], body["quaternions"], strict=True):
-            w, x, y, z = to_sensor
-            products.append(multiplied(np.array(to_body), np.array([w, -x, -y, -z])))
-        self.quaternions = np.array(products)
+        products = rotation_of(body["quaternions"]) * rotation_of(pointing["quaternions"]).inv()
+        self.quaternions = products.as_quat(scalar_first=True)
         self.positions = 1000.0 * np.array(isd["instrument_position"]["positions"])
         velocities = np.array(isd["instrument_position"]["velocities"])
         assert np.linalg.norm(np.cross(self.positions[0], velocities[0])) > 0  # usgscsm divides by it
@@ -162,7 +150,7 @@ class LineScanModel:
         return start + duration * (line - first_line + 0.5)
 
     def to_body(self, time):
-        return matrix_of(lagrange(self.quaternions, self.start, self.step, time))
+        return rotation_of(lagrange(self.quaternions, self.start, self.step, time)).as_matrix()
 
     def centre(self, time):
         return lagrange(self.positions, self.start, self.step, time)
@@ -190,9 +178,3 @@ class LineScanModel:
             before, after, off = after, after - other * (after - before) / (other - off), other
             other = self.seen(after, ground)[0]
         return after, self.seen(after, ground)[1]
-
-
-def multiplied(p, q):
-    """Product of quaternions (w, x, y, z)."""
-    w, v = p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
-    return np.array([w, *v])

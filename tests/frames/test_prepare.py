@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.frames.prepare import as_float_frames, prepare_frames
@@ -61,9 +62,8 @@ def test_masks_follow_the_frames():
     assert bool((prepared.images[prepared.missing] == 0).all())
     assert torch.allclose(prepared.filled[prepared.missing], torch.tensor(0.5), atol=0.05)
     counts = torch.tensor([[[0, 255], [17, 3]]], dtype=torch.uint8)
-    assert prepare_frames(counts, sensor(), saturation="auto").saturated.flatten().tolist() == [False, True] + 2 * [
-        False
-    ]
+    saturated = prepare_frames(counts, sensor(), saturation="auto").saturated
+    assert saturated.flatten().tolist() == [False, True, False, False]
     assert prepare_frames(counts.float(), sensor(), saturation="auto").saturated is None
     assert prepare_frames(counts, sensor()).saturated is None
     deep = counts.to(torch.int32)
@@ -99,8 +99,7 @@ def test_masks_that_broadcast(shape):
 )
 def test_bad_input(options, error, message):
     arguments = {"frames": 0.1 + torch.rand(2, 4, 6), "timing": sensor(), **options}
-    with pytest.raises(error, match=message):
-        prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments)
+    refuses(lambda: prepare_frames(arguments.pop("frames"), arguments.pop("timing"), **arguments), message, error)
 
 
 def test_float_frames_are_not_scaled():
@@ -138,5 +137,4 @@ def test_integer_frames_are_scaled():
     ],
 )
 def test_bad_frames(frames, options, error, message):
-    with pytest.raises(error, match=message):
-        as_float_frames(frames, **options)
+    refuses(lambda: as_float_frames(frames, **options), message, error)

@@ -15,8 +15,7 @@ from rsvib_torch.io import read_stack_info
 
 
 @pytest.mark.parametrize(
-    ("count", "seed", "run_every"),
-    [(144, 0, 1000), pytest.param(2400, 1, 12, marks=pytest.mark.slow)],
+    ("count", "seed", "run_every"), [(144, 0, 1000), pytest.param(2400, 1, 12, marks=pytest.mark.slow)]
 )
 def test_damaged_files_are_read_or_refused_with_a_one_line_error(tmp_path, count, seed, run_every):
     trials = list(mutated.trials(tmp_path, count, seed, run_every))

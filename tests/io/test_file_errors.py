@@ -69,12 +69,10 @@ def test_png_damage_is_refused(tmp_path):
     path = tmp_path / "bad.png"
     for length in range(len(data)):
         path.write_bytes(data[:length])
-        with pytest.raises(ValueError, match=r"bad\.png: not a readable PNG"):
-            read_stack(path)
+        refuses(lambda: read_stack(path), r"bad\.png: not a readable PNG")
     for place in range(8, len(data) - 4, 5):  # behind the pixels is the checksum of the end
         path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
-        with pytest.raises(ValueError, match=r"bad\.png"):
-            read_stack(path)
+        refuses(lambda: read_stack(path), r"bad\.png")
     extra = b"sRGB\x09"  # behind the header: no rendering intent, which does not concern the pixels
     chunk = struct.pack(">I", 1) + extra + struct.pack(">I", zlib.crc32(extra))
     path.write_bytes(data[:33] + chunk + data[33:])
@@ -85,8 +83,7 @@ def test_png_folders_that_are_not_stacks_are_refused(tmp_path):
     refuses(lambda: read_stack(tmp_path), "contains no PNG, TIFF or JPEG files")
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 5), np.uint8))
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 6), np.uint8))
-    with pytest.raises(ValueError, match=r"a.png is \(4, 5\) uint8 .*, b.png is \(4, 6\) uint8"):
-        read_stack(tmp_path)
+    refuses(lambda: read_stack(tmp_path), r"a.png is \(4, 5\) uint8 .*, b.png is \(4, 6\) uint8")
 
 
 def test_npy_damage_is_refused(tmp_path):
@@ -95,8 +92,7 @@ def test_npy_damage_is_refused(tmp_path):
     data = path.read_bytes()
     for length in range(len(data)):
         path.write_bytes(data[:length])
-        with pytest.raises(ValueError, match=r"frames\.npy: (truncated|not a readable \.npy)"):
-            read_stack(path)
+        refuses(lambda: read_stack(path), r"frames\.npy: (truncated|not a readable \.npy)")
     path.write_bytes(data.replace(b"(3, 9, 7)", b"(3, 9" + b"9" * 3 + b")"))
     refuses(lambda: read_stack_info(path), "truncated: the header states")
     np.save(path, np.array([{"a": 1}], dtype=object), allow_pickle=True)
@@ -107,8 +103,7 @@ def test_npy_damage_is_refused(tmp_path):
         ((0, 9, 7), "expected"),
     ):
         np.save(path, np.zeros(shape, np.uint8))
-        with pytest.raises(ValueError, match=message):
-            read_stack(path)
+        refuses(lambda: read_stack(path), message)
 
 
 def test_videos_that_cannot_be_read(tmp_path, capfd):
@@ -122,8 +117,7 @@ def test_videos_that_cannot_be_read(tmp_path, capfd):
     writer.release()
     data = (tmp_path / "cut.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
-    with pytest.raises(ValueError, match=r"cut\.avi: .* truncated: \d+ frames, 0\.\d+ of 0\.833 s"):
-        read_stack(tmp_path / "cut.avi")
+    refuses(lambda: read_stack(tmp_path / "cut.avi"), r"cut\.avi: .* truncated: \d+ frames, 0\.\d+ of 0\.833 s")
     assert capfd.readouterr().err == ""
 
 
@@ -227,34 +221,20 @@ def counts_in(folder, **options):
         (lambda at: counts_in(at, full_scale=4095), ValueError, "counts reach 4096, beyond full_scale=4095"),
         (lambda at: counts_in(at, full_scale=70000), ValueError, r"70000 exceeds the largest uint16 value"),
         (lambda at: counts_in(at, full_scale=-1.0), ValueError, "full_scale must be"),
-        (
-            lambda at: write_stack(at / "a.tif", FRAMES, dtype="uint16"),
-            ValueError,
-            r"a\.tif: full scale of uint16 frames",
-        ),
-        (
-            lambda at: write_stack(at / "a", FRAMES, dtype="uint8", full_scale=300),
-            ValueError,
-            "exceeds the largest",
-        ),
+        (lambda at: write_stack(at / "a.tif", FRAMES, dtype="uint16"), ValueError, r"a\.tif: full scale of uint16"),
+        (lambda at: write_stack(at / "a", FRAMES, dtype="uint8", full_scale=300), ValueError, "exceeds the largest"),
         (lambda at: read_stack(at / "gone.tif"), FileNotFoundError, r"gone\.tif does not exist"),
         (lambda at: write_stack(at / "a.xyz", FRAMES), ValueError, r"unknown file ending '\.xyz'; expected .*\.tif"),
         (lambda at: write_stack(at / "a.jpg", FRAMES), ValueError, "jpeg files can only be read"),
-        (lambda at: write_stack(at / "a.webm", FRAMES, dtype="uint8"), ValueError, "wmv files can only be read"),
         (lambda at: write_stack(at / "a.png", FRAMES, dtype="uint8"), ValueError, "a PNG file holds one frame, got 3"),
         (lambda at: write_stack(at / "a.png", FRAMES[:1]), ValueError, "png files hold uint8, uint16; got"),
         (lambda at: write_stack(at / "a", FRAMES.new_zeros(3, 5, 9, 7), dtype="uint8"), ValueError, "1, 3 or 4 chan"),
         (lambda at: write_stack(at / "a.tif", FRAMES[0]), ValueError, r"frames must have shape .* got \(9, 7\)"),
-        (
-            lambda at: write_stack(at / "a.tif", FRAMES / 0, dtype="uint8"),
-            ValueError,
-            "NaN or infinite pixels",
-        ),
+        (lambda at: write_stack(at / "a.tif", FRAMES / 0, dtype="uint8"), ValueError, "NaN or infinite pixels"),
         (lambda at: write_stack(at / "a.tif", FRAMES, dtype="complex64"), ValueError, "got dtype complex64"),
         (lambda at: write_stack(at / "none" / "a.tif", FRAMES), OSError, "none does not exist"),
     ],
 )
 def test_what_cannot_be_read_or_written_is_refused(tmp_path, call, error, message):
-    with pytest.raises(error, match=message):
-        call(tmp_path)
+    refuses(lambda: call(tmp_path), message, error)
     assert {path.name for path in tmp_path.iterdir()} <= {"frames.npy"}

@@ -106,14 +106,12 @@ def test_folder_of_float_frames_contains_tiff_files(tmp_path):
     assert sorted(file.name for file in (tmp_path / "frames").iterdir()) == [f"frame_000{i}.tif" for i in range(3)]
     np.testing.assert_allclose(read_stack(tmp_path / "frames").numpy(), COUNTS / 4095, rtol=1e-6)
     cv2.imwrite(str(tmp_path / "frames" / "x.png"), COUNTS[0])
-    with pytest.raises(ValueError, match="contains both PNG and TIFF files"):
-        read_stack(tmp_path / "frames")
+    refuses(lambda: read_stack(tmp_path / "frames"), "contains both PNG and TIFF files")
 
 
 @pytest.mark.parametrize(("ending", "message"), [(".TOY", "endings must be like '.tif'"), (None, "has no file ending")])
 def test_format_without_a_valid_ending_is_refused(ending, message):
-    with pytest.raises(ValueError, match=message):
-        register_format(StackFormat("toy", () if ending is None else (ending,), object))
+    refuses(lambda: register_format(StackFormat("toy", () if ending is None else (ending,), object)), message)
 
 
 @pytest.mark.parametrize(

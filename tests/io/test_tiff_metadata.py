@@ -7,6 +7,7 @@ import pytest
 import tifffile
 import torch
 from small_stack import FRAMES, draw_counts, process_small
+from test_tiff_pages import write_pages
 
 from rsvib_torch.io import metadata_not_kept, read_stack, read_stack_info, write_stack
 from rsvib_torch.stacks import read_manifest
@@ -36,12 +37,6 @@ OTHERS = {
 
 def tags_of(entries, *, first_page=False):
     return [(*entry, first_page) for entry in entries.values()]
-
-
-def write_pages(path, options, pages=GREY, **file_options):
-    with tifffile.TiffWriter(path, **file_options) as tif:
-        for number, page in enumerate(pages):
-            tif.write(page, **options(number))
 
 
 def copied(folder, *, output="out.tif", compression=None, change=lambda frames: frames):
@@ -128,7 +123,7 @@ def test_tags_of_pages_written_one_by_one(tmp_path):
             "metadata": {"temperature": number},
         }
 
-    write_pages(tmp_path / "in.tif", options)
+    write_pages(tmp_path / "in.tif", GREY, options)
     lost = {
         "DateTime (differs between pages)",
         "tag 65001 (differs between pages)",
@@ -139,10 +134,8 @@ def test_tags_of_pages_written_one_by_one(tmp_path):
     assert set(copied(tmp_path)) == lost
     given, found = values(tmp_path / "in.tif"), values(tmp_path / "out.tif", 4)
     assert all(found[code] == given[code] for code, *_ in GEOREFERENCE.values())
-    write_pages(
-        tmp_path / "in.tif",
-        lambda i: {"description": "orbit 7", "metadata": {"camera": "K1"}, "contiguous": False},
-    )
+    stated = {"description": "orbit 7", "metadata": {"camera": "K1"}, "contiguous": False}
+    write_pages(tmp_path / "in.tif", GREY, lambda i: stated)
     assert copied(tmp_path) == ()
     with tifffile.TiffFile(tmp_path / "out.tif") as tif:
         assert tif.pages.first.description == "orbit 7"
@@ -203,7 +196,7 @@ def test_ome_xml_is_kept(tmp_path):
         tmp_path / "in.tif", np.moveaxis(COLOUR, -1, 1), ome=True, photometric="minisblack", metadata={"axes": "TCYX"}
     )
     assert copied(tmp_path) == ("OME-XML",)
-    write_pages(tmp_path / "in.tif", lambda i: {}, ome=True)
+    write_pages(tmp_path / "in.tif", GREY, ome=True)
     assert copied(tmp_path) == ()
 
 

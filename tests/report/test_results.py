@@ -152,10 +152,8 @@ def test_offsets_are_written_one_line_per_band(tmp_path, result):
     )
     for name, values in (("time_s", result.offsets.times), ("fitted_y_px", result.fitted[..., 1])):
         np.testing.assert_array_equal([float(line[name]) for line in lines], values.flatten())
-    before, after = (
-        np.array([float(line[name]) for line in lines if line[name]]) for name in ("offset_x_px", "residual_x_px")
-    )
-    fitted = np.array([float(line["fitted_x_px"]) for line in lines if line["offset_x_px"]])
+    names = ("offset_x_px", "residual_x_px", "fitted_x_px")
+    before, after, fitted = (np.array([float(line[name]) for line in lines if line["offset_x_px"]]) for name in names)
     np.testing.assert_allclose(after, before - fitted, rtol=0, atol=1e-12)
     assert after.std() < 0.1 * before.std()  # noise of 0.02 px
     good = [float(line["offset_x_px"]) for line in lines if line["offset_x_px"]]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from detections import detection_of, result_of
+from refusals import refuses
 
 import rsvib_torch as rsv
 from rsvib_torch.stacks.manifest import StackManifest
@@ -65,8 +66,7 @@ def test_units_of_length():
     np.testing.assert_allclose(table["acceleration_m_per_s2"], angular**2 * amplitude)
     assert table["image_motion_um_per_s"] == [250.0, 250.0, 0.0]
     assert "25.000 ± 0.025" in found.physical_summary(12.5e-6)
-    with pytest.raises(ValueError, match=r"pixel_size \(in m\) must be at most 1000"):
-        found.table(pixel_size=12500.0)
+    refuses(lambda: found.table(pixel_size=12500.0), r"pixel_size \(in m\) must be at most 1000")
 
 
 def test_roll_has_a_column_of_its_own_and_an_axis_without_tone_one_row():
@@ -155,5 +155,4 @@ def test_missing_package_is_named_with_the_extra(monkeypatch, method, package):
 
 
 def test_results_without_a_table_name_what_they_have():
-    with pytest.raises(TypeError, match=r"Vibration has no table: use to_xarray\(\), which all results have"):
-        TWO_TONES.table()
+    refuses(TWO_TONES.table, r"Vibration has no table: use to_xarray\(\), which all results have", TypeError)

@@ -222,10 +222,7 @@ def test_results_are_drawn(results, tmp_path):
 
 def test_batches_are_drawn_over_windows_or_stacks(frames, windows):
     stacks = rsv.detect_vibration(torch.stack([frames[:2], frames[2:]])[:, :, None], TIMING)
-    for results, label, places in (
-        (windows, "time (s)", (0.0, 0.024)),
-        (stacks, "number of the stack", (0, 1)),
-    ):
+    for results, label, places in ((windows, "time (s)", (0.0, 0.024)), (stacks, "number of the stack", (0, 1))):
         panel = results.plot().axes[2]
         assert panel.get_xlabel() == label
         assert panel.lines[0].get_xdata()[0] == pytest.approx(places[0], abs=1e-3)

@@ -87,8 +87,7 @@ def test_texture_is_removed_by_several_frames():
     found = calibrate_row_time(frames, 997.0)
     assert found.row_time == pytest.approx(ROW_TIME, rel=2e-3)
     assert abs(found.row_time - ROW_TIME) < 4 * found.row_time_std
-    with pytest.raises(ValueError, match="no flicker found"):
-        calibrate_row_time(frames[:1], 997.0)
+    refuses(lambda: calibrate_row_time(frames[:1], 997.0), "no flicker found")
 
 
 def test_periodic_texture_is_not_detected_as_flicker():
@@ -130,8 +129,7 @@ def test_ambiguous_readout_direction_is_none():
 def test_columns_as_scan_axis():
     frames = record_frames(sine, scene=shaded()).transpose(-2, -1)
     assert calibrate_row_time(frames, 1000.0, scan_axis="x").row_time == pytest.approx(ROW_TIME, rel=5e-4)
-    with pytest.raises(ValueError, match="scan_axis"):
-        calibrate_row_time(frames, 1000.0, scan_axis="z")
+    refuses(lambda: calibrate_row_time(frames, 1000.0, scan_axis="z"), "scan_axis")
 
 
 @pytest.mark.parametrize("exposure", [65e-6, 420e-6, 730e-6])
@@ -172,15 +170,13 @@ def test_row_time_from_two_exposures_of_an_unknown_strobe():
 @pytest.mark.parametrize(("seed", "count"), [(0, 1), (1, 2)])
 def test_frames_without_flicker_are_refused(seed, count):
     frames = record_frames(np.ones_like, frames=count, scene=0.8 * draw_scene(HEIGHT, WIDTH, seed), noise=0.01)
-    with pytest.raises(ValueError, match="no flicker found"):
-        calibrate_row_time(frames, 100.0)
+    refuses(lambda: calibrate_row_time(frames, 100.0), "no flicker found")
 
 
 def test_slanted_stripes_are_not_flicker():
     rows, columns = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
     stripes = 0.5 + 0.3 * np.sin(2 * np.pi * (rows + 0.5 * columns) / 40)
-    with pytest.raises(ValueError, match="no flicker found"):
-        calibrate_row_time(torch.from_numpy(stripes)[None], 1000.0)
+    refuses(lambda: calibrate_row_time(torch.from_numpy(stripes)[None], 1000.0), "no flicker found")
 
 
 @pytest.mark.parametrize(
@@ -201,8 +197,7 @@ def test_slanted_stripes_are_not_flicker():
 )
 def test_bad_input(frames, options, message):
     options = {"flicker_frequency": 1000.0, **options}
-    with pytest.raises(ValueError, match=message):
-        calibrate_row_time(frames, **options)
+    refuses(lambda: calibrate_row_time(frames, **options), message)
 
 
 def test_flicker_too_fast_or_too_slow_for_the_rows():

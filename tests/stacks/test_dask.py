@@ -8,19 +8,11 @@ import numpy as np
 import pytest
 import tifffile
 from refusals import refuses
-from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small, write_small
+from small_stack import FRAMES, OPTIONS, STILL, TIMING, process_small
 from truth import decibel
 
 import rsvib_torch as rsv
 from rsvib_torch.stacks import engines, read_manifest
-
-
-@pytest.fixture(scope="module", name="place")
-def make_place(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("stack")
-    write_small(folder / "frames.tif")
-    process_small(folder / "frames.tif", folder / "out.tif")
-    return folder
 
 
 def cluster_of(workers):
@@ -29,60 +21,59 @@ def cluster_of(workers):
     return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, **options)
 
 
-def check_same(place, folder):
-    assert (folder / "out.tif").read_bytes() == (place / "out.tif").read_bytes()
-    ours, theirs = (read_manifest(path / "out.tif.manifest.json") for path in (place, folder))
+def check_same(whole, folder):
+    assert (folder / "out.tif").read_bytes() == (whole / "out.tif").read_bytes()
+    ours, theirs = (read_manifest(path / "out.tif.manifest.json") for path in (whole, folder))
     assert theirs.to_dict() == ours.to_dict()
 
 
-def test_dask_workers_give_the_same_bytes(place, tmp_path):
+def test_dask_workers_give_the_same_bytes(whole, tmp_path):
     with cluster_of(2) as cluster:
-        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
-    check_same(place, tmp_path)
+        process_small(whole / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
+    check_same(whole, tmp_path)
 
 
-def test_run_with_threads_is_resumed_with_dask(place, tmp_path):
+def test_run_with_threads_is_resumed_with_dask(whole, tmp_path):
     def stop(done, total):
         if done > FRAMES // 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        process_small(place / "frames.tif", tmp_path / "out.tif", progress=stop)
+        process_small(whole / "frames.tif", tmp_path / "out.tif", progress=stop)
     with cluster_of(1) as cluster:
-        report = process_small(
-            place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address, resume=True
-        )
+        options = {"scheduler": cluster.scheduler_address, "resume": True}
+        report = process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
     assert report.resumed > 2
-    check_same(place, tmp_path)
+    check_same(whole, tmp_path)
 
 
-def test_run_ends_if_there_are_no_workers(place, tmp_path, monkeypatch):
+def test_run_ends_if_there_are_no_workers(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(engines, "NO_WORKERS_SECONDS", 0.5)
     with (
         cluster_of(0) as cluster,
         pytest.raises(OSError, match=r"no Dask workers for 0.5 s; start workers, and resume the run"),
     ):
-        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
+        process_small(whole / "frames.tif", tmp_path / "out.tif", scheduler=cluster.scheduler_address)
     assert not (tmp_path / "out.tif").exists()
 
 
 @pytest.mark.slow
-def test_local_scheduler_starts_workers(place, tmp_path):
-    process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local", workers=2)
-    check_same(place, tmp_path)
+def test_local_scheduler_starts_workers(whole, tmp_path):
+    process_small(whole / "frames.tif", tmp_path / "out.tif", scheduler="local", workers=2)
+    check_same(whole, tmp_path)
 
 
-def test_missing_scheduler_and_missing_package(place, tmp_path, monkeypatch):
+def test_missing_scheduler_and_missing_package(whole, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="no Dask scheduler answers at nonsense://x"):
-        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="nonsense://x")
+        process_small(whole / "frames.tif", tmp_path / "out.tif", scheduler="nonsense://x")
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ModuleNotFoundError, match=r"the package distributed: pip install .*\[distributed\]"):
-        process_small(place / "frames.tif", tmp_path / "out.tif", scheduler="local")
+        process_small(whole / "frames.tif", tmp_path / "out.tif", scheduler="local")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_blocks_of_a_dask_array(place):
-    counts = tifffile.imread(place / "frames.tif")
+def test_blocks_of_a_dask_array(whole):
+    counts = tifffile.imread(whole / "frames.tif")
     array = dask.array.from_array(counts, chunks=(6, -1, -1))
     options = {name: OPTIONS[name] for name in ("detection", "restoration")}
     restored = array.map_overlap(
@@ -102,8 +93,8 @@ def test_blocks_of_a_dask_array(place):
     np.testing.assert_array_equal(rsv.restore_block(block, TIMING, full_scale=4095, **options)[1:-1], frames[6:12])
 
 
-def test_blocks_that_cannot_be_restored_are_returned_or_refused(place):
-    counts = tifffile.imread(place / "frames.tif")[:3]
+def test_blocks_that_cannot_be_restored_are_returned_or_refused(whole):
+    counts = tifffile.imread(whole / "frames.tif")[:3]
     for block in (counts[:1], np.zeros_like(counts)):
         restored = rsv.restore_block(block, TIMING, full_scale=4095)
         np.testing.assert_array_equal(restored, block)

@@ -11,20 +11,10 @@ import numpy as np
 import pytest
 import tifffile
 from attacks.small_runs import fork
-from small_stack import FRAMES, OPTIONS, WINDOWS, process_small, write_small
+from small_stack import FRAMES, OPTIONS, WINDOWS, process_small
 
 from rsvib_torch.stacks import read_manifest
 from rsvib_torch.stacks.run_folder import work_folder
-
-
-@pytest.fixture(scope="module", name="whole")
-def process_whole(tmp_path_factory):
-    """A stack and the output of an uninterrupted run."""
-    folder = tmp_path_factory.mktemp("whole")
-    write_small(folder / "frames.tif")
-    for name in ("out.tif", "out.npy"):
-        process_small(folder / "frames.tif", folder / name)
-    return folder
 
 
 def stop_after(frames):

@@ -35,8 +35,7 @@ def test_window_that_does_not_fit_the_free_memory_is_refused(set_free):
     assert float(required[1]) == pytest.approx(memory_needed(LARGE, 8, {}) / GB, rel=0.01)
     fitting = int(re.search(r"at most ([0-9]+) frames at once \(--window\)", message)[1])
     assert windows_at_once(LARGE, fitting, memory=None, most=4, restoration={}) == 1
-    with pytest.raises(ValueError, match="too little"):
-        windows_at_once(LARGE, fitting + 1, memory=None, most=4, restoration={})
+    refuses(lambda: windows_at_once(LARGE, fitting + 1, memory=None, most=4, restoration={}), "too little")
     assert windows_at_once(LARGE, 8, memory="20GB", most=4, restoration={}) == 1
 
 

@@ -7,35 +7,13 @@ import numpy as np
 import pytest
 import tifffile
 import torch
-from small_stack import (
-    FRAMES,
-    HEIGHT,
-    MOTION,
-    OPTIONS,
-    STILL,
-    TIMING,
-    WIDTH,
-    WINDOWS,
-    process_small,
-    write_small,
-    write_with_gaps,
-)
+from small_stack import FRAMES, HEIGHT, MOTION, OPTIONS, STILL, TIMING, WIDTH, process_small, write_with_gaps
 from truth import decibel
 
 import rsvib_torch as rsv
 from rsvib_torch.io import open_stack, write_stack
 from rsvib_torch.stacks import cut_windows, detect_stack, read_manifest
 from rsvib_torch.stacks.memory import parse_memory
-
-
-@pytest.fixture(scope="module", name="place")
-def make_place(tmp_path_factory):
-    """A folder with a stack and the output of an uninterrupted run."""
-    folder = tmp_path_factory.mktemp("stack")
-    write_small(folder / "frames.tif")
-    report = process_small(folder / "frames.tif", folder / "restored.tif")
-    assert (report.frames, report.windows, report.restored) == (FRAMES, WINDOWS, WINDOWS)
-    return folder
 
 
 @pytest.mark.parametrize(("frames", "window"), [(1, 2), (2, 2), (9, 8), (25, 3), (100, 8), (101, 8), (7, 100)])
@@ -50,14 +28,14 @@ def test_windows_contain_every_pair_once_and_write_every_frame_once(frames, wind
     assert [w.alone for w in windows] == [len(windows) == 1] * len(windows)
 
 
-def test_every_frame_of_a_long_stack_is_restored(place):
-    raw, restored = (tifffile.imread(place / name) / 4095 for name in ("frames.tif", "restored.tif"))
+def test_every_frame_of_a_long_stack_is_restored(whole):
+    raw, restored = (tifffile.imread(whole / name) / 4095 for name in ("frames.tif", "out.tif"))
     assert restored.shape == (FRAMES, HEIGHT, WIDTH)
     before, after = ([decibel(frame, STILL, 12) for frame in stack] for stack in (raw, restored))
     assert max(before) < 27
     assert min(after) > 30
     assert np.median(np.subtract(after, before)) > 16
-    manifest = read_manifest(place / "restored.tif.manifest.json")
+    manifest = read_manifest(whole / "out.tif.manifest.json")
     for record in manifest.windows:
         found = record.detection.vibration
         assert float(found.amplitude[0, 0]) == pytest.approx(MOTION.amplitude[0], rel=0.06)
@@ -65,74 +43,75 @@ def test_every_frame_of_a_long_stack_is_restored(place):
         # the phase refers to the time origin of the window
         turn = 2 * np.pi * MOTION.frequency[0] * record.start_time + MOTION.phase[0] - float(found.phase[0, 0])
         assert abs(np.angle(np.exp(1j * turn))) < 0.2
-    assert sorted(path.name for path in place.iterdir()) == ["frames.tif", "restored.tif", "restored.tif.manifest.json"]
+    outputs = {name + ending for name in ("out.npy", "out.tif") for ending in ("", ".manifest.json")}
+    assert {path.name for path in whole.iterdir()} == {"frames.tif", *outputs}
 
 
-def test_window_equals_detection_and_restoration_of_its_frames(place):
-    frames = rsv.read_stack(place / "frames.tif", full_scale=4095)[8:11]
+def test_window_equals_detection_and_restoration_of_its_frames(whole):
+    frames = rsv.read_stack(whole / "frames.tif", full_scale=4095)[8:11]
     found = rsv.detect_vibration(frames, TIMING, **OPTIONS["detection"])
     expected = rsv.restore(frames[:2], TIMING, found.vibration, method="dewarp", check=False)
-    restored = rsv.read_stack(place / "restored.tif")
+    restored = rsv.read_stack(whole / "out.tif")
     torch.testing.assert_close(restored[8:10], expected.clamp(0, 1), atol=0.6 / 4095, rtol=0)
 
 
 @pytest.mark.parametrize("options", [{"workers": 3}, {"memory": "900MB", "workers": 8}, {"bad_frames": "skip"}])
-def test_result_does_not_depend_on_workers_memory_or_staging(place, tmp_path, options):
+def test_result_does_not_depend_on_workers_memory_or_staging(whole, tmp_path, options):
     threads = torch.get_num_threads()
-    process_small(place / "frames.tif", tmp_path / "restored.tif", **options)
-    assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
-    old, new = (read_manifest(folder / "restored.tif.manifest.json") for folder in (place, tmp_path))
+    process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
+    assert (tmp_path / "out.tif").read_bytes() == (whole / "out.tif").read_bytes()
+    old, new = (read_manifest(folder / "out.tif.manifest.json") for folder in (whole, tmp_path))
     assert new.to_dict()["windows"] == old.to_dict()["windows"]
     assert torch.get_num_threads() == threads
 
 
 @pytest.mark.parametrize("ending", [".npy", ".raw", ".h5", ".zarr", ""])
-def test_output_is_the_same_in_every_format(place, tmp_path, ending):
+def test_output_is_the_same_in_every_format(whole, tmp_path, ending):
     sink = tmp_path / f"restored{ending}"
-    process_small(place / "frames.tif", sink)
+    process_small(whole / "frames.tif", sink)
     reader = open_stack(sink)
     frames = np.stack([reader.frame(index) for index in range(FRAMES)])
-    np.testing.assert_array_equal(frames, tifffile.imread(place / "restored.tif"))
+    np.testing.assert_array_equal(frames, tifffile.imread(whole / "out.tif"))
     assert reader.info.full_scale == (None if ending == ".npy" else 4095)
     reader.close()
     expected = {sink.name, f"{sink.name}.manifest.json"} | ({"restored.raw.json"} if ending == ".raw" else set())
     assert {path.name for path in tmp_path.iterdir()} == expected
 
 
-def test_compressed_tiff(place, tmp_path):
-    process_small(place / "frames.tif", tmp_path / "restored.tif", compression="zlib")
-    with tifffile.TiffFile(tmp_path / "restored.tif") as tif:
+def test_compressed_tiff(whole, tmp_path):
+    process_small(whole / "frames.tif", tmp_path / "out.tif", compression="zlib")
+    with tifffile.TiffFile(tmp_path / "out.tif") as tif:
         assert tif.pages[0].compression.name == "ADOBE_DEFLATE"
-    np.testing.assert_array_equal(*(tifffile.imread(folder / "restored.tif") for folder in (place, tmp_path)))
+    np.testing.assert_array_equal(*(tifffile.imread(folder / "out.tif") for folder in (whole, tmp_path)))
     with pytest.raises(ValueError, match="compression='zlib' is only available for TIFF files"):
-        process_small(place / "frames.tif", tmp_path / "restored.npy", compression="zlib")
+        process_small(whole / "frames.tif", tmp_path / "restored.npy", compression="zlib")
 
 
-def test_iterator_yields_windows_in_order(place):
+def test_iterator_yields_windows_in_order(whole):
     options = {name: OPTIONS[name] for name in ("window", "detection", "restoration", "workers")}
-    windows = rsv.iterate_stack(place / "frames.tif", TIMING, full_scale=4095, **options)
+    windows = rsv.iterate_stack(whole / "frames.tif", TIMING, full_scale=4095, **options)
     first = next(windows)
     assert first.indices == (0, 1)
-    restored = rsv.read_stack(place / "restored.tif")
+    restored = rsv.read_stack(whole / "out.tif")
     torch.testing.assert_close(first.frames.clamp(0, 1), restored[:2], atol=0.6 / 4095, rtol=0)
     assert sum(len(result.indices) for result in windows) == FRAMES - 2
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("rsvib")]
 
 
-def test_stack_is_restored_with_detections_of_an_earlier_run(place, tmp_path):
+def test_stack_is_restored_with_detections_of_an_earlier_run(whole, tmp_path):
     shared = {name: OPTIONS[name] for name in ("window", "detection", "workers")}
-    detect_stack(place / "frames.tif", tmp_path / "manifest.json", TIMING, full_scale=4095, **shared)
+    detect_stack(whole / "frames.tif", tmp_path / "manifest.json", TIMING, full_scale=4095, **shared)
     manifest = read_manifest(tmp_path / "manifest.json")
     assert all(record.written == 0 and record.detection for record in manifest.windows)
-    process_small(place / "frames.tif", tmp_path / "restored.tif", given=manifest.detections(), detection=None)
-    assert (tmp_path / "restored.tif").read_bytes() == (place / "restored.tif").read_bytes()
+    process_small(whole / "frames.tif", tmp_path / "out.tif", given=manifest.detections(), detection=None)
+    assert (tmp_path / "out.tif").read_bytes() == (whole / "out.tif").read_bytes()
     with pytest.raises(ValueError, match="given has 8 detections for 6 windows of at most 4 frames"):
-        process_small(place / "frames.tif", tmp_path / "other.tif", given=manifest.detections(), window=4)
+        process_small(whole / "frames.tif", tmp_path / "other.tif", given=manifest.detections(), window=4)
 
 
 @pytest.mark.parametrize("choice", ["pass", "skip"])
-def test_bad_frames_are_listed_and_the_others_restored(place, tmp_path, choice):
-    counts = tifffile.imread(place / "frames.tif").astype(np.float32) / 4095
+def test_bad_frames_are_listed_and_the_others_restored(whole, tmp_path, choice):
+    counts = tifffile.imread(whole / "frames.tif").astype(np.float32) / 4095
     counts[5] = 0.5  # constant
     counts[9, 4, 5] = 3e38
     counts[12, 3, 4] = np.inf
@@ -162,8 +141,8 @@ def test_bad_frames_are_listed_and_the_others_restored(place, tmp_path, choice):
     assert min(decibel(frame, STILL, 12) for frame in restored) > 28
 
 
-def test_window_without_two_usable_frames_is_written_unchanged(place, tmp_path):
-    counts = tifffile.imread(place / "frames.tif")
+def test_window_without_two_usable_frames_is_written_unchanged(whole, tmp_path):
+    counts = tifffile.imread(whole / "frames.tif")
     counts[5:8] = 7
     np.save(tmp_path / "frames.npy", counts)
     report = process_small(tmp_path / "frames.npy", tmp_path / "out.npy")
@@ -220,14 +199,14 @@ def test_memory_sizes_are_parsed():
         ({"memory": "1KB"}, ValueError, "is too little"),
     ],
 )
-def test_invalid_options_are_errors_without_files(place, tmp_path, options, error, message):
+def test_invalid_options_are_errors_without_files(whole, tmp_path, options, error, message):
     with pytest.raises(error, match=message):
-        process_small(place / "frames.tif", tmp_path / "out.tif", **options)
+        process_small(whole / "frames.tif", tmp_path / "out.tif", **options)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_colour_and_axis_order_are_kept(place, tmp_path):
-    grey = tifffile.imread(place / "frames.tif")[:5]
+def test_colour_and_axis_order_are_kept(whole, tmp_path):
+    grey = tifffile.imread(whole / "frames.tif")[:5]
     colour = np.stack([grey, grey // 2, grey // 4], axis=-1)
     tifffile.imwrite(tmp_path / "colour.tif", colour, photometric="rgb", metadata=None, resolution=(300, 300))
     process_small(tmp_path / "colour.tif", tmp_path / "out.tif")

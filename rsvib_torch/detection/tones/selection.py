@@ -212,7 +212,8 @@ class _Search:
             if self.accuracy and not first:
                 # Bands that move within their height contain twice the frequency of a tone, as a large tone if that is
                 # nearly blind. Of 200 recordings in four and eight frames, three were refused because of it.
-                passed = passed & (fit.amplitude[..., -1] <= fit.amplitude[..., :-1].max(-1))
+                largest = fit.amplitude[..., :-1].max(-1)
+                passed = passed & ((fit.amplitude[..., -1] <= largest) | (largest == 0))
             passed = self.open_axes & passed & _resolved(self.measurements, fit) & (self.is_visible(fit) | first)
             while bool(passed.any()) and not bool((passed == self.open_axes).all()):
                 self.open_axes = passed
