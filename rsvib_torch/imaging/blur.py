@@ -167,9 +167,10 @@ def row_transfer(taps: Tensor, along: Tensor, frequencies: Tensor) -> Tensor:
 
     The ``taps`` (..., R, J, N) are those of ``row_taps``; ``along`` (..., R, N) is the displacement x_n in px.
     """
-    angle = (-2 * math.pi) * along[..., None] * frequencies
-    taps = taps.to(angle.dtype)
-    return torch.complex(taps @ angle.cos(), taps @ angle.sin())
+    angle = ((-2 * math.pi) * along[..., None] * frequencies).flatten(0, -3)
+    weights = taps.to(angle.dtype).flatten(0, -3)
+    transfer = torch.complex(torch.bmm(weights, angle.cos()), torch.bmm(weights, angle.sin()))
+    return transfer.view(*taps.shape[:-1], -1)
 
 
 def form_rows(
@@ -190,7 +191,7 @@ def form_rows(
     other in ``spectra``; places and displacements are then (B, R, N).
     """
     first, taps = row_taps(places, node_weights, partial(bspline_weights, degree=degree))
-    source = first[..., None] - degree // 2 + torch.arange(taps.shape[-2], device=first.device)
+    source = first[..., None] + torch.arange(-(degree // 2), taps.shape[-2] - degree // 2, device=first.device)
     num_rows = spectra.shape[-2] // num_scenes
     source = mirrored(source, num_rows)
     if num_scenes > 1:

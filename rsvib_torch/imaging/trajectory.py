@@ -86,40 +86,36 @@ def exposure_trajectory(
     return vibration.path(starts, times), weights
 
 
-def rows_showing(
-    scene_rows: Tensor,
-    frame_start: Tensor,
-    timing: RowTiming,
-    vibration: Motion,
-    *,
-    exposure_time: float | Tensor | None = None,
-) -> Tensor:
+def rows_showing(scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion) -> Tensor:
     """Frame rows r(s) that show scene rows s of shape S: the solution of ``r = s + Y(t(r))``, float64.
 
     Row r is exposed from ``frame_start + r T_row`` on, and Y is the mean displacement over that exposure (Eq. 2).
     Newton's method; ``|dY/dt| T_row`` is 0.02 for 5 px at 30 Hz, and must stay below 1: content that moves along the
     scan as fast as the rows is never passed. The vibration is in row order, its batch dimensions lead; ``frame_start``
-    and ``exposure_time`` (by default that of the sensor) in s broadcast to S.
+    in s broadcasts to S.
     """
+    return rows_and_displacement(scene_rows, frame_start, timing, vibration)[0]
+
+
+def rows_and_displacement(
+    scene_rows: Tensor, frame_start: Tensor, timing: RowTiming, vibration: Motion
+) -> tuple[Tensor, Tensor]:
+    """``rows_showing``, and the mean displacement (S, 2) of these rows in px."""
     check_two_axes(vibration, "the displacement of a row")
-    exposure_time = timing.exposure_time if exposure_time is None else exposure_time
     scene_rows = scene_rows.to(torch.float64)
     rows = scene_rows + torch.zeros_like(frame_start)
-    slope = torch.zeros_like(rows)
+    near = torch.tensor([-1e-3, 0.0, 1e-3], dtype=torch.float64, device=rows.device)  # rows, for the derivative
     for iteration in range(8):
-        starts = frame_start + rows * timing.row_time
-        residual = scene_rows + vibration.mean_displacement(starts, exposure_time)[..., 1] - rows
-        # three steps are enough for most motions; the third keeps the slope of the second
-        last_of_three = iteration == 2
-        if not last_of_three:
-            # derivative of the mean displacement, which differs from the velocity for periods as short as exposures
-            ends = vibration.displacement(torch.stack([starts, starts + exposure_time], -1))[..., 1].detach()
-            slope = (ends[..., 1] - ends[..., 0]) * (timing.row_time / exposure_time)
-        step = residual / (1.0 - slope).clamp(min=0.1)  # the limit keeps steps finite near slope 1
+        starts = frame_start[..., None] + (rows[..., None] + near) * timing.row_time
+        before, displacement, after = vibration.mean_displacement(starts, timing.exposure_time).unbind(-2)
+        # the limit keeps steps finite near slope 1
+        remaining = (1.0 - (after - before)[..., 1].detach() / 2e-3).clamp(min=0.1)
+        step = (scene_rows + displacement[..., 1] - rows) / remaining
         rows = rows + step
-        if last_of_three and bool((step.abs() < 1e-9).all()):  # px, far below any measurement
+        # a step of 1e-5 px would be followed by one of its square, far below any measurement
+        if iteration > 0 and bool((step.abs() < 1e-5).all()):
             break
-    return rows
+    return rows, displacement
 
 
 def shown_by_tones(

@@ -9,7 +9,7 @@ batch of matrices.
 
 A system is eliminated from both ends at a time, which halves the number of steps: the last rows in reverse order are
 the second half of the batch. ``from_both_ends`` has the two halves, each of which contains the b or b + 1 middle rows.
-What both eliminations leave of the middle is one small system.
+What both eliminations leave of the middle is one small matrix.
 
 ``InterpolatedFactors`` are those of systems that change smoothly with frequency: some are computed, the others are
 interpolated.
@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -40,8 +41,7 @@ class _Triangle:
     of few systems.
     """
 
-    # (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; values beyond the last column have no meaning, and rows that are not
-    # eliminated are 0
+    # (K, b, S), ``[j, i - 1]`` is ``U[j, j + i]``; rows that are not eliminated are 0
     upper: Tensor
     inverse: Tensor  # (steps, S), ``1 / d_j`` of the eliminated rows, real
     _solutions: dict[int, "_Solution"] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class _Triangle:
             below.addcmul_(row, value, value=-1)
         if x.is_complex():
             x.conj_physical_()
-        x[: len(self.inverse)] *= self.inverse[:, None]
+        x[: len(self.inverse)].mul_(self.inverse[:, None])
 
     def backward(self, memory: "_Solution") -> None:
         """Replace y by the solution, which rows that are not eliminated contain."""
@@ -85,9 +85,10 @@ class _Triangle:
         count, width, _ = self.upper.shape
         for j in range(count - 1, width - 1, -1):
             runs[j - width].addcmul_(self._columns[j - width], rows[j], value=-1)
-        for j in range(min(width, count) - 1, 0, -1):
-            column = torch.stack([self.upper[k, j - 1 - k] for k in range(j)])
-            x[:j].addcmul_(column[:, None], rows[j], value=-1)
+        # the first b rows, row by row
+        for j in range(min(width - 1, len(self._rows)) - 1, -1, -1):
+            later = x[j + 1 : width]
+            rows[j].sub_((self._rows[j][: len(later)] * later).sum(0))
 
 
 def _eliminated(skewed: Tensor, steps: int) -> _Triangle:
@@ -118,9 +119,9 @@ def from_both_ends(skewed: Tensor) -> Tensor:
     steps = max(0, count - width) // 2
     half = count - steps
     first, second = skewed[:half], skewed[steps:count].flip(0, 1)
-    row = torch.arange(half, device=skewed.device)[:, None]
-    column = row + torch.arange(-width, width + 1, device=skewed.device)
-    between = ((row >= steps) & (column >= steps)).view(half, 2 * width + 1, *(1,) * (skewed.ndim - 2))
+    row = np.arange(half)[:, None]
+    of_middle = (row >= steps) & (row + np.arange(-width, width + 1) >= steps)
+    between = torch.from_numpy(of_middle).to(skewed.device).view(half, 2 * width + 1, *(1,) * (skewed.ndim - 2))
     halves = torch.stack([first, second.masked_fill(between, 0)], 2)
     return torch.cat([halves, halves.new_zeros(width, *halves.shape[1:])])
 
@@ -133,17 +134,20 @@ class BandedFactor:
     """
 
     ends: _Triangle  # of the halves, (2 S) systems
-    middle: _Triangle  # of the middle rows
+    # U^-1 (m, m, S) and 1 / D (m, S) of what is left of the m middle rows: the inverse of the matrix itself loses three
+    # times as much to rounding
+    middle: Tensor
+    middle_inverse: Tensor
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Values that define the factor."""
-        return self.ends.upper, self.ends.inverse, self.middle.upper, self.middle.inverse
+        return self.ends.upper, self.ends.inverse, self.middle, self.middle_inverse
 
     @classmethod
-    def of_tensors(cls, upper: Tensor, inverse: Tensor, middle_upper: Tensor, middle_inverse: Tensor) -> "BandedFactor":
+    def of_tensors(cls, upper: Tensor, inverse: Tensor, middle: Tensor, middle_inverse: Tensor) -> "BandedFactor":
         """The opposite of ``tensors``."""
-        return cls(_Triangle(upper, inverse), _Triangle(middle_upper, middle_inverse))
+        return cls(_Triangle(upper, inverse), middle, middle_inverse)
 
     def halves(self, values: Tensor) -> Tensor:
         """The halves (H, M, 2 S) of values (K, M, S)."""
@@ -153,22 +157,17 @@ class BandedFactor:
     def solve(self, right_side: Tensor) -> Tensor:
         """Solve ``A x = right_side`` for right sides (K, M, S)."""
         half, steps, size = len(self.ends.upper), len(self.ends.inverse), right_side.shape[-1]
-        ends, middle = self.ends.memory(right_side), self.middle.memory(right_side)
-        first, second = ends.x[:half].split(size, -1)
-        conjugate = right_side.conj()
-        first.copy_(conjugate[:half])
-        second[:steps] = conjugate[half:].flip(0)
+        ends = self.ends.memory(right_side)
+        both = ends.x[:half]
+        both.copy_(self.halves(right_side).conj())
+        first, second = both.split(size, -1)
         second[steps:] = 0
         self.ends.forward(ends)
         # what both ends leave of the middle rows
-        rows = middle.x[: half - steps]
-        torch.add(first[steps:], second[steps:].flip(0), out=rows)
-        if rows.is_complex():
-            rows.conj_physical_()
-        self.middle.forward(middle)
-        self.middle.backward(middle)
-        first[steps:] = rows
-        second[steps:] = rows.flip(0)
+        middle = first[steps:] + second[steps:].flip(0)
+        middle = (self.middle.conj()[:, :, None] * middle[:, None]).sum(0) * self.middle_inverse[:, None]
+        middle = (self.middle[:, :, None] * middle).sum(1)
+        both[steps:] = torch.cat([middle, middle.flip(0)], -1)
         self.ends.backward(ends)
         return torch.cat([first, second[:steps].flip(0)])
 
@@ -183,7 +182,15 @@ def factor_banded(halves: Tensor, count: int) -> BandedFactor:
     middle = halves.new_zeros(half - steps + width, 2 * width + 1, size)
     torch.add(first, second.flip(0, 1), out=middle[: half - steps])
     halves[steps:half, width + 1 :] = 0
-    return BandedFactor(ends, _eliminated(middle, half - steps))
+    inverse = _eliminated(middle, half - steps).inverse
+    # the middle rows as dense matrices: a strided view, because each row begins one column further right
+    line, entry, _ = middle.stride()
+    dense = middle.as_strided((half - steps, half - steps, size), (line - entry, entry, 1), width * entry).movedim(
+        -1, 0
+    )
+    identity = torch.eye(half - steps, dtype=halves.dtype, device=halves.device)
+    upper = torch.linalg.solve_triangular(dense, identity, upper=True, unitriangular=True)
+    return BandedFactor(ends, upper.movedim(0, -1).contiguous(), inverse)
 
 
 def skew_band(band: Tensor) -> Tensor:

@@ -139,7 +139,9 @@ def bspline_coefficient_rows(samples: Tensor, degree: int) -> Iterator[tuple[sli
         source = (
             samples[..., near, :] if inside else samples.index_select(-2, index[rows.start : rows.stop + 2 * reach])
         )
-        yield rows, torch.matmul(matrix[:count, : count + 2 * reach], source)
+        flat = source.flatten(0, -3)
+        own = matrix[:count, : count + 2 * reach].expand(len(flat), -1, -1)
+        yield rows, torch.bmm(own, flat).view(*samples.shape[:-2], count, -1)
 
 
 def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
@@ -172,11 +174,9 @@ def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tenso
 
 def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:
     """Matrix (..., rows, (rows - 1) step + N) whose product with samples is their correlation with kernels (..., N)."""
-    taps = kernels.shape[-1]
-    matrix = kernels.new_zeros(*kernels.shape[:-1], rows, (rows - 1) * step + taps)
-    row = torch.arange(rows, device=kernels.device)[:, None]
-    matrix[..., row, step * row + torch.arange(taps, device=kernels.device)] = kernels[..., None, :]
-    return matrix
+    reach = (rows - 1) * step
+    windows = torch.nn.functional.pad(kernels, (reach, reach)).unfold(-1, reach + kernels.shape[-1], step)
+    return windows.flip(-2)
 
 
 def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Tensor:
@@ -214,13 +214,17 @@ def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
     block = min(8 if samples.device.type == "cpu" else 256, length)
     span = (block - 1) * step + taps
     count = length // block
-    own = _toeplitz(kernels, block, step).flatten(0, 1)
+    matrix = _toeplitz(kernels, block, step)  # (Q, block, span)
     windows = samples.unfold(-2, span, block * step).mT  # (..., count, span, W)
-    blocks: Tensor = (own @ windows).unflatten(-2, (number, block)).movedim(-3, 0).flatten(-3, -2)
+    every = windows.reshape(-1, *windows.shape[-2:])
+    products = torch.bmm(matrix.view(1, -1, span).expand(len(every), -1, -1), every)
+    blocks: Tensor = products.view(*windows.shape[:-2], number, block, -1).movedim(-3, 0).flatten(-3, -2)
     rest = length - count * block
     if not rest:
         return blocks
-    return torch.cat([blocks, _across(samples[..., count * block * step :, :], kernels, step, rest)], -2)
+    near = (rest - 1) * step + taps
+    last = matrix[:, :rest, :near].flatten(0, 1) @ samples[..., count * block * step :, :][..., :near, :]
+    return torch.cat([blocks, last.unflatten(-2, (number, rest)).movedim(-3, 0)], -2)
 
 
 @cache

@@ -129,12 +129,12 @@ def restore_banded(
 
     # one slab for every `stride` scene rows: its middle, the frame row at which it appears, the motion relative to it
     centres = torch.arange((stride - 1) // 2, H + stride - 1, stride, device=frames.device)[: -(-H // stride)]
-    frame_rows = motion.frame_rows(centres.to(torch.float64))
+    frame_rows, displaced = motion.frame_rows(centres.to(torch.float64))
     displacement, node_weights = exposure_trajectory(
         motion.vibration, motion.row_starts(frame_rows), motion.timing, _TRANSFERS[interpolation][2]
     )
     rows = frame_rows.detach().round()
-    along = motion.mean_displacement(frame_rows)[..., 0] + motion.shift[..., 0, None]
+    along = displaced[..., 0] + motion.shift[..., 0, None]
     moved = torch.stack([along, rows - centres + motion.shift[..., 1, None]], dim=-1)
     displacement = (displacement - moved[..., None, :]).flatten(0, 2).to(frames.dtype)
     grid = (u.to(frames.dtype), v.to(frames.dtype))

@@ -38,12 +38,11 @@ class _Moves:
     @classmethod
     def of(cls, motion: FrameMotion, length: int, dtype: torch.dtype) -> "_Moves":
         """Moves by a motion, for rows that are extended to ``length``."""
-        rows = motion.frame_rows(torch.arange(motion.num_rows, dtype=torch.float64, device=motion.shift.device))
-        along = motion.mean_displacement(rows)[..., 0]
+        rows, moved = motion.frame_rows(torch.arange(motion.num_rows, dtype=torch.float64, device=motion.shift.device))
         cell = rows.detach().floor()
         weights = bspline_weights(rows - cell, _DEGREE).to(dtype)
         taps = cell.to(torch.int64)[..., None] + torch.arange(_DEGREE + 1, device=rows.device) - _DEGREE // 2
-        tables = phase_tables(along, length, slice(0, length // 2 + 1), dtype.to_complex())
+        tables = phase_tables(moved[..., 0], length, slice(0, length // 2 + 1), dtype.to_complex())
         return cls(mirrored(taps, motion.num_rows), weights, *(torch.view_as_real(table) for table in tables))
 
 
@@ -72,21 +71,19 @@ def _moved_back(spectra: Tensor, moves: _Moves, rows_of: Callable[[Tensor], Tens
     B, T, C, H, count, _ = spectra.shape
     flat = spectra.movedim(2, 3).reshape(B * T * H, -1)  # one entry per row, with all channels
     image = torch.arange(B * T, device=spectra.device)[:, None, None]
-    taps = moves.taps.expand(B, -1, -1, -1).flatten(0, 1) + image * H
-    weights, coarse, fine = (
-        values.expand(B, *values.shape[1:]).flatten(0, 1) for values in (moves.weights, moves.coarse, moves.fine)
-    )
+    values = (moves.taps, moves.weights, moves.coarse[..., None, :], moves.fine[:, :, :, None])
+    taps, *others = (one.expand(B, *one.shape[1:]).flatten(0, 1) for one in values)
+    chunks = zip(*(one.split(chunk_rows, 1) for one in (taps + image * H, *others)), strict=True)
 
-    def restored(part: slice) -> Tensor:
-        fetched = embedding_bag(
-            taps[:, part].flatten(0, 1), flat, per_sample_weights=weights[:, part].flatten(0, 1), mode="sum"
-        )
-        products = torch.view_as_complex(coarse[:, part, :, None]) * torch.view_as_complex(fine[:, part, None])
-        phases = torch.view_as_real(products).flatten(-3, -2)[:, :, None, :count]
-        moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2)) * torch.view_as_complex(phases)
+    def restored(taps: Tensor, weights: Tensor, coarse: Tensor, fine: Tensor) -> Tensor:
+        """Some rows of all images."""
+        fetched = embedding_bag(taps.flatten(0, 1), flat, per_sample_weights=weights.flatten(0, 1), mode="sum")
+        products = torch.view_as_real(torch.view_as_complex(coarse) * torch.view_as_complex(fine))
+        phases = torch.view_as_complex(products.flatten(2, 3)[:, :, None, :count])
+        moved = torch.view_as_complex(fetched.view(B * T, -1, C, count, 2)) * phases
         return rows_of(torch.view_as_real(moved))
 
-    parts = ((part, restored(part)) for part in runs(H, chunk_rows))
+    parts = ((part, restored(*chunk)) for part, chunk in zip(runs(H, chunk_rows), chunks, strict=True))
     stacked: Tensor = gathered(parts, H, 1).unflatten(0, (B, T)).movedim(3, 2)
     return stacked
 

@@ -24,7 +24,7 @@ from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
-from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_showing
+from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_and_displacement
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
@@ -55,19 +55,21 @@ class FrameMotion:
         shift = self.shift[stacks][:, members]
         return replace(self, vibration=vibration, frame_starts=self.frame_starts[members], shift=shift)
 
-    def frame_rows(self, scene_rows: Tensor) -> Tensor:
-        """Frame rows (B, T, S) that contain rows (S,) of the restored frames."""
-        return rows_showing(
+    def frame_rows(self, scene_rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Frame rows (B, T, S) that contain rows (S,) of the restored frames, and their ``mean_displacement``."""
+        rows, displacement = rows_and_displacement(
             scene_rows - self.shift[..., 1, None], self.frame_starts[:, None], self.timing, self.vibration
         )
+        return rows, displacement - self.shift[..., None, :]
 
     @cached_property
     def bounds(self) -> list[list[float]]:
         """Bound on the displacement in any frame of each stack, beyond the shift, in px along (x, y)."""
         half = 0.5 * (self.num_rows * self.timing.row_time + self.timing.exposure_time)
-        times = self.frame_starts[:, None] + half * torch.arange(3, dtype=torch.float64, device=self.shift.device)
-        first, middle, last = self.vibration.drift(times.expand(len(self.shift), -1, -1)).detach().unbind(-2)
-        drift = torch.maximum((first - middle).abs(), (last - middle).abs()).amax(1)
+        delays = torch.tensor([0.0, half, 2 * half], dtype=torch.float64, device=self.shift.device)
+        times = self.frame_starts[:, None] + delays
+        moved = self.vibration.drift(times.expand(len(self.shift), -1, -1)).detach()
+        drift = (moved - moved[:, :, 1:2]).abs().amax((1, 2))
         bounds: list[list[float]] = (self.vibration.largest_oscillation() + drift).tolist()
         return bounds
 
@@ -110,8 +112,8 @@ class FrameMotion:
     @cached_property
     def blur_lengths(self) -> NDArray[np.float64]:
         """Largest range (B, T, 2) of the displacement along (x, y) during the exposure of a row, in px."""
-        displacement = self.exposures[0].detach()
-        lengths: NDArray[np.float64] = (displacement.amax(-2) - displacement.amin(-2)).amax(2).cpu().numpy()
+        low, high = self.exposures[0].detach().aminmax(dim=-2)
+        lengths: NDArray[np.float64] = (high - low).amax(2).cpu().numpy()
         return lengths
 
 
@@ -123,16 +125,20 @@ def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows
     return FrameMotion(vibration, timing, starts, shift, num_rows)
 
 
-def motion_in_row_order(frames: PreparedFrames, vibration: Motion) -> Motion:
-    """The vibration in row order on the frames' device, batch shape (B,); one of another batch is refused."""
-    batch = frames.images.shape[0]
+def motion_of_frames(frames: PreparedFrames, vibration: Motion) -> FrameMotion:
+    """Motion of prepared frames by a vibration in image axes, batch shape () or (B,); one of another batch is refused.
+
+    Roll and zoom remain in the vibration: ``restore_in_strips`` makes strips of columns of such frames.
+    """
+    batch, count, _, height, _ = frames.images.shape
     if vibration.batch_shape not in ((), (batch,)) or (vibration.batch_shape and not frames.batched):
         raise ValueError(
             f"vibration of batch shape {tuple(vibration.batch_shape)} does not fit frames of shape {frames.shape}; "
             "one vibration, or one per stack of a (B, T, C, H, W) batch"
         )
     motion = vibration.to_row_order(frames.image_timing).to(frames.images.device)
-    return motion if motion.batch_shape else motion.expanded(batch)
+    motion = motion if motion.batch_shape else motion.expanded(batch)
+    return frame_motion(motion, frames.timing, count, height)
 
 
 @checks_arguments
@@ -178,9 +184,8 @@ def visible_pixels(
             of_column = ColumnMotion.of_columns(rowwise, column[None], row_timing, num_frames, height)
         motion = frame_motion(of_column, row_timing, num_frames, height)
         motion.check_fits(width)
-        rows = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
-        along = motion.mean_displacement(rows)[..., 0]
-        columns = torch.arange(first, last, device=vibration.device) + along[..., None]
+        rows, moved = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
+        columns = torch.arange(first, last, device=vibration.device) + moved[..., :1]
         visible_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
         parts.append(visible_rows & (columns >= 0) & (columns <= width - 1))
     mask = frames_from_row_order(torch.cat(parts, -1), timing)
@@ -234,7 +239,7 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
 
 
 def restore_in_strips(
-    method: Callable[..., Tensor], images: Tensor, motion: Motion, timing: RowTiming, options: Mapping[str, Any]
+    method: Callable[..., Tensor], images: Tensor, motion: FrameMotion, options: Mapping[str, Any]
 ) -> Tensor:
     """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom.
 
@@ -242,14 +247,13 @@ def restore_in_strips(
     has that option.
     """
     count, (height, width) = images.shape[1], images.shape[-2:]
-    if motion.same_for_all_columns:
-        of_frames = frame_motion(motion, timing, count, height)
-        of_frames.check_fits(width)
-        return method(images, of_frames, **options)
-    starts = timing.frame_starts(count).tolist()
+    if motion.vibration.same_for_all_columns:
+        motion.check_fits(width)
+        return method(images, motion, **options)
+    timing, starts = motion.timing, motion.frame_starts.tolist()
     end = starts[-1] + height * timing.row_time + timing.exposure_time
-    strips, neglected = _strips(motion, (height, width), starts[0], end)
-    of_strips = ColumnMotion.of_columns(motion, strips.columns, timing, count, height)
+    strips, neglected = _strips(motion.vibration, (height, width), starts[0], end)
+    of_strips = ColumnMotion.of_columns(motion.vibration, strips.columns, timing, count, height)
     cut = {
         name: strips.cut(value) if isinstance(value, Tensor) and value.shape[-2:] == images.shape[-2:] else value
         for name, value in options.items()

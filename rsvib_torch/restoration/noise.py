@@ -13,15 +13,18 @@ from statistics import NormalDist
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.execution.chunking import at_once, runs
+from rsvib_torch.execution.parallel import allowed_threads, in_parallel
 from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.numerics.fourier import squared_modulus, waves
+from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
 from rsvib_torch.restoration.scene_model.observation import row_kernels
-from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts
+from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts, taper
 
 # Squares for power spectra, and which parts of images count
 
@@ -36,8 +39,7 @@ def _cut_squares(images: Tensor, counts: Sequence[int]) -> Tensor:
 
 def _tapered(squares: Tensor) -> Tensor:
     """Squares minus their means, times a Hann window under which the power of white noise is its variance."""
-    window = torch.hann_window(_SIDE + 2, periodic=False, dtype=squares.dtype, device=squares.device)[1:-1]
-    window = window / window.square().sum().sqrt()
+    window = constant(taper, _SIDE, dtype=squares.dtype, device=squares.device)
     return (squares - squares.mean((-2, -1), keepdim=True)) * window * window[:, None]
 
 
@@ -73,6 +75,11 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
         >>> round(estimate_noise(0.1 * noise).item(), 2)
         0.1
     """
+    return torch.as_tensor(noise_deviation(frames, ignore), dtype=frames.dtype, device=frames.device)
+
+
+def noise_deviation(frames: Tensor, ignore: Tensor | None) -> Array:
+    """``estimate_noise`` as an array."""
     shape = (frames.shape[-2], frames.shape[-1])
     orders = [min(8, (extent - 1) // 2 + 1, extent - 1) for extent in shape]
     inner = [extent - order for extent, order in zip(shape, orders, strict=True)]
@@ -86,31 +93,48 @@ def estimate_noise(frames: Tensor, ignore: Tensor | None = None) -> Tensor:
         return inside.unfold(-2, block + orders[0], stride * block).unfold(-2, block + orders[1], block)
 
     # energy of the differences along both axes, relative to that of white noise of variance 1
-    down, along = (
-        torch.as_tensor(np.diff(np.eye(block + order), order, axis=0), dtype=frames.dtype, device=frames.device)
-        for order in orders
-    )
+    down, along = (constant(_differences, block, order, dtype=frames.dtype, device=frames.device) for order in orders)
     images = frames.reshape(-1, *shape)
     pixels = height * width // stride
-    parts = [
-        (down @ (blocks_of(images[part]) @ along.mT)).square().mean((-2, -1))
-        for part in runs(len(images), at_once(16 * pixels, frames.device, cpu_bytes=2**26))
-    ]
-    energy = torch.cat(parts).view(*frames.shape[:-2], *parts[0].shape[1:])
-    energy = energy / math.prod(math.comb(2 * order, order) for order in orders)
+    parts = []
+    for part in runs(len(images), at_once(16 * pixels, frames.device, cpu_bytes=2**26)):
+        blocks = blocks_of(images[part])
+        differences = (blocks.reshape(-1, blocks.shape[-1]) @ along.T).view(-1, blocks.shape[-2], block)
+        energy = torch.bmm(down.expand(len(differences), -1, -1), differences).square_().mean((-2, -1))
+        parts.append(energy.view(len(blocks), -1))
+    energy = torch.cat(parts)
     if ignore is not None:
         missing = blocks_of(ignore.to(frames.dtype)).mean((-2, -1))
-        energy = energy.masked_fill(~_mostly_measured(missing, (-2, -1)), math.nan)
-    energy = energy.flatten(-2)
+        energy = energy.masked_fill(~_mostly_measured(missing, (-2, -1)).view(energy.shape), math.nan)
+    powers = table(energy).reshape(*frames.shape[:-2], -1)
+    powers = powers / math.prod(math.comb(2 * order, order) for order in orders)
     # Means of squares of pure noise scatter, so that their low quantile lies below the true mean, by as much as that of
     # a chi-squared variable (Wilson and Hilferty 1931).
-    quantile = 0.15
+    share = 0.15
     variance = min(2.0 * math.prod(_correlation_area(difference) for difference in orders) / (9.0 * block**2), 0.2)
-    expected = (1.0 - variance + NormalDist().inv_cdf(quantile) * variance**0.5) ** 3
-    quiet = (energy.quantile if ignore is None else energy.nanquantile)(quantile, dim=-1) / expected
-    few = (~energy.isnan()).sum(-1) < 8  # too few blocks for a quantile
-    deviation: Tensor = torch.where(few, energy.nanmean(-1), quiet).sqrt()
+    expected = (1.0 - variance + NormalDist().inv_cdf(share) * variance**0.5) ** 3
+    few = (~np.isnan(powers)).sum(-1) < 8  # too few blocks for a quantile
+    deviation: Array = np.sqrt(np.where(few, valid_mean(powers, -1), quantile(powers, share, -1) / expected))
     return deviation
+
+
+def _differences(count: int, order: int) -> Array:
+    """Matrix (count, count + order) of differences of neighbours."""
+    matrix: Array = np.diff(np.eye(count + order), order, axis=0)
+    return matrix
+
+
+def _row_weights(count: int) -> Array:
+    """Weights (count,) of the rows of a square under its window."""
+    window = np.hanning(2 * count + 1)[1::2] ** 2
+    weights: Array = window / window.sum()
+    return weights
+
+
+def _pooled_frequencies() -> Array:
+    """Moduli (U', V') of the pooled frequencies of squares in cycles per px."""
+    modulus = np.hypot(np.fft.rfftfreq(_SIDE)[:, None], np.fft.fftfreq(_SIDE))
+    return table(_pooled(torch.from_numpy(modulus)))
 
 
 def _correlation_area(order: int) -> float:
@@ -153,46 +177,51 @@ def noise_of_blurred_frames(
     """
     num_stacks, num_frames = frames.shape[:2]
     shape, device = frames.shape[-2:], frames.device
-    nothing = torch.full((num_stacks, num_frames), math.nan, dtype=torch.float64, device=device)
+    result = np.full((num_stacks, num_frames), math.nan)
     if min(shape) < 2 * _SIDE or np.hypot(*motion.blur_lengths.max((0, 1))) < _LEAST_BLUR:
-        return nothing
+        return torch.from_numpy(result).to(device)
     # transfer of the blur of squares spread over the frame; the estimator needs frequencies that it blocks
     counts = _square_counts(shape, min(max(256 // num_frames, 25), 64))
     rows = torch.as_tensor(spread_starts(shape[0], _SIDE, counts[0])[:, None] + np.arange(_SIDE), device=device)
-    u = torch.fft.rfftfreq(_SIDE, dtype=torch.float64, device=device)
-    v = torch.fft.fftfreq(_SIDE, dtype=torch.float64, device=device)
-    used = _pooled(torch.hypot(u[:, None], v)) > min_frequency
+    u = constant(np.fft.rfftfreq, _SIDE, dtype=torch.float64, device=device)
+    v = constant(np.fft.fftfreq, _SIDE, dtype=torch.float64, device=device)
+    used = constant(_pooled_frequencies, dtype=u.dtype, device=device) > min_frequency
     displacement, node_weights = motion.exposures
     of_squares = displacement[:, :, rows]  # (B, T, n, rows, N, 2)
     blur = _power_transfer(of_squares[:, :, :, row_step // 2 :: row_step], node_weights, u, v)
-    transfer = _pooled(blur)[..., used]
-    blocked = (transfer < max_transfer).double().mean((1, 2, 3)).cpu().numpy() >= min_share
+    transfer = table(_pooled(blur)[..., used])
+    blocked = (transfer < max_transfer).mean((1, 2, 3)) >= min_share
     stacks = blocked.nonzero()[0].tolist()
     if not stacks:
-        return nothing
+        return torch.from_numpy(result).to(device)
     # power of the squares, mean over channels, with rows moved back by their displacement
     squares = _tapered(_cut_squares(frames[stacks], counts))  # (S, T, C, n, m, rows, columns)
     mean = (of_squares[stacks][..., 0] * node_weights).sum(-1)
     unshift = waves(mean, -u).to(frames.dtype.to_complex())  # aligns neighbouring rows along the row axis
     spectra = torch.fft.rfft(squares) * unshift[:, :, None, :, None]
-    power = squared_modulus(torch.fft.fft(spectra, dim=-2)).mean(2)
-    power = _pooled(power.transpose(-2, -1).to(torch.float64))[..., used]
-    transfer = transfer[stacks][:, :, :, None].expand_as(power)
-    power, transfer = power.flatten(2, 3).flatten(0, 1), transfer.flatten(2, 3).flatten(0, 1)
+    powers = squared_modulus(torch.fft.fft(spectra, dim=-2)).mean(2)
+    power = table(_pooled(powers.transpose(-2, -1).to(torch.float64))[..., used])  # (S, T, n, m, K)
+    transfer = np.broadcast_to(transfer[stacks][:, :, :, None], power.shape)
+    power, transfer = (values.reshape(len(stacks) * num_frames, -1, power.shape[-1]) for values in (power, transfer))
     # squares that count; frames with too few of them have no estimate
-    usable = (power > 0).any(-1)
+    usable = np.any(power > 0, -1)
     if ignore is not None:
         missing = _cut_squares(ignore[stacks].any(2), counts).double().mean((-2, -1))
-        usable = usable & _mostly_measured(missing.flatten(2).flatten(0, 1), (-1,))
+        usable &= table(_mostly_measured(missing.flatten(2).flatten(0, 1), (-1,)))
     enough = usable.sum(-1) >= min(4, usable.shape[-1])
-    noise = fit_noise(power.where(enough[:, None, None], 1.0), transfer, usable | ~enough[:, None])
-    nothing[stacks] = noise.masked_fill(~enough, math.nan).view(-1, num_frames)
-    return nothing
+    noise = np.full(len(enough), math.nan)
+    if enough.any():
+        spectra_of = [values[enough] for values in (power, transfer, usable)]
+        parts = runs(enough.sum(), -(-enough.sum() // allowed_threads()))
+        fitted = in_parallel(
+            lambda part: fit_noise(*(values[part] for values in spectra_of)), parts, torch.device("cpu")
+        )
+        noise[enough] = np.concatenate(fitted)
+    result[stacks] = noise.reshape(-1, num_frames)
+    return torch.from_numpy(result).to(device)
 
 
-def fit_noise(
-    power: Tensor, transfer: Tensor, usable: Tensor, *, iterations: int = 6, max_decrease: float = 0.5
-) -> Tensor:
+def fit_noise(power: Array, transfer: Array, usable: Array, *, iterations: int = 6, max_decrease: float = 0.5) -> Array:
     """Noise power (T,) by Fisher scoring of ``texture_p transfer_pk scene_k + noise``.
 
     ``power`` and ``transfer`` are (T, P, K) of P squares at K frequencies; squares that count are ``usable`` (T, P).
@@ -200,39 +229,37 @@ def fit_noise(
     has a standard deviation of about 1 %. ``max_decrease`` is the largest relative one of a parameter in a step; it
     keeps the powers positive.
     """
-    share = usable.to(power.dtype)[..., None]
-    share = share / share.sum(-2, keepdim=True)
-
-    def mean(values: Tensor) -> Tensor:
-        return (share * values).sum(-2, keepdim=True)
-
-    noise = mean(power).amin(-1, keepdim=True)
-    texture = torch.ones_like(power[..., :1])
-    scene = mean(power - noise).clamp(min=0.1 * noise) / mean(transfer)
+    share = usable[:, None] / usable.sum(-1)[:, None, None]  # (T, 1, P)
+    mean_power = share @ power
+    noise = mean_power.min(-1, keepdims=True)
+    texture = np.ones_like(power[..., :1])
+    scene = np.maximum(mean_power - noise, 0.1 * noise) / (share @ transfer)
     for _ in range(iterations):
         # step of scene and noise
         by_scene = texture * transfer  # derivative of the model with respect to the scene
         model = by_scene * scene + noise
-        weight, residual = share / model.square(), power - model
-        curvature = (by_scene.square() * weight).sum(-2, keepdim=True)
-        gradient = (by_scene * weight * residual).sum(-2, keepdim=True)
-        mixed = (by_scene * weight).sum(-2, keepdim=True)
+        weight, residual = share.mT / np.square(model), power - model
+        weighted = by_scene * weight
+        curvature = (by_scene * weighted).sum(-2, keepdims=True)
+        gradient = (weighted * residual).sum(-2, keepdims=True)
+        mixed = weighted.sum(-2, keepdims=True)
         # normal equations of scene and noise with the scene eliminated
-        reduced = (weight * residual).sum((-2, -1), keepdim=True) - (mixed * gradient / curvature).sum(-1, keepdim=True)
-        step = reduced / (weight.sum((-2, -1), keepdim=True) - (mixed.square() / curvature).sum(-1, keepdim=True))
-        step = step.clamp(min=-max_decrease * noise, max=noise)
-        scene = torch.maximum(scene + (gradient - mixed * step) / curvature, max_decrease * scene)
+        gain = mixed / curvature
+        reduced = (weight * residual).sum((-2, -1), keepdims=True) - (gain * gradient).sum(-1, keepdims=True)
+        step = reduced / (weight.sum((-2, -1), keepdims=True) - (gain * mixed).sum(-1, keepdims=True))
+        step = np.clip(step, -max_decrease * noise, noise)
+        scene = np.maximum(scene + (gradient - mixed * step) / curvature, max_decrease * scene)
         noise = noise + step
         # step of the texture, whose mean is one by definition
         by_texture = transfer * scene
         model = texture * by_texture + noise
-        weight, residual = model.square().reciprocal(), power - model
-        change = (by_texture * weight * residual).sum(-1, keepdim=True)
-        change = change / (by_texture.square() * weight).sum(-1, keepdim=True)
-        texture = torch.maximum(texture + change, max_decrease * texture)
-        typical = mean(texture)
+        weighted = by_texture / np.square(model)
+        change = (weighted * (power - model)).sum(-1, keepdims=True) / (by_texture * weighted).sum(-1, keepdims=True)
+        texture = np.maximum(texture + change, max_decrease * texture)
+        typical = share @ texture
         texture, scene = texture / typical, scene * typical
-    return noise[:, 0, 0]
+    result: Array = noise[:, 0, 0]
+    return result
 
 
 def _square_counts(shape: torch.Size, most: int) -> list[int]:
@@ -247,9 +274,9 @@ def _power_transfer(displacement: Tensor, node_weights: Tensor, u: Tensor, v: Te
     along = waves(displacement[..., 0], u) * node_weights[:, None]
     across = waves(displacement[..., 1], v)
     size = displacement.shape[-3]
-    window = torch.hann_window(2 * size + 1, periodic=False, dtype=u.dtype, device=u.device)[1::2].square()
+    weights = constant(_row_weights, size, dtype=u.dtype, device=u.device)
     transfer = squared_modulus(along.transpose(-2, -1) @ across)
-    return (transfer * (window / window.sum())[:, None, None]).sum(-3)
+    return (transfer * weights[:, None, None]).sum(-3)
 
 
 def _pooled(values: Tensor) -> Tensor:
@@ -502,19 +529,24 @@ def noise_levels(frames: Tensor, motion: FrameMotion, ignore: Tensor | None = No
     assigned the median noise power of the others of its stack. The frames (B, T, C, H, W) are in row order, with local
     means at pixels to ``ignore``.
     """
-    high_pass = estimate_noise(frames, ignore).square().nanmean(-1).masked_fill(_constant(frames), math.nan)
-    power, waiting = high_pass, torch.ones_like(high_pass[:, :1], dtype=torch.bool)
+    alone = valid_mean(np.square(noise_deviation(frames, ignore)), -1)
+    alone[_constant(frames)] = math.nan
+    high_pass = torch.as_tensor(alone, dtype=frames.dtype, device=frames.device)
+    power, waiting = alone, np.full((len(alone), 1), True)
     for estimator in ESTIMATORS.values():
-        estimated = estimator(frames, motion, ignore, high_pass).to(power.dtype)
-        lowered = torch.minimum(high_pass, estimated.nan_to_num(nan=math.inf))
-        applies = waiting & ~estimated.isnan().all(1, keepdim=True)
-        power, waiting = torch.where(applies, lowered, power), waiting & ~applies
-        if not bool(waiting.any()):
+        estimated = table(estimator(frames, motion, ignore, high_pass))
+        applies = waiting & ~np.isnan(estimated).all(1, keepdims=True)
+        # a frame that the estimator cannot estimate keeps its power, NaN included
+        power = np.where(applies, np.minimum(alone, without_nan(estimated, math.inf)), power)
+        waiting &= ~applies
+        if not waiting.any():
             break
-    return torch.where(power.isnan(), power.nanmedian(1, keepdim=True).values, power).nan_to_num(nan=0.0).sqrt()
+    power = without_nan(np.where(np.isnan(power), median(power, 1, keepdims=True), power), 0.0)
+    return torch.as_tensor(np.sqrt(power), dtype=frames.dtype, device=frames.device)
 
 
-def _constant(frames: Tensor, row_step: int = 8, tolerance: float = 1e-6) -> Tensor:
+def _constant(frames: Tensor, row_step: int = 8, tolerance: float = 1e-6) -> NDArray[np.bool_]:
     """Frames (B, T) whose values, in every eighth row, are equal to within rounding: they hold not even noise."""
-    low, high = frames[..., ::row_step, :].flatten(2).aminmax(dim=-1)
-    return high - low <= tolerance * torch.maximum(-low, high)
+    low, high = tables(*frames[..., ::row_step, :].flatten(2).aminmax(dim=-1))
+    constant: NDArray[np.bool_] = high - low <= tolerance * np.maximum(-low, high)
+    return constant

@@ -18,7 +18,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.fourier import waves
 from rsvib_torch.options import RestorationMtfOptions
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, motion_in_row_order
+from rsvib_torch.restoration.frame_motion import FrameMotion, motion_of_frames
 from rsvib_torch.restoration.noise import estimate_noise
 from rsvib_torch.restoration.restore import restore_prepared
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
@@ -169,7 +169,7 @@ def restoration_mtf(
         raise ValueError(f"one stack of frames of at least 32 x 32 px required, got shape {prepared.shape}")
     vibration, _ = vibration_to_undo(vibration, timing, count, size[0])
     check_two_axes(vibration, "the MTF of a restoration")
-    motion = frame_motion(motion_in_row_order(prepared, vibration), prepared.timing, count, size[0])
+    motion = motion_of_frames(prepared, vibration)
     points = options.scale
     # neighbours and their aliases 1 - u are at least half a step apart: more than the taper mixes
     cycles = max(4, min(40, min(size) // 5))

@@ -27,7 +27,7 @@ from rsvib_torch.restoration.banded import restore_banded
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.exact.exact import restore_exact
 from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
-from rsvib_torch.restoration.frame_motion import motion_in_row_order, restore_in_strips
+from rsvib_torch.restoration.frame_motion import FrameMotion, motion_of_frames, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
 from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
@@ -171,7 +171,7 @@ def restore(
         warn_of_restoration(str(reason))
     if left_alone and not bool(vibration.moving_axes().any()):
         return unchanged_frames(prepared, options.joint, options.scale)
-    motion = motion_in_row_order(prepared, vibration)
+    motion = motion_of_frames(prepared, vibration)
     restored = _restored(prepared, motion, options)
     if options.check:  # before frames are sharpened: the verdict compares them with raw frames, blurred by the optics
         with threads_for(prepared.images):
@@ -188,11 +188,11 @@ def restore_prepared(frames: PreparedFrames, vibration: Motion, options: Restora
 
     The motion is in image axes, the result (B, T, C, H, W) in row order.
     """
-    return _restored(frames, motion_in_row_order(frames, vibration), options)
+    return _restored(frames, motion_of_frames(frames, vibration), options)
 
 
-def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOptions) -> Tensor:
-    """Frames restored with a motion (B) in row order, with the masks that the method takes."""
+def _restored(frames: PreparedFrames, motion: FrameMotion, options: RestorationOptions) -> Tensor:
+    """Frames restored with their motion, with the masks that the method takes."""
     method = METHODS[options.method]
     chosen = method if frames.colours is None else method.mosaic
     assert chosen is not None, "methods without mosaic have no option mosaic"
@@ -203,7 +203,7 @@ def _restored(frames: PreparedFrames, motion: Motion, options: RestorationOption
     if chosen.strips:
         more["strips"] = 1
     with threads_for(frames.images):
-        return restore_in_strips(chosen.function, frames.filled, motion, frames.timing, {"options": options, **more})
+        return restore_in_strips(chosen.function, frames.filled, motion, {"options": options, **more})
 
 
 def restore_each(
@@ -277,15 +277,15 @@ def _as_taken(frames: PreparedFrames, joint: bool | int, scale: int) -> Tensor:
     return enlarged(images[:, middle : middle + 1] if joint is True else images, scale)
 
 
-def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: Motion, joint: bool | int) -> None:
-    """Judge the stacks that move, by a motion (B) in row order, on 160 columns of two pairs of frames."""
+def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: FrameMotion, joint: bool | int) -> None:
+    """Judge the stacks that move on 160 columns of two pairs of frames."""
     if frames.images.shape[1] < 2:
         return
-    moves = {stack: axes for stack, axes in enumerate(motion.moving_axes().tolist()) if any(axes)}
-    verdicts = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=2, columns=160)
+    moves = {stack: [bound > 0 for bound in bounds] for stack, bounds in enumerate(motion.bounds) if any(bounds)}
+    verdicts = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=2, columns=160, least="partly")
     for stack, verdict in zip(moves, verdicts, strict=True):
         # frames that share no scene cannot be compared
-        if isinstance(verdict, RestorationVerdict) and verdict.overall in ("partly", "worse"):
+        if isinstance(verdict, RestorationVerdict):
             where = f"stack {stack}: " if len(restored) > 1 else ""
             warn_of_restoration(f"{where}{verdict.sentence}")
 

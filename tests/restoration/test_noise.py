@@ -16,7 +16,6 @@ from rsvib_torch.restoration.noise import (
     noise_of_blurred_frames,
 )
 from rsvib_torch.restoration.scene_model.observation import (
-    interpolation_error,
     kernel_spectrum,
     kernel_weights,
     scene_weights,
@@ -199,9 +198,9 @@ def test_kernel_between_rows():
     assert (weights.sum(-1) - 1).abs().max() < 6e-4
     frequencies = torch.tensor([0.05, 0.2, 0.35], dtype=torch.float64)
     rows = np.arange(-40, 41)
-    for frequency, response, alias in zip(
-        frequencies, kernel_spectrum(frequencies), interpolation_error(frequencies), strict=True
-    ):
+    cycles = torch.tensor([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+    aliases = kernel_spectrum(frequencies[:, None] + cycles).square().sum(-1)
+    for frequency, response, alias in zip(frequencies, kernel_spectrum(frequencies), aliases, strict=True):
         wave = np.exp(2j * np.pi * frequency.item() * rows)
         fractions = (np.arange(400) + 0.5) / 400
         taps = kernel_weights(torch.from_numpy(fractions)).numpy()

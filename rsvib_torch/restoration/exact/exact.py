@@ -7,7 +7,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -20,7 +20,7 @@ from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.fourier import extend_rows, extended_length, fast_length
-from rsvib_torch.numerics.tables import take_stacks
+from rsvib_torch.numerics.tables import table, tables, take_stacks
 from rsvib_torch.options import ExactOptions
 from rsvib_torch.restoration.exact.filling import (
     FILLED_BLUR_REACH,
@@ -134,6 +134,7 @@ class FrameModel:
     unknown: Tensor | None  # (B, T, C, H, W) bool, pixels without data and saturated ones; None for none
     clipped: Tensor | None  # (B, T, C, H, W) bool, the saturated ones
     strips: int  # number of neighbouring stacks that are strips of columns of the same frames
+    _known: dict[tuple[bytes, ...], RowKernels] = field(default_factory=dict)  # kernels of the last scenes
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
@@ -160,21 +161,34 @@ class FrameModel:
         device = self.frames.device
         return torch.as_tensor(scenes.stack[:, None], device=device), torch.as_tensor(scenes.members, device=device)
 
-    def _moved_along(self, scenes: Scenes) -> NDArray[np.float64]:
-        """(N, M) px by which the frames are moved along the rows relative to the restored one."""
-        along = self.motion.shift[..., 0].cpu().numpy()
-        moved: NDArray[np.float64] = along[scenes.stack[:, None], scenes.members]
-        moved -= along[scenes.stack, scenes.reference][:, None]
-        return moved
+    @cached_property
+    def _shift(self) -> NDArray[np.float64]:
+        return table(self.motion.shift)
 
-    def kernels(self, scenes: Scenes, contributes: NDArray[np.bool_]) -> RowKernels:
-        """Kernels of the frames of scenes, in the coordinates of their reference; of weight 0 where stated."""
-        index = self._indices(scenes)
-        displacement, node_weights = self.motion.exposures
-        shift = self.motion.shift[scenes.stack, scenes.reference]
-        moved = displacement[index] - shift[:, None, None, None]
-        weights = self.weights[index] * torch.as_tensor(contributes, device=self.frames.device)
-        return GRIDS[self.scale][0](moved.flatten(0, 1), node_weights, weights.flatten(), self.frames.shape[-2])
+    def _moved(self, scenes: Scenes) -> NDArray[np.float64]:
+        """(N, M, 2) px by which the frames are moved along (x, y) relative to the restored one."""
+        moved: NDArray[np.float64] = self._shift[scenes.stack[:, None], scenes.members]
+        return moved - self._shift[scenes.stack, scenes.reference][:, None]
+
+    def _row_kernels(self, scenes: Scenes) -> RowKernels:
+        """Kernels of the frames of scenes, in the coordinates of their reference; those of the last call are kept."""
+        key = tuple(values.tobytes() for values in (scenes.stack, scenes.members, scenes.reference))
+        known = self._known.get(key)
+        if known is None:
+            index = self._indices(scenes)
+            displacement, node_weights = self.motion.exposures
+            shift = torch.as_tensor(self._shift[scenes.stack, scenes.reference], device=displacement.device)
+            moved = (displacement[index] - shift.view(-1, 1, 1, 1, 2)).flatten(0, 1)
+            make, height = GRIDS[self.scale][0], self.frames.shape[-2]
+            known = make(moved, node_weights, self.weights[index].flatten(), height)
+            self._known.clear()
+            self._known[key] = known
+        return known
+
+    def _weighted(self, kernels: RowKernels, contributes: NDArray[np.bool_]) -> RowKernels:
+        """Kernels of scenes, of weight 0 where frames do not contribute."""
+        used = torch.as_tensor(contributes.reshape(-1, 1), device=self.frames.device)
+        return replace(kernels, weight=kernels.weight * used)
 
     def places(self, scenes: Scenes) -> list[Tensor]:
         """Mean displacement (M, R, 2) of the rows of the frames of each scene."""
@@ -191,15 +205,12 @@ class FrameModel:
         """Factors (N,) on the priors, estimated from those frames whose columns are the same as in the restored one."""
         if not isinstance(self.prior, RowPrior):
             return np.ones(len(scenes.stack))  # the strength of other priors is not selected
-        index = self._indices(scenes)
-        same = scenes.contributes & (self._moved_along(scenes) == 0)
-        same_shift = self.motion.shift[..., 1].cpu().numpy()
-        same &= same_shift[scenes.stack[:, None], scenes.members] == same_shift[scenes.stack, scenes.reference][:, None]
+        same = scenes.contributes & (self._moved(scenes) == 0).all(-1)
         # frames of the same stack, and of strips of the same frames, with the same noise to 20 % have one strength
-        used = torch.as_tensor(same, device=self.frames.device)
-        weights = (self.weights[index] * used).sum(1) / used.sum(1)
-        interpolation = self.prior.interpolation_power.mean(-1)[index].mean(1)
-        noise = (self.level[index[0][:, 0]].square() / weights + interpolation).detach().log().tolist()
+        weights, level, interpolation = tables(self.weights, self.level, self.prior.interpolation_power.mean(-1))
+        place = scenes.stack[:, None], scenes.members
+        weight = (weights[place] * same).sum(1) / same.sum(1)
+        noise = np.log(level[scenes.stack] ** 2 / weight + interpolation[place].mean(1))
         chosen: list[int] = []
         representative = []
         for number, stack in enumerate(scenes.stack // self.strips):
@@ -209,13 +220,19 @@ class FrameModel:
             representative.append(found)
         # cross-validation of as many scenes at a time as the memory allows
         scene_bytes = 4 * self.frames[0, 0].numel() * scenes.members.shape[1]
-        strengths = np.ones(len(scenes.stack))
+        strengths, together = np.ones(len(scenes.stack)), len(_blocks(self, scenes)) == 1
         for part in runs(len(chosen), at_once(scene_bytes, self.frames.device, cpu_bytes=_FRAME_BYTES)):
             some = take_stacks([scenes], np.array(chosen[part]))
             stack_of, member_of = self._indices(some)
+            # kernels that are used again if all scenes are solved together
+            if together:
+                frames_of = np.arange(same.size).reshape(same.shape)[chosen[part]].ravel()
+                kernels = self._row_kernels(scenes).of(torch.as_tensor(frames_of, device=stack_of.device))
+            else:
+                kernels = self._row_kernels(some)
             strengths[chosen[part]] = prior_strengths(
-                self.frames.detach()[stack_of, member_of],
-                self.kernels(some, same[chosen[part]]),
+                self.frames[stack_of, member_of],
+                self._weighted(kernels, same[chosen[part]]),
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
                 self._blur_reaches(some)[:, None],
@@ -233,7 +250,7 @@ class FrameModel:
         outer = np.isin(scenes.stack % self.strips, (0, self.strips - 1))
         ends = (outer & (self._blur_reaches(scenes) > FILLED_BLUR_REACH)) | (self.scale > 1)
         incomplete = (self.measured[scenes.stack[:, None], scenes.members] < 1).any(1)
-        moved = self._moved_along(scenes).any(1)
+        moved = self._moved(scenes)[..., 0].any(1)
         kinds = np.where(moved | incomplete, "pixels", np.where(ends, "extension", "nothing"))
         return [kind + (" and ends" if kind == "pixels" and end else "") for kind, end in zip(kinds, ends, strict=True)]
 
@@ -246,15 +263,13 @@ class FrameModel:
         data = extend_rows(self.frames[index] - self.mean[stack_of][:, None], self.period)
 
         # Observation operator, and precision of the prior.
-        kernels = self.kernels(scenes, scenes.contributes)
+        kernels = self._weighted(self._row_kernels(scenes), scenes.contributes)
         operator = GRIDS[self.scale][1]
         observation = operator(kernels, self.frames.shape[-2], self.period, data.dtype, len(data))
         level = self.level[stack_of]
         if isinstance(self.prior, RowPrior):
-            strength, reach = (
-                torch.as_tensor(values[:, None], dtype=data.dtype, device=data.device)
-                for values in (scenes.strength, self._blur_reaches(scenes))
-            )
+            factors = np.stack([scenes.strength, self._blur_reaches(scenes)])[..., None]
+            strength, reach = torch.as_tensor(factors, dtype=data.dtype, device=data.device)
             prior = self.prior.of(stack_of, index[1])
             precision = prior.precision(level[:, None].square(), strength, reach)
         else:
@@ -267,7 +282,7 @@ class FrameModel:
             return problem
         if kind == "extension":
             return with_extension(problem, width)
-        along = torch.as_tensor(self._moved_along(scenes), device=data.device)
+        along = torch.as_tensor(self._moved(scenes)[..., 0], device=data.device)
         unknown = None if self.unknown is None else self.unknown[index]
         measured = measured_values(along, unknown, data.shape, width, ends=kind.endswith("ends"))
         floor = None
@@ -299,11 +314,13 @@ def model_frames(
         parts = [first + strip for first in range(0, B, strips) for strip in chosen]
         every = strips == 1
         measured = noise_levels(
-            frames.detach() if every else frames.detach()[parts],
+            frames if every else frames[parts],
             motion if every else motion.of(parts),
             unknown if every or unknown is None else unknown[parts],
         )
-        powers = measured.square().unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
+        powers = measured.square()
+        if not every:
+            powers = powers.unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
     powers = powers.clamp(min=_MIN_LEVEL**2)

@@ -19,9 +19,8 @@ from torch import Tensor
 
 from rsvib_torch.execution.chunking import runs
 from rsvib_torch.execution.parallel import allowed_threads, in_parallel
-from rsvib_torch.numerics.fourier import waves
-from rsvib_torch.numerics.tables import Array
-from rsvib_torch.restoration.scene_model.observation import RowKernels
+from rsvib_torch.numerics.tables import Array, table
+from rsvib_torch.restoration.scene_model.observation import RowKernels, prior_diagonals
 from rsvib_torch.restoration.scene_model.scene_prior import ORDER, RowPrior, bounded_ratio
 
 _SLAB_ROWS = 128  # rows solved side by side, each slab by itself: enough for the dependence on distant rows to vanish
@@ -140,17 +139,14 @@ def _add_row_prior(bands: Array, precision: Array, rows: int, width: int) -> Non
 
     The bands are (rows + width, 2 width + 1, N, U), of N scenes.
     """
-    for d in range(len(precision)):
-        for side in {d, -d}:
-            # rows of the scene: the sum of the products; the first and the last ones are predicted from fewer rows
-            top, bottom = max(0, -side), rows - max(0, side)
-            inner = bands[top:bottom, width + side]
-            inner += precision[d].sum(0)
-            for k in range(1, len(precision) - d):
-                first = bands[top : top + k, width + side]
-                first -= precision[d, k]
-                last = bands[bottom - k : bottom, width + side]
-                last -= precision[d, k]
+    order = len(precision) - 1
+    added = prior_diagonals(order) @ precision.reshape((order + 1) ** 2, -1)
+    added = added.reshape(2 * order + 1, 2 * order + 1, *precision.shape[2:])
+    near = bands[:rows, width - order : width + order + 1]
+    near += added[order]
+    # the first and the last rows are predicted from fewer rows
+    near[:order] += added[:order]
+    near[::-1, ::-1][:order] += added[:order]
 
 
 def _factored(skewed: Array, count: int) -> tuple[Array, Array]:
@@ -197,6 +193,7 @@ def sample_rows(
     scenes, members, channels = images.shape[:3]
     slabs = max(1, images.shape[-2] // slab_rows)
     height, width = images.shape[-2] // slabs, images.shape[-1]
+    kernels = kernels.rows(0, slabs * height)
     # spectra of the rows, minus the mean of the image
     taper = np.hanning(width + 2)[1:-1]
     angles = -2 * np.pi * (np.arange(width)[:, None] * chosen % width) / width
@@ -208,9 +205,9 @@ def sample_rows(
     # kernels of the rows at these frequencies
     u = chosen / width
     frequencies = torch.from_numpy(u).to(images.device)
-    kernel_on_device = kernels.taps.to(torch.complex128) @ waves(kernels.along, frequencies)  # (S M, R, J, F)
-    tables = (kernel_on_device.to(images.dtype.to_complex()), kernels.first, kernels.middle, kernels.weight)
-    kernel, first, middle, weight = (table[:, : slabs * height].cpu().numpy() for table in tables)
+    on_device = kernels.at(frequencies).to(images.dtype.to_complex())  # (S M, R, J, F)
+    tables = (on_device, kernels.first, kernels.middle, kernels.weight)
+    kernel, first, middle, weight = (values.cpu().numpy() for values in tables)
     phase = np.exp(2j * np.pi * middle[..., None] * u).astype(spectra.dtype)
     spectra = spectra * phase.reshape(scenes, members, 1, -1, len(u))
 
@@ -297,10 +294,10 @@ def prior_strengths(
         *(table[..., place.to(table.device)] for table in (prior.power, prior.reflections, prior.interpolation_power))
     )
     # less noise than 200 times the interpolation error of the kernel cannot be distinguished from it
-    above = noise_power[:, 0] > 200.0 * prior.interpolation_power.mean((1, 2))
+    above = table(noise_power)[:, 0] > 200.0 * table(prior.interpolation_power.mean((1, 2)))
     products, ratio = at.products().cpu().numpy(), at.ratio(noise_power).cpu().numpy()
     precisions = np.stack([products * bounded_ratio(ratio * strength, blur_reach) for strength in _STRENGTHS])
-    return select_strengths(precisions, above.cpu().numpy() & certain, sample.explain)
+    return select_strengths(precisions, above & certain, sample.explain)
 
 
 def select_strengths(

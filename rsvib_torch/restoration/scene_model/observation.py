@@ -11,19 +11,22 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.imaging.blur import row_taps, row_transfer
 from rsvib_torch.numerics.banded_solver import from_both_ends
 from rsvib_torch.numerics.fourier import shift_phases
 from rsvib_torch.numerics.splines import correlated, gauss_legendre
+from rsvib_torch.numerics.tables import constant
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH
@@ -46,15 +49,15 @@ _POLYNOMIAL = (
 def _kernel(distance: Tensor) -> Tensor:
     """Kernel at distances of at most ``KERNEL_REACH``."""
     square = (distance / KERNEL_REACH).square()
-    value = torch.full_like(square, _POLYNOMIAL[-1])
-    for coefficient in _POLYNOMIAL[-2::-1]:
-        value = value * square + coefficient
+    *lower, value = constant(np.array, _POLYNOMIAL, dtype=square.dtype, device=square.device).unbind()
+    for coefficient in reversed(lower):
+        value = torch.addcmul(coefficient, value, square)
     return value * (1 - square).square()
 
 
 def kernel_weights(fraction: Tensor) -> Tensor:
     """Weights (S, 6) of the six rows ``n - 2 ... n + 3`` at positions ``n + fraction`` (S); their sum is 1 to 5e-4."""
-    taps = torch.arange(TAPS, dtype=fraction.dtype, device=fraction.device) - (KERNEL_REACH - 1)
+    taps = torch.arange(1 - KERNEL_REACH, KERNEL_REACH + 1, dtype=fraction.dtype, device=fraction.device)
     return _kernel(fraction[..., None] - taps)
 
 
@@ -63,12 +66,18 @@ def kernel_samples() -> tuple[float, ...]:
     return tuple(_kernel(torch.arange(1 - KERNEL_REACH, KERNEL_REACH, dtype=torch.float64, device="cpu")).tolist())
 
 
+@cache
+def _kernel_nodes() -> tuple[Tensor, Tensor]:
+    """Distances on one side at which the kernel is integrated, times 2 pi, and twice its values times the weights."""
+    nodes, weights = gauss_legendre(32)
+    places = nodes * KERNEL_REACH
+    return 2 * torch.pi * places, 2 * KERNEL_REACH * weights * _kernel(places)
+
+
 def kernel_spectrum(frequencies: Tensor) -> Tensor:
     """Fourier transform of the kernel at frequencies in cycles per row."""
-    nodes, weights = gauss_legendre(32)  # of one side
-    places = (nodes * KERNEL_REACH).to(frequencies)
-    values = 2 * KERNEL_REACH * weights.to(frequencies) * _kernel(places)
-    return torch.cos(2 * torch.pi * frequencies[..., None] * places) @ values
+    places, values = (table.to(frequencies) for table in _kernel_nodes())
+    return torch.cos(frequencies[..., None] * places) @ values
 
 
 @cache
@@ -87,12 +96,6 @@ def scene_weights() -> tuple[float, ...]:
     count = torch.exp(-0.5 * (2 * torch.pi * 0.6 * v).square()) / ((v + 0.02) * spectrum)
     half = torch.linalg.lstsq(cosines * count[:, None], (spectrum * count)[:, None]).solution[:, 0]
     return tuple(torch.cat([half.flip(0), half[1:]]).tolist())
-
-
-def interpolation_error(frequencies: Tensor, cycles: Sequence[int] = (-3, -2, -1, 1, 2, 3)) -> Tensor:
-    """Power of the aliases, at offsets of ``cycles`` per row, that a wave of unit coefficients has between the rows."""
-    aliases = frequencies[..., None] + torch.tensor(cycles, dtype=torch.float64, device="cpu").to(frequencies)
-    return kernel_spectrum(aliases).square().sum(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +124,14 @@ class RowKernels:
         """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
         return -SCENE_REACH, num_rows + SCENE_REACH
 
+    def of(self, frames: Tensor) -> "RowKernels":
+        """Kernels of some of the frames."""
+        return RowKernels(*(value[frames] for value in vars(self).values() if isinstance(value, Tensor)))
+
     def rows(self, top: int, count: int) -> "RowKernels":
         """Kernels of ``count`` rows from row ``top`` on, counted from there."""
+        if count == self.first.shape[1]:
+            return self
         first, *others = (
             value[:, top : top + count] for value in (self.first, self.taps, self.middle, self.along, self.weight)
         )
@@ -150,7 +159,7 @@ def row_kernels(
 
 def about_middle(along: Tensor) -> tuple[Tensor, Tensor]:
     """Middles (M, R) of the ranges of displacements (M, R, N), and the displacements relative to them."""
-    middle = 0.5 * (along.detach().amin(-1) + along.detach().amax(-1))
+    middle = torch.stack(along.detach().aminmax(dim=-1)).mean(0)
     return middle, along - middle[..., None]
 
 
@@ -203,14 +212,15 @@ class SmoothKernels:
     reach: float  # largest distance along the rows in px from their middles
     symmetric: bool = True  # whether kernels at -u are the conjugates of those at u
 
-    def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[Tensor]:
-        """Kernels (M R, U), or their conjugates, without the phase of their middles, one tap after the other."""
+    def taps(self, u: Tensor, *, conjugate: bool = False) -> Iterator[tuple[slice, Tensor]]:
+        """Kernels (j, M R, U) of some taps, or their conjugates, without the phase of their middles: less memory."""
         right = interpolation_matrix(self.reach, u, self.left.dtype, symmetric=self.symmetric)[1]
         if conjugate:
-            right[:, 1::2] *= -1
+            right[:, 1::2].neg_()
         right = right.to(self.left)
-        for tap in self.left:
-            yield torch.view_as_complex((tap @ right).unflatten(-1, (-1, 2)))
+        count = at_once(self.left.element_size() * self.left[0, :, 0].numel() * right.shape[1], right.device)
+        for part in runs(len(self.left), count):
+            yield part, torch.view_as_complex((self.left[part] @ right).unflatten(-1, (-1, 2)))
 
 
 def smooth_kernels(kernels: RowKernels, dtype: torch.dtype) -> SmoothKernels:
@@ -249,20 +259,23 @@ class SmoothBand:
         faults in fresh memory take as long as the product that fills it.
         """
         bands = self._product(interpolation_matrix(self.reach, u, self.left.dtype, symmetric=True)[1], out)
-        real = bands[..., 0].unflatten(3, (-1, self.windows))
-        halves = real[:, :, 0], real[:, :, 1]  # (H + b, 2 b + 1, N, W, U) each
-        precision = precision[:, :, :, None].to(bands.dtype)
-        width, half = self.width, len(self.left) - self.width
-        for d in range(len(precision)):
-            for side in {d, -d}:
-                # rows of the scene: the sum of the products; the middle rows in the first half only
-                top, total = max(0, -side), precision[d].sum(0)
-                halves[0][top : half - max(0, side), width + side].add_(total)
-                halves[1][top : self.rows - half + top, width + side].add_(total)
-                # rows at the ends of the scene are predicted from fewer rows
-                for k in range(1, len(precision) - d):
-                    halves[0][top : top + k, width + side, :, :1].sub_(precision[d, k])
-                    halves[1][top : top + k, width + side, :, -1:].sub_(precision[d, k])
+        order, half = len(precision) - 1, len(self.left) - self.width
+        # what is added to the diagonals of the first p rows of the scene, of all rows, and of the first p middle rows
+        selected = constant(prior_diagonals, order, dtype=precision.dtype, device=precision.device)
+        added = (selected @ precision.reshape((order + 1) ** 2, -1)).to(bands.dtype)
+        added = added.view(2 * order + 1, 2 * order + 1, *precision.shape[2:3], 1, precision.shape[3])
+        ends, inner, middle = added.split([order, 1, order])
+        # real parts of the diagonals of both halves (H + b, 2 p + 1, N, W, U)
+        near = bands[:, self.width - order : self.width + order + 1, ..., 0].unflatten(3, (-1, self.windows))
+        first, second = near[:, :, 0], near[:, :, 1]
+        first[:half].add_(inner)
+        # the entries between the middle rows are in the first half only
+        eliminated = self.rows - half
+        second[:eliminated].add_(inner)
+        second[eliminated : eliminated + order].add_(middle)
+        # rows at the ends of the scene are predicted from fewer rows
+        first[:order, ..., :1, :].add_(ends)
+        second[:order, ..., -1:, :].add_(ends)
         return torch.view_as_complex(bands).flatten(2)
 
     def _product(self, right: Tensor, out: Tensor | None) -> Tensor:
@@ -273,6 +286,22 @@ class SmoothBand:
         else:
             product = torch.mm(rows, right, out=torch.view_as_real(out).view(len(rows), -1))
         return product.view(*self.left.shape[:4], -1, 2)
+
+
+@cache
+def prior_diagonals(order: int) -> NDArray[np.float64]:
+    """Factors ((2 p + 1)^2, (p + 1)^2) of products of a prior, as they are added to diagonals -p ... p of bands.
+
+    Row p has the sum of the products at each distance, for all rows of a scene; the rows above what the first rows of
+    the scene lack; the rows below the sums for columns before row p, if row p is the first of the middle rows.
+    """
+    factors = np.zeros((2 * order + 1, 2 * order + 1, order + 1, order + 1))
+    for side in range(-order, order + 1):
+        d, top = abs(side), max(0, -side)
+        factors[order : order + 1 + top, order + side, d, : order + 1 - d] = 1.0
+        for k in range(1, order + 1 - d):
+            factors[top : top + k, order + side, d, k] = -1.0
+    return factors.reshape((2 * order + 1) ** 2, -1)
 
 
 def normal_matrices(
@@ -286,17 +315,17 @@ def normal_matrices(
     nodes, _ = interpolation_matrix(2 * kernels.blur_reach, None, dtype, symmetric=kernels.symmetric)
     nodes = nodes.to(kernels.middle.device)
     values = kernels.at(nodes)
-    weighted = values * kernels.weight[..., None, None]
+    weighted = (values * kernels.weight[..., None, None]).conj().resolve_conj()
     # entry of A[k, k + d] of a scene, whose rows are followed by b rows that are 0
     diagonals, taps = 2 * width + 1, values.shape[-2]
     scene = torch.arange(num_scenes, device=nodes.device).repeat_interleave(len(kernels.first) // num_scenes)
     row = kernels.first - top + (count + width) * scene[:, None]
-    columns = torch.arange(taps, device=nodes.device)
+    first = (diagonals * row + width)[..., None, None] + torch.arange(taps, device=nodes.device)
+    first = first + (diagonals - 1) * torch.arange(taps, device=nodes.device)[:, None]  # (M, R, J, J)
     bands = values.new_zeros(num_scenes * (count + width) * diagonals, len(nodes))
-    for tap in range(taps):  # one at a time: less memory
-        entry = (diagonals * (row + tap) + width - tap)[..., None] + columns
-        products = weighted[..., tap, None, :].conj() * values
-        bands = bands.index_add_(0, entry.flatten(), products.flatten(0, 2))
+    for part in runs(taps, at_once(16 * values.numel(), nodes.device)):  # few taps at a time: less memory
+        products = weighted[..., part, None, :] * values[..., None, :, :]
+        bands = bands.index_add_(0, first[..., part, :].flatten(), products.flatten(0, 3))
     normal: Tensor = _stacked(bands).view(num_scenes, count + width, diagonals, -1).permute(1, 2, 0, 3)
     return normal
 
@@ -325,7 +354,8 @@ class Observation:
         self._smooth = smooth_kernels(kernels, dtype)
         scene = torch.arange(num_scenes, device=kernels.first.device)[:, None, None]
         place = kernels.first.unflatten(0, (num_scenes, -1)) - self.top + self.count * scene
-        self._first = place.flatten()  # of the coefficients of all scenes, one scene after the other
+        # coefficients of the taps of each row (J, N M R), of all scenes one after the other
+        self._places = place.flatten() + torch.arange(kernels.taps.shape[-2], device=place.device)[:, None]
         self._normal: dict[int, SmoothBand] = {}
 
     def normal(self, order: int) -> SmoothBand:
@@ -361,9 +391,9 @@ class Observation:
         """``K c``, (N, M, C, R, S), of coefficients (K, C, N, S) at the frequencies ``part``."""
         # sum over the taps of each row of all frames
         flat = coefficients.movedim(2, 0).flatten(0, 1)
-        rows = flat.new_zeros(len(self._first), *flat.shape[1:])
-        for tap, kernel in enumerate(self._smooth.taps(self.u[part])):
-            rows = rows + kernel[:, None] * flat[self._first + tap]
+        rows = flat.new_zeros(self._places.shape[1], *flat.shape[1:])
+        for taps, kernel in self._smooth.taps(self.u[part]):
+            rows = rows + (kernel[:, :, None] * flat[self._places[taps]]).sum(0)
         # displacement of the middle of each row
         phases = shift_phases(self.kernels.middle, self.period, part, flat.dtype).conj()
         observed = (rows.unflatten(0, phases.shape[:2]) * phases[:, :, None]).transpose(1, 2)
@@ -378,8 +408,8 @@ class Observation:
         rows = (spectra.flatten(0, 1) * phases[:, None]).transpose(1, 2).flatten(0, 1)
         # each row contributes to the scene rows of its taps
         total = rows.new_zeros(self.num_scenes * self.count, *rows.shape[1:])
-        for tap, kernel in enumerate(self._smooth.taps(self.u[part], conjugate=True)):
-            total = total.index_add_(0, self._first + tap, kernel[:, None] * rows)
+        for taps, kernel in self._smooth.taps(self.u[part], conjugate=True):
+            total = total.index_add_(0, self._places[taps].flatten(), (kernel[:, :, None] * rows).flatten(0, 1))
         of_scenes: Tensor = total.unflatten(0, (self.num_scenes, -1)).movedim(0, 2)
         return of_scenes
 
@@ -387,7 +417,7 @@ class Observation:
         """Rows of the scenes where the frame at rest would observe them, (N, C, R, L)."""
         first = -SCENE_REACH - self.top
         near = coefficients[first : first + self.num_rows + 2 * SCENE_REACH]
-        weights = torch.tensor([scene_weights()], dtype=near.real.dtype, device=near.device)
+        weights = constant(np.array, (scene_weights(),), dtype=near.dtype.to_real(), device=near.device)
         sampled = correlated(torch.view_as_real(near).flatten(1), weights, 0)[0]
         spectra = torch.view_as_complex(sampled.unflatten(1, (*near.shape[1:], 2)))
         scenes: Tensor = torch.fft.irfft(spectra.permute(2, 1, 0, 3), n=self.period)

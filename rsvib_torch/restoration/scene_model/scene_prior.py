@@ -4,7 +4,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.numerics.fourier import extend_rows, squared_modulus, waves
 from rsvib_torch.numerics.splines import mirrored
+from rsvib_torch.numerics.tables import Array, constant, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.observation import interpolation_error, kernel_spectrum
+from rsvib_torch.restoration.scene_model.observation import kernel_spectrum
 
 ORDER = 2  # rows that a row is predicted from
 _TINY = float(np.finfo(np.float32).tiny)  # smallest power
@@ -48,12 +50,13 @@ class RowPrior:
         The precision of interior rows at distance d is the sum over k. The first and the last rows are predicted from
         fewer rows: for row j it is the sum of the first j + 1 products.
         """
-        a = torch.ones_like(self.power)[None]
-        for reflection in self.reflections:
-            padded = torch.cat([a, torch.zeros_like(a[:1])])
+        first, *others = self.reflections
+        a = torch.stack([torch.ones_like(first), -first])
+        for reflection in others:
+            padded = functional.pad(a, (0, 0, 0, 0, 0, 1))
             a = padded - reflection * padded.flip(0)
-        lags = [a[: len(a) - d] * a[d:] for d in range(len(a))]
-        return torch.stack([torch.cat([lag, torch.zeros_like(a[: len(a) - len(lag)])]) for lag in lags])
+        later = functional.pad(a, (0, 0, 0, 0, 0, ORDER)).unfold(0, len(a), 1)  # a_(k + d), (d, N, U, k)
+        return a * later.movedim(-1, 1)
 
     def ratio(self, noise_power: Tensor) -> Tensor:
         """Noise power over the variance of e, (N, U), for noise of power (N, 1) in data of weight 1."""
@@ -63,7 +66,7 @@ class RowPrior:
     def resampled(self, count: int) -> "RowPrior":
         """The prior at ``count`` frequencies spread over the same range."""
         parts = [self.power.log()[:, None], self.reflections.movedim(0, 1), self.interpolation_power.log()]
-        stacked = torch.nn.functional.interpolate(torch.cat(parts, 1), count, mode="linear", align_corners=True)
+        stacked = functional.interpolate(torch.cat(parts, 1), count, mode="linear", align_corners=True)
         power, reflections, interpolation = stacked.split([part.shape[1] for part in parts], 1)
         return RowPrior(power[:, 0].exp(), reflections.movedim(1, 0), interpolation.exp())
 
@@ -108,19 +111,11 @@ def _levinson(moments: Sequence[Table]) -> tuple[list[Table], list[Table], Table
     return reflections, filter_, variance
 
 
-def _pooled(power: Tensor) -> Tensor:
-    """Means over 5 x 5 neighbouring frequencies of (N, U, V)."""
-    u, v = (torch.arange(-2, extent + 2, device=power.device) for extent in power.shape[1:])
-    around = power[:, u.clamp(0, power.shape[1] - 1)][..., v % power.shape[2]]
-    return torch.nn.functional.avg_pool2d(around[:, None], 5, 1)[:, 0]
-
-
-def _pooling(count: int) -> NDArray[np.float64]:
-    """Matrix (U, U) of a weighted mean over three neighbouring frequencies, mirrored at both ends."""
+def _mixing(count: int, weights: Sequence[float], fold: Callable[[Array], Array]) -> Array:
+    """Matrix (U, U) of a weighted mean over neighbouring frequencies, whose indices are folded at both ends."""
     matrix = np.zeros((count, count))
-    for step, weight in ((-1, 0.25), (0, 0.5), (1, 0.25)):
-        near = np.abs(np.arange(count) + step)
-        np.add.at(matrix, (np.arange(count), np.minimum(near, 2 * (count - 1) - near)), weight)
+    for step, weight in enumerate(weights, -(len(weights) // 2)):
+        np.add.at(matrix, (np.arange(count), fold(np.arange(count) + step)), weight)
     return matrix
 
 
@@ -133,36 +128,40 @@ def autoregressive_prior(observed: Tensor, transfer: Tensor, aliases: Tensor, no
     ``noise_power`` that of the noise. ``aliases`` (N, T, U, V) is the power of the interpolation error of the kernel
     between rows, through the blur of each frame, for a wave of power 1.
     """
-    excess = observed - noise_power
+    _, U, V = observed.shape
+    constants = (
+        # cosines of the lags of autocovariances (V, p + 1), and the pooling of the lags over neighbouring frequencies
+        np.cos(2 * np.pi * np.fft.fftfreq(V)[:, None] * np.arange(ORDER + 1)),
+        _mixing(U, (0.25, 0.5, 0.25), lambda u: np.minimum(np.abs(u), 2 * (U - 1) - np.abs(u))) / V,
+        # means over 5 x 5 neighbouring frequencies
+        _mixing(U, (0.2,) * 5, lambda u: u.clip(0, U - 1)),
+        _mixing(V, (0.2,) * 5, lambda v: v % V),
+    )
+    spectra, device = (observed, transfer, aliases, noise_power), observed.device
+    if torch.is_grad_enabled() and any(values.requires_grad for values in spectra):
+        of_tensors = [torch.as_tensor(constant, device=device) for constant in constants]
+        power, reflections, interpolation = _expectation_maximisation(spectra, of_tensors)
+        return RowPrior(power, torch.stack(reflections), interpolation)
+    # small tables, for which the calls of PyTorch would take longer than the arithmetic
+    power, reflections, interpolation = _expectation_maximisation(tables(*spectra), constants)
+    return RowPrior(*(torch.from_numpy(values).to(device) for values in (power, np.stack(reflections), interpolation)))
+
+
+def _expectation_maximisation(
+    spectra: Sequence[Table], constants: Sequence[Table], iterations: int = 20
+) -> tuple[Table, list[Table], Table]:
+    """Power (N, U), partial correlations, and interpolation power (N, T, U) of the scene; tensors or arrays.
+
+    The spectra are the arguments of ``autoregressive_prior``, which makes the constants.
+    """
+    observed, transfer, aliases, noise_power = spectra
+    cosine, pooling, around_u, around_v = constants
     # steps are small where the noise is stronger than the scene: below half of the noise power, the initial value is
     # pooled over neighbouring frequencies, as that of a single one depends on chance
-    level = 0.5 * noise_power
-    excess = torch.where(excess < level, _pooled(excess).minimum(level), excess)
-    scene = torch.maximum(excess, 0.002 * noise_power) * transfer / (transfer.square() + 1e-2)
-    # cosines of the lags of autocovariances (V, p + 1), and the pooling of the lags over neighbouring frequencies
-    _, U, V = observed.shape
-    cosine = np.cos(2 * np.pi * np.fft.fftfreq(V)[:, None] * np.arange(ORDER + 1))
-    pooling = _pooling(U) / V
-    tables = (scene, observed, transfer, noise_power)
-    if torch.is_grad_enabled() and any(table.requires_grad for table in tables):
-        constants = [torch.as_tensor(table, device=observed.device) for table in (cosine, pooling)]
-        power, *reflections, scene = _expectation_maximisation(tables, constants[0], constants[1])
-    else:  # small tables, for which the calls of PyTorch would take longer than the arithmetic
-        arrays = torch.stack([table.detach() for table in tables]).cpu().numpy()
-        *fitted, expected = _expectation_maximisation(arrays, cosine, pooling)
-        power, *reflections = torch.from_numpy(np.stack(fitted)).to(observed.device)
-        scene = torch.from_numpy(expected).to(observed.device)
-    interpolation = (scene[:, None] * aliases).mean(-1).clamp(min=_TINY)
-    return RowPrior(power.clamp(min=_TINY), torch.stack(reflections), interpolation)
-
-
-def _expectation_maximisation(tables: Table, cosine: Table, pooling: Table, iterations: int = 20) -> tuple[Table, ...]:
-    """Power (N, U), partial correlations and expected spectrum (N, U, V) of the scene; tensors or arrays.
-
-    ``tables`` (N, U, V) are a first expected spectrum, and ``observed``, ``transfer`` and ``noise_power`` as in
-    ``autoregressive_prior``.
-    """
-    scene, observed, transfer, noise_power = tables
+    excess, level = observed - noise_power, 0.5 * noise_power
+    pooled = (around_u @ excess @ around_v.T).clip(None, level)
+    excess = excess + (excess < level) * (pooled - excess)
+    scene = excess.clip(0.002 * noise_power, None) * transfer / (transfer * transfer + 1e-2)
     through = transfer * observed
     for _ in range(iterations):
         # the model of the expected spectrum of the scene
@@ -178,7 +177,8 @@ def _expectation_maximisation(tables: Table, cosine: Table, pooling: Table, iter
         # the expected spectrum for this model: variance and square of the Wiener estimate
         gain = 1.0 / (penalty + transfer)
         scene = gain * noise_power + gain * gain * through
-    return (moments[0], *reflections, scene)
+    interpolation = (scene[:, None] * aliases).mean(-1)
+    return moments[0].clip(_TINY, None), reflections, interpolation.clip(_TINY, None)
 
 
 def brightness(frames: Tensor) -> Tensor:
@@ -222,12 +222,18 @@ class ObservedSpectrum:
 
         Pieces with a stronger squared ``transfer`` and less noise weigh more.
         """
-        weight = transfer / self.levels.to(torch.float64).square()[..., None, None, None]
+        weight = transfer / self.levels.to(torch.float64).square().view(*self.levels.shape, 1, 1, 1)
         total = weight.sum((1, 2)).clamp(min=_TINY)
         # power of whole rows above 25 times that of the pieces is due to the boundary extension and not to chance:
         # without it, regular patterns are lost near the ends of the rows
         observed = torch.maximum((weight * self.power).sum((1, 2)) / total, self.whole / 25.0)
         return observed, weight / total[:, None, None], transfer.sum((1, 2)) / total
+
+
+def taper(count: int) -> Array:
+    """Hann window (count,), under which the power of white noise is its variance."""
+    window = np.hanning(count + 2)[1:-1]
+    return window / np.linalg.norm(window)
 
 
 _PIECE = (64, 256)  # px, rows and columns of the pieces
@@ -249,12 +255,9 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
         spread_starts(whole, extent, max(1, round(count / excess)))
         for whole, extent, count in zip(shape, size, counts, strict=True)
     )
-    tapers = [
-        torch.hann_window(extent + 2, periodic=False, dtype=frames.dtype, device=frames.device)[1:-1] for extent in size
-    ]
-    tapers = [taper / taper.square().sum().sqrt() for taper in tapers]
-    u = torch.fft.rfftfreq(size[1], dtype=torch.float64, device=frames.device)
-    v = torch.fft.fftfreq(size[0], dtype=torch.float64, device=frames.device)
+    tapers = [constant(taper, extent, dtype=frames.dtype, device=frames.device) for extent in size]
+    u = constant(np.fft.rfftfreq, size[1], dtype=torch.float64, device=frames.device)
+    v = constant(np.fft.fftfreq, size[0], dtype=torch.float64, device=frames.device)
 
     # phases that move rows back by their displacement, and the taper across rows
     displacement, node_weights = motion.exposures
@@ -262,7 +265,7 @@ def observed_spectrum(frames: Tensor, motion: FrameMotion, levels: Tensor, lengt
     mean = (displacement[:, :, rows, :, 0] * node_weights).sum(-1)
     back = waves(mean, -u).to(frames.dtype.to_complex()) * tapers[0][:, None]  # (N, T, n, rows, U)
     # power of the pieces, mean over channels and columns of pieces, some rows of pieces at a time
-    bright = brightness(frames)[..., None, None, None]
+    bright = brightness(frames).view(*frames.shape[:3], 1, 1, 1)
     piece_bytes = 8 * frames[..., 0, 0].numel() * len(lefts) * size[0] * size[1]
     step = at_once(piece_bytes, frames.device, cpu_bytes=2**24)
     powers = []
@@ -284,12 +287,10 @@ def fit_prior(frames: Tensor, motion: FrameMotion, levels: Tensor, length: int) 
     spectrum = observed_spectrum(frames, motion, levels, length)
     # blur at the vertical frequencies, and at those of the two strongest aliases across rows: all others together have
     # less than 4 % of their power
-    cycles = (-1, 1)
-    v = torch.cat([spectrum.v, *(spectrum.v + cycle for cycle in cycles)])
-    blur = spectrum.blur(spectrum.u, v).unflatten(-1, (3, -1))
-    transfer = smeared(blur[..., 0, :] * kernel_spectrum(spectrum.v).square())
-    error = torch.stack([interpolation_error(spectrum.v, [cycle]) for cycle in cycles])
-    aliases = (blur[..., 1:, :].mean(2) * error).sum(-2)
+    v = spectrum.v + torch.tensor([[0.0], [-1.0], [1.0]], dtype=spectrum.v.dtype, device=spectrum.v.device)
+    blur, power = spectrum.blur(spectrum.u, v.flatten()).unflatten(-1, (3, -1)), kernel_spectrum(v).square()
+    transfer = smeared(blur[..., 0, :] * power[0])
+    aliases = (blur[..., 1:, :].mean(2) * power[1:]).sum(-2)
     observed, weight, noise = spectrum.weighted(transfer)
     passed = (weight * transfer).sum((1, 2))
     prior = autoregressive_prior(observed, passed, aliases, noise)
@@ -312,4 +313,4 @@ def _power_of_rows(strips: Tensor, length: int, count: int) -> Tensor:
     not matter at the low frequencies of the extension.
     """
     power = squared_modulus(torch.fft.fft(torch.fft.rfft(extend_rows(strips, length)), dim=-2)).mean((1, 2, 3))
-    return torch.nn.functional.adaptive_avg_pool1d(power, count).mT.to(torch.float64)
+    return functional.adaptive_avg_pool1d(power, count).mT.to(torch.float64)

@@ -10,9 +10,9 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,9 +28,10 @@ from rsvib_torch.io.stack_reading import FramesOrFiles, load_frames
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.timing import RowTiming, SensorTiming
-from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_in_row_order
-from rsvib_torch.restoration.noise import estimate_noise
+from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array, table, valid_mean, without_nan
+from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_of_frames
+from rsvib_torch.restoration.noise import noise_deviation
 from rsvib_torch.restoration.verdict.pairs import (
     FramePairs,
     Overlap,
@@ -233,8 +234,8 @@ def _mean_square(difference: Tensor) -> Tensor:
 class _PairVerdicts:
     """Verdicts on one pair of frames of each of B stacks, in row order; the fields of ``RestorationVerdict``."""
 
-    levels: Tensor  # (5, B) before, after, noise, chi_square, predicted_gain
-    displacements: Tensor  # (3, B, 2) misfit_before, misfit_after, resolution
+    levels: Array  # (5, B) before, after, noise, chi_square, predicted_gain
+    displacements: Array  # (3, B, 2) misfit_before, misfit_after, resolution
     outcomes: list[Outcome]  # outcome of each stack
     reasons: list[tuple[Reason, ...]]  # reasons for each outcome
 
@@ -246,8 +247,8 @@ def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_
     """
     # Noise of the raw frames; frames that differ in brightness are made equal.
     raw = torch.stack([pair.earlier, pair.later], 1)
-    noise = estimate_noise(raw, pair.ignore).square().flatten(1).nanmean(1).double()
-    noise = noise.nan_to_num(nan=0.0).clamp(min=_MIN_NOISE**2)
+    noise = valid_mean(np.square(noise_deviation(raw, pair.ignore)).reshape(len(raw), -1), 1)
+    noise = np.maximum(without_nan(noise, 0.0), _MIN_NOISE**2)
     pair = equally_bright(pair, noise)
 
     # Displacement between the raw frames, and between the later one and its prediction. An image restored from both
@@ -255,40 +256,45 @@ def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_
     widening = math.sqrt(2.0 * shared / (shared - 1.0)) if shared > 1 else 1.0
     sizes, resolutions = misfit(torch.stack([pair.earlier, pair.predicted]), torch.stack([pair.later, pair.later]))
     misfit_before, misfit_after = sizes[0], widening * sizes[1]
-    resolution = torch.minimum(resolutions[0], widening * resolutions[1])
+    resolution = np.minimum(resolutions[0], widening * resolutions[1])
 
-    # Error of the restored frames, from their difference and that of the later frame from its prediction.
-    unexplained = _mean_square(pair.later - pair.predicted)
-    error = (unexplained - noise).clamp(min=0.0)
-    after = torch.full_like(error, math.nan)
-    if pair.restored_later is not None:
-        after = _mean_square(pair.restored_later - pair.restored)
-    error = torch.maximum(error, 0.5 * after) if shared == 1 else error + noise / shared
+    # Means over the pixels, which are transferred together. The noise of two restored frames is independent and
+    # vanishes in the product of the changes of the scene by the motion.
+    unknown = torch.full((len(raw),), math.nan, dtype=torch.float64, device=raw.device)
+    means = torch.stack(
+        [
+            _mean_square(pair.later - pair.earlier),
+            unknown if pair.restored_later is None else _mean_square(pair.restored_later - pair.restored),
+            _mean_square(pair.later - pair.predicted),
+            ((pair.predicted - pair.restored) * pair.changed_later).mean((1, 2, 3), dtype=torch.float64),
+            torch.zeros_like(unknown) if pair.ignore is None else pair.ignore.any(1).double().mean((1, 2, 3)),
+            *pair.offset.unbind(-1),
+        ]
+    )
+    before, after, unexplained, change, missing, *offset = table(means)
 
-    # Error of the raw frames: the change of the scene by the motion, and noise. The noise of two restored frames is
-    # independent and vanishes in the product.
-    change = ((pair.predicted - pair.restored) * pair.changed_later).mean((1, 2, 3), dtype=torch.float64)
-    gain = 10.0 * torch.log10((change.clamp(min=0.0) + noise) / error.clamp(min=_MIN_NOISE**2))
+    # Error of the restored frames, from their difference and that of the later frame from its prediction, and of the
+    # raw frames: the change of the scene by the motion, and noise.
+    error = np.maximum(unexplained - noise, 0.0)
+    error = np.fmax(error, 0.5 * after) if shared == 1 else error + noise / shared
+    gain = 10.0 * np.log10((np.maximum(change, 0.0) + noise) / np.maximum(error, _MIN_NOISE**2))
 
-    # Outcome of each pair, from figures that are transferred together.
-    missing = torch.zeros_like(gain) if pair.ignore is None else pair.ignore.any(1).double().mean((1, 2, 3))
-    displacements = torch.stack([misfit_before, misfit_after, resolution])
-    figures = torch.cat([*displacements, pair.offset, gain[:, None], missing[:, None]], 1)
+    # Outcome of each pair.
+    displacements = np.stack([misfit_before, misfit_after, resolution])
+    figures = np.column_stack([*displacements, *offset, gain, missing])
     outcomes: list[Outcome] = []
     reasons: list[tuple[Reason, ...]] = []
     contradicted = []
     one_image = pair.restored_later is None
-    for values, moving in zip(figures.tolist(), moves, strict=True):
-        *axes, level, share = values
+    for (*axes, level, share), moving in zip(figures.tolist(), moves, strict=True):
         outcome, why = outcome_of_pair(axes[:2], axes[2:4], axes[4:6], moving, axes[6:], level, one_image=one_image)
         contradicted.append((outcome == "worse" and level > 0) or (outcome in ("helps", "partly") and level < 0))
         if share > max_missing:
             outcome, why = "unknown", (Reason("pixels_missing", None, share, max_missing),)
         outcomes.append(outcome)
         reasons.append(why)
-    gain = gain.masked_fill(torch.tensor(contradicted, device=gain.device), math.nan)
-    before = _mean_square(pair.later - pair.earlier)
-    levels = torch.stack([before.sqrt(), after.sqrt(), noise.sqrt(), unexplained / noise, gain])
+    gain = np.where(contradicted, math.nan, gain)
+    levels = np.stack([np.sqrt(before), np.sqrt(after), np.sqrt(noise), unexplained / noise, gain])
     return _PairVerdicts(levels, displacements, outcomes, reasons)
 
 
@@ -384,29 +390,28 @@ def _at_pixels(restored: Tensor, frames: PreparedFrames, count: int) -> Tensor:
 
 
 def _judged_strip(
-    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: Motion, timing: RowTiming
+    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: FrameMotion
 ) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
     """The part of the frames by which their restoration is judged, and its motion.
 
     With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
-    Arguments and results are as in ``shared_part``, except for the motion (B) in row order and the timing.
+    Arguments and results are as in ``shared_part``.
     """
-    count, (height, width) = raw.shape[1], raw.shape[-2:]
-    if motion.same_for_all_columns:
-        of_frames = frame_motion(motion, timing, count, height)
-        of_frames.check_fits(width)
-        return raw, restored, ignore, of_frames
+    count, width = raw.shape[1], raw.shape[-1]
+    if motion.vibration.same_for_all_columns:
+        motion.check_fits(width)
+        return raw, restored, ignore, motion
     strip = min(_STRIP, width // 2)
     halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
     both = torch.cat([raw[..., half] for half in halves], -1)
     parts = [halves[0 if part.start < strip // 2 else 1] for part in detailed_parts(both, strip)]
     middles = [part.start + 0.5 * (strip - 1) - 0.5 * (width - 1) for part in parts]
     columns = torch.tensor(middles, dtype=torch.float64, device=raw.device)
-    starts = tuple(timing.frame_starts(count).tolist())
-    of_strips = ColumnMotion(motion, columns, starts, timing.row_time, height)
+    starts, height = tuple(motion.frame_starts.tolist()), motion.num_rows
+    of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
     raw, restored = cut_columns(raw, parts), cut_columns(restored, parts)
     ignore = None if ignore is None else cut_columns(ignore, parts)
-    return raw, restored, ignore, frame_motion(of_strips, timing, count, height)
+    return raw, restored, ignore, frame_motion(of_strips, motion.timing, count, height)
 
 
 def judge_prepared(
@@ -418,11 +423,12 @@ def judge_prepared(
     most_pairs: int | None = None,
 ) -> RestorationVerdict:
     """``judge_restoration`` of one stack of frames that are already prepared; arguments as in ``judge_stacks``."""
-    motion = motion_in_row_order(frames, vibration)
-    moves = {0: motion.moving_axes()[0].tolist()}
+    motion = motion_of_frames(frames, vibration)
+    moves = {0: [bound > 0 for bound in motion.bounds[0]]}
     (verdict,) = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=most_pairs)
     if isinstance(verdict, TooLittleInCommonError):
         raise verdict
+    assert verdict is not None, "verdicts of all concerns are made"
     return verdict
 
 
@@ -430,73 +436,81 @@ def judge_prepared(
 def judge_stacks(
     frames: PreparedFrames,
     restored: Tensor,
-    motion: Motion,
+    motion: FrameMotion,
     moves: dict[int, list[bool]],
     *,
     joint: bool | int = False,
     most_pairs: int | None = None,
     columns: int | None = None,
-) -> list[RestorationVerdict | TooLittleInCommonError]:
+    least: Outcome = "helps",
+) -> list[RestorationVerdict | TooLittleInCommonError | None]:
     """Verdicts on stacks of a batch, which are judged together, or errors if two frames have too little in common.
 
-    Restored frames (B, T, C, H, W), or (B, 1, C, H, W), and the motion that was undone are in row order, verdicts in
-    image axes. ``moves`` has the stacks to judge with their axes with motion. Only the ``columns`` with the most detail
-    are used.
+    Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order, verdicts in image axes. ``moves`` has the
+    stacks to judge with their axes with motion. Only the ``columns`` with the most detail are used. Verdicts of less
+    concern than ``least`` are None.
     """
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
     count = raw.shape[1]
     pairs = pairs_to_judge(count, joint, limit)
+    ignore = frames.missing
+    # only the frames that are compared, if these are some of a long stack
+    compared = sorted({frame for pair in pairs for frame in pair})
+    if len(compared) < count:
+        raw, motion = raw[:, compared], motion.of(list(range(len(raw))), compared)
+        still = still if still.shape[1] == 1 else still[:, compared]
+        ignore = None if ignore is None else ignore[:, compared]
     task = _Task(
-        pairs, len(joint_groups(count, joint)[0][0]), columns, frames.image_timing, steps(len(moves), "stacks")
+        [(compared.index(earlier), compared.index(later)) for earlier, later in pairs],
+        compared,
+        len(joint_groups(count, joint)[0][0]),
+        columns,
+        frames.image_timing,
+        steps(len(moves), "stacks"),
+        least,
     )
 
     # as many stacks at a time as the memory allows
     pixels = raw.shape[2] * raw.shape[3] * min(columns or raw.shape[4], raw.shape[4])
     together = at_once(16 * pixels, raw.device, cpu_bytes=2**26)
-    verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
+    verdicts: list[RestorationVerdict | TooLittleInCommonError | None] = []
     for chosen in (list(moves)[part] for part in runs(len(moves), together)):
-        taken, images = _of_stacks(raw, chosen), _of_stacks(still, chosen)
-        ignore = None if frames.missing is None else _of_stacks(frames.missing, chosen)
-        of_stacks = motion.mapped(partial(_of_stacks, chosen=chosen))
-        judged = _judged_strip(taken, images, ignore, of_stacks, frames.timing)
-        verdicts += _judge_batch(*judged, [moves[stack] for stack in chosen], task)
+        judged = raw, still, ignore, motion
+        if len(chosen) < len(raw):  # all are judged without a copy
+            judged = raw[chosen], still[chosen], None if ignore is None else ignore[chosen], motion.of(chosen)
+        verdicts += _judge_batch(*_judged_strip(*judged), [moves[stack] for stack in chosen], task)
     return verdicts
-
-
-def _of_stacks(values: Tensor, chosen: list[int]) -> Tensor:
-    """Values (B, ...) of some stacks, without a copy if these are all."""
-    return values if chosen == list(range(len(values))) else values[chosen]
 
 
 @dataclass(frozen=True)
 class _Task:
     """What the verdicts on the stacks of a batch have in common."""
 
-    pairs: list[tuple[int, int]]  # indices of the frames to compare
+    pairs: list[tuple[int, int]]  # frames to compare, counted among those
+    numbers: list[int]  # of these frames in the stack
     shared: int  # frames from which one image is restored
     columns: int | None  # judge on so many columns only, those with the most detail; None for all
     timing: SensorTiming  # the sensor in image orientation
     advance: Callable[[int], None]  # to be called with the number of stacks that were judged
+    least: Outcome  # the least concern of which verdicts are made
 
 
 def _judge_batch(
     raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: FrameMotion, moves: list[list[bool]], task: _Task
-) -> list[RestorationVerdict | TooLittleInCommonError]:
+) -> list[RestorationVerdict | TooLittleInCommonError | None]:
     """Verdicts on all stacks of a batch, whose displacement depends on the row only, see ``shared_part``."""
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.
     size = raw.shape[-2], raw.shape[-1]
-    rows = torch.arange(size[0], dtype=torch.float64, device=raw.device)
-    moved = motion.mean_displacement(rows.expand(1, raw.shape[1], -1))
+    displacement, node_weights = motion.exposures
+    moved = (displacement * node_weights[:, None]).sum(-2) - motion.shift[:, :, None]
     common = overlaps(motion, moved, task.pairs)
-    errors = {
-        stack: error for stack, of_stack in enumerate(common) if (error := _too_little(of_stack, task.pairs, size))
-    }
+    errors = {stack: error for stack, of_stack in enumerate(common) if (error := _too_little(of_stack, task, size))}
     shared = [Overlap.of_all([of_stack[pair] for of_stack in common]) for pair in range(len(task.pairs))]
     if errors or not all(one.is_enough(size) for one in shared):
-        results: list[RestorationVerdict | TooLittleInCommonError] = []
+        results: list[RestorationVerdict | TooLittleInCommonError | None] = []
         for stack in range(len(raw)):
             if stack in errors:
                 results.append(errors[stack])
@@ -515,29 +529,32 @@ def _judge_batch(
     task.advance(len(raw))
 
     # One result for each stack, in image axes.
-    levels = torch.stack([verdict.levels for verdict in verdicts], -1)  # (5, B, P)
-    displacements = torch.stack([verdict.displacements for verdict in verdicts], -2)  # (3, B, P, 2)
+    levels = np.stack([verdict.levels for verdict in verdicts], -1)  # (5, B, P)
+    displacements = np.stack([verdict.displacements for verdict in verdicts], -2)  # (3, B, P, 2)
     if task.timing.scan_axis == -1:
-        displacements = displacements.flip(-1)
-    levels_of, displacements_of = (values.flatten(0, 1).unbind() for values in (levels, displacements))
+        displacements = displacements[..., ::-1].copy()
+    levels_of, displacements_of = (
+        torch.from_numpy(values).to(raw.device).flatten(0, 1).unbind() for values in (levels, displacements)
+    )
+    concerns = [max(_OUTCOMES.index(verdict.outcomes[stack]) for verdict in verdicts) for stack in range(len(raw))]
     return [
-        RestorationVerdict(
+        None
+        if concern < _OUTCOMES.index(task.least)
+        else RestorationVerdict(
             **dict(zip(_LEVELS, levels_of[stack :: len(raw)], strict=True)),
             **dict(zip(_DISPLACEMENTS, displacements_of[stack :: len(raw)], strict=True)),
             outcome=tuple(verdict.outcomes[stack] for verdict in verdicts),
             findings=tuple(reasons_from_row_order(verdict.reasons[stack], task.timing) for verdict in verdicts),
         )
-        for stack in range(len(raw))
+        for stack, concern in enumerate(concerns)
     ]
 
 
-def _too_little(
-    common: list[Overlap], pairs: list[tuple[int, int]], size: tuple[int, int]
-) -> TooLittleInCommonError | None:
+def _too_little(common: list[Overlap], task: _Task, size: tuple[int, int]) -> TooLittleInCommonError | None:
     """An error for the first pair of frames with too little in common."""
-    for overlap, (earlier, later) in zip(common, pairs, strict=True):
+    for overlap, pair in zip(common, task.pairs, strict=True):
         if not overlap.is_enough(size):
-            y, x = overlap.step
+            (y, x), (earlier, later) = overlap.step, (task.numbers[frame] for frame in pair)
             return TooLittleInCommonError(
                 f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
             )

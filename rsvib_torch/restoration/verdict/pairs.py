@@ -16,9 +16,9 @@ from torch.nn import functional
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.frames.pixels import cut_parts, detailed_parts
 from rsvib_torch.imaging.blur import form_rows
-from rsvib_torch.imaging.trajectory import exposure_trajectory
 from rsvib_torch.numerics.fourier import extended_length, spline_spectra
 from rsvib_torch.numerics.splines import correlated
+from rsvib_torch.numerics.tables import Array, table, tables
 from rsvib_torch.restoration.frame_motion import FrameMotion
 
 _SMOOTHING = 5.0  # px, standard deviation of the Gaussian in ``misfit``; displacements of up to about 10 px stay linear
@@ -166,7 +166,7 @@ def shared_part(
     )
 
 
-def equally_bright(pair: FramePairs, noise: Tensor, *, block: int = 16) -> FramePairs:
+def equally_bright(pair: FramePairs, noise: Array, *, block: int = 16) -> FramePairs:
     """The pairs with the earlier frame, and the images made of it, at the brightness and contrast of the later one.
 
     Gain and offset are the regression of the later frame on the predicted one, from means over squares of ``block`` px,
@@ -174,16 +174,18 @@ def equally_bright(pair: FramePairs, noise: Tensor, *, block: int = 16) -> Frame
     """
     side = min(block, *pair.later.shape[-2:])
     images = torch.stack([pair.predicted, pair.later])
-    means = functional.avg_pool2d(images.flatten(0, 2)[:, None], side).view(*images.shape[:3], -1).to(torch.float64)
-    mean, target = levels = means.mean(-1, keepdim=True)
-    predicted, later = means - levels
-    noise = noise[:, None, None, None]
-    gain = (predicted * later).mean((-2, -1), keepdim=True)[..., None] + noise
-    gain = gain / (predicted.square().mean((-2, -1), keepdim=True)[..., None] + noise)
+    means = table(functional.avg_pool2d(images.flatten(0, 2)[:, None], side)).astype(np.float64)
+    means = means.reshape(*images.shape[:3], -1)
+    mean, target = levels = means.mean(-1)
+    predicted, later = means - levels[..., None]
+    slope = ((predicted * later).mean((1, 2)) + noise) / (np.square(predicted).mean((1, 2)) + noise)
     # frames that contradict each other keep their brightness
-    related = gain > 0.0
-    offset = torch.where(related, target[..., None] - gain * mean[..., None], 0.0).to(pair.later.dtype)
-    gain = torch.where(related, gain, 1.0).to(pair.later.dtype)
+    related = slope[:, None] > 0.0
+    factors = np.concatenate(
+        [np.where(related, slope[:, None], 1.0), np.where(related, target - slope[:, None] * mean, 0.0)], 1
+    )
+    of_images = torch.as_tensor(factors[..., None, None], dtype=images.dtype, device=images.device)
+    gain, offset = of_images[:, :1], of_images[:, 1:]
 
     def adjusted(image: Tensor) -> Tensor:
         return torch.addcmul(offset, image, gain)
@@ -197,7 +199,7 @@ def equally_bright(pair: FramePairs, noise: Tensor, *, block: int = 16) -> Frame
     )
 
 
-def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Tensor]:
+def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Array, Array]:
     """Root-mean-square displacement between two images (..., C, H, W) of one scene along each axis, and its resolution.
 
     A displacement d changes brightness by ``d . grad f``, so that the mean squared difference is ``a + dx^2 fx^2 + dy^2
@@ -215,17 +217,22 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Ten
     kernels = torch.as_tensor(taps, dtype=first.dtype, device=first.device)
     images = torch.stack([0.5 * (first + second), second - first])
     filtered = correlated(correlated(images, kernels, -1, step), kernels, -2, step)  # (across, along, image, ...)
-    along, across, change = (
-        values.flatten(-3).to(torch.float64) for values in (filtered[0, 1, 0], filtered[1, 0, 0], filtered[0, 0, 1])
-    )
+    # along: Gaussian across and its derivative along the rows, of the mean image; across likewise; change: smoothed
+    maps = filtered.flatten(0, 2)[[0b010, 0b100, 0b001]].flatten(-3).to(torch.float64)
+    along, across, change = maps.unbind()
     # normal equations of weighted least squares for the four terms
-    energy = along.square() + across.square()
     tiny = torch.finfo(torch.float64).tiny
-    weight = (energy + energy.mean(-1, keepdim=True)).square().clamp(min=tiny).reciprocal()[..., None, :]
-    terms = torch.stack([torch.ones_like(along), along.square(), across.square(), 2 * along * across], -2)
-    weighted = terms * weight
-    data = torch.cat([terms, change.square()[..., None, :], weighted], -2)
-    products, strongest = (weighted @ data.mT).cpu().numpy(), energy.amax(-1).sqrt()
+    terms = [torch.ones_like(along), along.square(), across.square(), 2 * along * across]
+    energy = terms[1] + terms[2]
+    weight = (energy + energy.mean(-1, keepdim=True)).square().clamp(min=tiny).reciprocal()
+    data = torch.stack([*terms, change.square()], -2)
+    weighted = data[..., :4, :] * weight[..., None, :]
+    largest = torch.maximum(first.abs().amax((-3, -2, -1)), second.abs().amax((-3, -2, -1)))
+    data = torch.cat([data, weighted], -2)
+    products, strongest, brightest = tables(
+        torch.bmm(weighted.flatten(0, -3), data.flatten(0, -3).mT), energy.amax(-1), largest
+    )
+    products = products.reshape(*strongest.shape, *products.shape[1:])
     normal, right, scatter = products[..., :4], products[..., 4:5], products[..., 5:]
     # small tables on the CPU; those of images without contrast may overflow
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -237,12 +244,10 @@ def misfit(first: Tensor, second: Tensor, *, step: int = 4) -> tuple[Tensor, Ten
         correlated_values = 4 * math.pi * (_SMOOTHING / step) ** 2
         scatter = scatter * (correlated_values * 2.0 * solution[..., :1, None] ** 2)
         variance = np.diagonal(inverse @ scatter @ inverse, axis1=-2, axis2=-1)[..., 1:3].clip(0.0)
-    figures = torch.from_numpy(np.stack([solution[..., 1:3].clip(0.0) ** 0.5, (2.0 * variance**0.5) ** 0.5]))
-    size, resolution = figures.to(first.device)
+    size, resolution = solution[..., 1:3].clip(0.0) ** 0.5, (2.0 * variance**0.5) ** 0.5
     # rounding is no contrast
-    largest = torch.maximum(first.abs().amax((-3, -2, -1)), second.abs().amax((-3, -2, -1)))
-    has_contrast = (strongest > 1e-5 * largest)[..., None]
-    return torch.where(has_contrast, size, 0.0), torch.where(has_contrast, resolution, math.inf)
+    has_contrast = (np.sqrt(strongest) > 1e-5 * brightest)[..., None]
+    return np.where(has_contrast, size, 0.0), np.where(has_contrast, resolution, math.inf)
 
 
 def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int], *, degree: int = 5) -> Tensor:
@@ -254,13 +259,14 @@ def reblur(scenes: Tensor, motion: FrameMotion, frame: int, first_rows: list[int
     """
     # displacement of each row during its exposure
     count, (height, width) = len(scenes), scenes.shape[-2:]
-    rows = torch.arange(height, dtype=torch.float64, device=scenes.device)
-    first = torch.tensor(first_rows, dtype=torch.float64, device=scenes.device)
-    starts = motion.frame_starts[frame] + (first[:, None] + rows) * motion.timing.row_time
-    displacement, node_weights = exposure_trajectory(motion.vibration, starts, motion.timing, "gauss")
-    along, across = (displacement - motion.shift[:, frame, None, None]).unbind(-1)
+    rows, stacks = torch.arange(height, device=scenes.device), torch.arange(count, device=scenes.device)
+    first = torch.tensor(first_rows, device=scenes.device)[:, None]
+    displacement, node_weights = motion.exposures
+    moved = displacement[stacks[:, None], frame, first + rows] - motion.shift[:, frame, None, None]
+    along, across = moved.unbind(-1)
     place = rows[:, None] - across
-    reach, blur = torch.stack([along.abs().amax(), (place.amax(-1) - place.amin(-1)).amax()]).tolist()
+    low, high = place.aminmax(dim=-1)
+    reach, blur = torch.stack([along.abs().amax(), (high - low).amax()]).tolist()
     # spectra of the spline coefficients, the scenes one below the other
     length = extended_length(width, math.ceil(reach))
     u = torch.fft.rfftfreq(length, dtype=scenes.dtype, device=scenes.device)
