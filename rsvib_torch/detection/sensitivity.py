@@ -14,9 +14,10 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
 from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displacements
+from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import pseudo_inverse, split_axis, table, tables
+from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, table, tables, tensor
 from rsvib_torch.results.presentation import AXIS_NAMES
 
 _STEP = 1e-4  # relative change of the timing, for differences
@@ -69,7 +70,7 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
 
 
 def with_row_time_std(
-    std: VibrationStd, vibration: Vibration, sensitivity: TimingSensitivity, timing: SensorTiming
+    std: VibrationStd, vibration: Vibration, sensitivity: TimingSensitivity, timing: SensorTiming | RowTiming
 ) -> VibrationStd:
     """Standard deviations of tones with that of the row time, which exposure and frame period in s do not share."""
 
@@ -85,6 +86,18 @@ def with_row_time_std(
         period=widened("period", "frequency", 1 / vibration.frequency.clamp(min=1e-300)),
         phase=widened("phase", "phase", torch.ones_like(vibration.phase)),
     )
+
+
+def displacements_by_row_time(measured: Measurements, motion: Motion, timing: RowTiming, num_frames: int) -> Array:
+    """Change (1, N, G, A) in px of the displacements by a motion if the row time is wrong by its standard deviation.
+
+    The motion is not a batch and on the CPU. Rows are then exposed at other times after the starts of their frames.
+    """
+    times, starts = measured.exposure_starts, table(timing.frame_starts(num_frames))
+    frames = np.searchsorted(starts, times + 0.5 * timing.row_time, "right") - 1
+    later = times + (timing.row_time_std / timing.row_time) * (times - starts[np.maximum(frames, 0)])
+    moved = [table(motion.mean_displacement(tensor(at), measured.exposure_time)) for at in (times, later)]
+    return measured.relative(moved[1] - moved[0])
 
 
 def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:

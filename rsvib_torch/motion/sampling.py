@@ -79,7 +79,13 @@ def source_map(
     dtype: Any = np.float32,
 ) -> Array:
     """(2, H, W) px, the place (x, y) in a frame where each pixel of the restored frame was recorded."""
-    offsets, weights = recorded_offsets(motion, timing, size, frame, shift)
+    return places(*recorded_offsets(motion, timing, size, frame, shift), timing, size, dtype)
+
+
+def places(
+    offsets: Array, weights: Array, timing: SensorTiming, size: tuple[int, int], dtype: Any = np.float32
+) -> Array:
+    """(2, H, W) px, the places (x, y) of all pixels with the offsets of ``recorded_offsets``."""
     along, across = (1, 0) if timing.scan_axis == -2 else (0, 1)
     count, length = size[::-1][along], size[::-1][across]
     offsets = offsets.astype(dtype)

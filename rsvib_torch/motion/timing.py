@@ -55,8 +55,8 @@ class SensorTiming:
             last one is.
         frame_start_times: Exposure start of the first row of each frame in seconds, for frames that are not evenly
             spaced (dropped frames, irregular clocks); strictly increasing.
-        row_time_std: Standard deviation of ``row_time`` in s, with the same exposure and frame period in s. That of
-            tones contains its effect.
+        row_time_std: Standard deviation of ``row_time`` in s, with the same exposure and frame period in s. Those of
+            detected motions contain its effect.
 
     Raises:
         ValueError: If a value is out of range, or indicates another unit (a row time over 10 ms, a frame period

@@ -311,6 +311,10 @@ _FOLLOWED = {
     ),
 }
 _SHAPES = {
+    "corners_unexplained": _px(
+        "corners move by {value:.3g} px that no path of the camera and no tones explain, {limit:.2g} px are allowed",
+        compares="standard deviation of the offsets of corners in a window of a video",
+    ),
     "motion_unexplained": _px(
         "rows move by {value:.3g} px that no {model} explains, {limit:.2g} px are allowed",
         compares="rms residual of the rows, above 15 % of their motion and 0.03 px",

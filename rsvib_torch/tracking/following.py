@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection.tones.fit import displacement_std, residual_of, vibration_of_fit
+from rsvib_torch.detection.tones.fit import displacement_std, residual_of
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.execution.progress import steps
@@ -32,7 +32,7 @@ from rsvib_torch.options import FollowOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, tones_of_rows
-from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle
+from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
 _BANDS = RegistrationOptions()
@@ -215,7 +215,7 @@ def _at_frame(
     """
     if tones is None:
         return None
-    vibrations, stds_of_fit = vibration_of_fit(tones.fit)
+    vibrations, stds_of_fit = vibration_at_frame(tones.fit, rows, height)
     vibration, std = vibrations[0], stds_of_fit[0]
     if direction < 0:
         signs = vibration.phase.new_tensor(_ACROSS)

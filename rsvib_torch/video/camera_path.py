@@ -9,7 +9,7 @@ explains has been projected out. Both are fitted together, with weights that lea
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,6 +27,12 @@ WINDOW_FRAMES = 96  # of one fit; amplitudes and frequencies may change from win
 _MOST_TONES = 3  # of an axis in a window
 _KNOTS = 2  # of the spline per frame; with one, residuals of hand-held clips are 1.7 times as large
 _STIFFNESS = 1e-3  # of the third difference of the spline, in units of the information of a typical knot
+# px, of the reduced frames. A window whose corners are left with more is fitted again in short windows, with tones that
+# sweep; clips with parallax and compression have 0.05 to 0.17, a tone of 1.5 px that sweeps by 24 Hz/s leaves 0.8
+_UNEXPLAINED = 0.3
+_SHORT_FRAMES = 24  # of such a window
+_SLOPES = 6.0 * np.arange(-6, 7)  # Hz/s, by which they may sweep; a difference of 3 Hz/s turns the ends by 1.5 rad
+_FAST = 10.0  # Hz/s, from which on a tone is at a blind frequency for a moment only
 _ENVELOPE = 4  # frames between the knots of a tone; a blow that decays with 0.3 s is followed at 30 frames per second
 _STEADY = 0.1  # of a tone, by which neighbouring knots differ (standard deviation), where corners do not determine it
 _CELLS = 24  # of the rows, in which the search for tones takes means; resolves tones of 12 periods per readout
@@ -69,26 +75,41 @@ class WindowTone:
     knots: NDArray[np.complex128]
     start: float  # s, of the first knot
     step: float  # s, between knots
+    slope: float = 0.0  # Hz/s, by which the frequency changes
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
 
     def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
         """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
         index, factors = spline_taps(np.array([time]), self.start, self.step, len(self.knots))
-        turned = weight * (factors * self.knots[index]).sum() * np.exp(2j * math.pi * self.frequency * origin)
-        return Tone(self.axis, self.frequency, complex(turned), weight * self.amplitude_std, self.frequency_std)
+        frequency = self.frequency + self.slope * time
+        turns = frequency * origin - 0.5 * self.slope * time**2
+        turned = weight * (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
+        return Tone(self.axis, frequency, complex(turned), weight * self.amplitude_std, self.frequency_std)
 
     def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
         """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
-        attenuation = np.prod(np.sinc(self.frequency * np.array(averaged)))
-        return np.asarray(attenuation * np.exp(2j * math.pi * self.frequency * times))
+        frequency = self.frequency + self.slope * times
+        attenuation = np.prod([np.sinc(frequency * seconds) for seconds in averaged], 0)
+        return np.asarray(attenuation * np.exp(1j * math.pi * (self.frequency + frequency) * times))
 
     def correct_frequency(self, limit: float) -> None:
-        """Change the frequency, by at most ``limit`` in Hz, so that the phase of the knots stays the same."""
-        turns = np.angle(np.vdot(self.knots[:-1], self.knots[1:])) / (2 * math.pi * self.step)  # mean, weighted by size
-        change = float(np.clip(turns, -limit, limit))
+        """Change the frequency, by at most ``limit`` in Hz, so that the phase of the knots stays the same.
+
+        That of a tone that sweeps changes by as much at the ends of the window, in opposite directions.
+        """
+        turned = self.knots[1:] * self.knots[:-1].conj()
+        mean = turned.sum()  # weighted by size
         times = self.start + self.step * (np.arange(len(self.knots)) - 1)
-        self.frequency, self.knots = self.frequency + change, self.knots * np.exp(-2j * math.pi * change * times)
+        middles = 0.5 * (times[1:] + times[:-1])
+        change = float(np.clip(np.angle(mean) / (2 * math.pi * self.step), -limit, limit))
+        slope = 0.0
+        if self.slope:
+            weight = np.abs(turned)
+            bent = (weight * middles) @ np.angle(turned * np.conj(mean)) / (2 * math.pi * self.step)
+            slope = float(np.clip(bent / max(weight @ middles**2, 1e-30), -limit / middles[-1], limit / middles[-1]))
+        self.frequency, self.slope = self.frequency + change, self.slope + slope
+        self.knots = self.knots * np.exp(-1j * math.pi * (2 * change + slope * times) * times)
 
     def set_std(self, covariance: Array) -> None:
         """Standard deviations, from the covariance (2 M, 2 M) of the real and the imaginary parts of the knots."""
@@ -199,11 +220,6 @@ class _WindowFit:
         """Knots of a tone at times in s from the middle, and their values."""
         return spline_taps(times, self.start - self.origin, self.envelope_step, self.envelope_knots)
 
-    def tone(self, axis: int, frequency: float) -> WindowTone:
-        """A tone with an amplitude that is not known yet."""
-        knots = np.zeros(self.envelope_knots, complex)
-        return WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step)
-
     def solve(self, rounds: int = 2) -> None:
         """Fit path and tones; each round corrects the weights and the frequencies."""
         size, of_tone = 4 * self.count, 2 * self.envelope_knots
@@ -245,8 +261,9 @@ class _WindowFit:
                 residual[part] -= (both @ solution[index]).reshape(2, -1).T
             length = np.hypot(*residual.T)
             self.sigma = max(float(np.median(length)) / 1.177, 1e-3)  # of two normal components: 1.177 std
-            self.weights = self._weights(length, self.sigma, 1 / 1.177)
-            self.unexplained = float(np.mean([np.median(length[part]) ** 2 for part, *_ in self.pairs]))
+            medians = self._medians(length)
+            self.weights = self._weights(length, self.sigma, medians / 1.177)
+            self.unexplained = float(np.square(medians).mean())
             for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
                 real, imaginary = solution[first : first + of_tone].reshape(2, -1)
                 tone.knots = real + 1j * imaginary
@@ -256,13 +273,17 @@ class _WindowFit:
             part = slice(of_tone * number, of_tone * (number + 1))
             tone.set_std(covariance[part, part])
 
-    def _weights(self, distance: Array, std: float, factor: float) -> Array:
-        """Weights of residuals with a standard deviation, or that of their pair: ``factor`` times the median.
+    def _medians(self, distance: Array) -> Array:
+        """Median of every pair of frames."""
+        return np.array([np.median(distance[part]) for part, *_ in self.pairs])
+
+    def _weights(self, distance: Array, std: float, of_pairs: Array) -> Array:
+        """Weights of residuals with a standard deviation, or that of their pair if it is larger.
 
         A vibration that is not found yet displaces all corners of a pair.
         """
-        of_pairs = [max(std, factor * float(np.median(distance[part]))) for part, *_ in self.pairs]
-        return _robust_weights(distance, np.repeat(of_pairs, [part.stop - part.start for part, *_ in self.pairs]))
+        counts = [part.stop - part.start for part, *_ in self.pairs]
+        return _robust_weights(distance, np.repeat(np.maximum(std, of_pairs), counts))
 
     def _regularise(self, gram: Array, size: int) -> None:
         """Add the stiffness of the path, whose columns are the first ones, and a little for what is not determined."""
@@ -272,10 +293,12 @@ class _WindowFit:
             gram[part, part] += _STIFFNESS * typical * self.penalty
         gram[np.diag_indices(len(gram))] += 1e-9 * typical
 
-    def with_tone(self, axis: int, frequency: float) -> "_WindowFit":
+    def with_tone(self, axis: int, frequency: float, slope: float) -> "_WindowFit":
         """The fit with one more tone."""
+        knots = np.zeros(self.envelope_knots, complex)
+        tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
         other = copy(self)
-        other.tones, other.weights = [*map(copy, self.tones), self.tone(axis, frequency)], np.ones_like(self.weights)
+        other.tones, other.weights = [*map(copy, self.tones), tone], np.ones_like(self.weights)
         other.solve(_ROUNDS)
         return other
 
@@ -285,10 +308,12 @@ class _WindowFit:
         others = [tone.frequency for tone in self.tones if tone.axis == axis]
         return np.all([np.abs(frequencies - other) > resolved for other in others] or [frequencies > 0], axis=0)
 
-    def strongest(self, axis: int, frequencies: Array, wanted: NDArray[np.bool_]) -> tuple[float, float, float]:
+    def strongest(
+        self, axis: int, slope: float, frequencies: Array, wanted: NDArray[np.bool_]
+    ) -> tuple[float, float, float]:
         """The frequency that explains most of an axis, its ratio of variances, and the offsets by it (px rms).
 
-        It is one of those ``wanted`` of equally spaced frequencies.
+        It is one of those ``wanted`` of equally spaced frequencies, all of which change by ``slope`` in Hz/s.
         """
         # 1. Means of the offsets along the axis in cells of rows, without those by the other components.
         others = self.knots.copy()
@@ -301,7 +326,7 @@ class _WindowFit:
         order, sizes = np.lexsort((offsets, cell)), np.bincount(cell)
         middle = np.cumsum(sizes) - sizes + (sizes - 1) // 2
         apart = np.abs(offsets - offsets[order[middle]][cell])
-        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5)
+        weights = self._weights(apart, 1.5 * float(np.median(apart)), 1.5 * self._medians(apart))
         total = np.maximum(np.bincount(cell, weights), 1e-9)
         early, late, rest = (np.bincount(cell, weights * values) / total for values in (*self.times.T, offsets))
         times, root = np.stack([early, late], -1), np.sqrt(total)
@@ -321,8 +346,9 @@ class _WindowFit:
         # those of a coarse and a fine grid of frequencies, in a tenth of the time of sines and cosines.
         fine = np.exp(2j * math.pi * np.diff(frequencies[:2]) * np.arange(_FINE)[:, None, None] * times.T)
         fine, single_rest, parts = fine.astype(np.complex64), rest.astype(np.float32), []
+        swept = root * np.exp(1j * math.pi * slope * times.T**2)
         for first in frequencies[::_FINE]:
-            both = fine * (root * np.exp(2j * math.pi * first * times.T)).astype(np.complex64)
+            both = fine * (swept * np.exp(2j * math.pi * first * times.T)).astype(np.complex64)
             waves = both[:, 1] - both[:, 0]
             wave = np.stack([waves.real, waves.imag])  # cosine and sine (2, F, cells)
             hidden = wave @ half.T
@@ -345,12 +371,17 @@ class _WindowFit:
 
 
 def fit_window(
-    corners: Corners, interval: float, averaged: Averaged, readout: float, has_tones: bool = True
+    corners: Corners,
+    interval: float,
+    averaged: Averaged,
+    readout: float,
+    has_tones: bool = True,
+    slopes: Sequence[float] | Array = (0.0,),
 ) -> WindowPath:
     """Path and tones of the ``corners`` of all pairs of a window of frames, which are an ``interval`` in s apart.
 
     A corner is displaced by the mean of the displacement over the times ``averaged``; the ``readout`` takes from the
-    first to the last row (s). Without ``has_tones``, no tones are looked for.
+    first to the last row (s). Without ``has_tones``, no tones are looked for; ``slopes`` in Hz/s are those of tones.
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
@@ -358,19 +389,24 @@ def fit_window(
     step = 0.3 / (fit.times.max() - fit.times.min())
     highest = min(0.5 * _CELLS / readout, 1.0 / max(*averaged, 1e-9))
     frequencies = np.arange(_LOWEST / interval, highest, step)
-    is_visible = np.abs(2 * np.sin(math.pi * frequencies * interval)) > _MIN_GAIN
-    is_visible &= np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1) > _MIN_SINC
+    is_resolved = np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1) > _MIN_SINC
+    is_visible = is_resolved & (np.abs(2 * np.sin(math.pi * frequencies * interval)) > _MIN_GAIN)
     axes = [0, 1] if has_tones and is_visible.sum() > 2 else []
     while axes:
-        found = [fit.strongest(axis, frequencies, is_visible & fit.is_apart(axis, frequencies)) for axis in axes]
-        axis, (frequency, ratio, offsets) = max(zip(axes, found, strict=True), key=lambda item: item[1][1])
+        tried = [(axis, float(slope)) for axis in axes for slope in slopes]
+        wanted = [
+            fit.is_apart(axis, frequencies) & (is_resolved if abs(slope) > _FAST else is_visible)
+            for axis, slope in tried
+        ]
+        found = [fit.strongest(*of, frequencies, where) for of, where in zip(tried, wanted, strict=True)]
+        (axis, slope), (frequency, ratio, offsets) = max(zip(tried, found, strict=True), key=lambda item: item[1][1])
         if ratio < _MIN_RATIO or offsets < _MIN_EXPLAINED:
             break
         # Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
         # tone: they are compared by what remains of both axes.
         aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
         inside = (aliases > frequencies[is_visible][0]) & (aliases < frequencies[is_visible][-1])
-        trials = [fit.with_tone(axis, float(alias)) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
+        trials = [fit.with_tone(axis, float(alias), slope) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
         fit = min(trials, key=lambda trial: trial.unexplained)
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
     fit.solve()
@@ -383,6 +419,7 @@ class CameraPath:
     """The path and the vibration of a camera over all frames of a video; windows overlap by half."""
 
     windows: tuple[WindowPath, ...]
+    allowed: float  # px, residual of a window that is explained
 
     def _weights(self, times: Array) -> Array:
         """(W, N) weights of the windows at times, which change linearly between the middles of neighbours."""
@@ -430,14 +467,28 @@ def camera_path(
     """
     readout = timing.row_time * size[0 if timing.scan_axis == -2 else 1]
     averaged = timing.exposure_time, _PATCH_ROWS * reduction(*size) * timing.row_time
-    windows: list[WindowPath] = []
+    allowed, windows = _UNEXPLAINED * reduction(*size), list[WindowPath]()
     waiting: list[Corners | None] = []
 
     def fit() -> None:
         known = [pair for pair in waiting if pair is not None]
         if len(known) >= max(2, len(waiting) // 4):
+            window = fit_window(Corners.joined(known), timing.frame_period, averaged, readout, has_tones)
+            windows.extend(swept(window) or [window])
+
+    def swept(window: WindowPath) -> list[WindowPath]:
+        """Short windows with tones that sweep, from the windows before on, if they explain the corners."""
+        found: list[WindowPath] = []
+        if not has_tones or window.residual < allowed:
+            return found
+        for first in range(0, len(waiting) - _SHORT_FRAMES // 2, _SHORT_FRAMES // 2):
+            known = [pair for pair in waiting[first : first + _SHORT_FRAMES] if pair is not None]
+            if len(known) < _SHORT_FRAMES // 2:
+                return []
             joined = Corners.joined(known)
-            windows.append(fit_window(joined, timing.frame_period, averaged, readout, has_tones))
+            if not windows or joined.times.mean() > windows[-1].origin:
+                found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES))
+        return found if found and np.median([one.residual for one in found]) < 0.5 * window.residual else []
 
     fitted = 0
     for pair in pairs:
@@ -452,7 +503,7 @@ def camera_path(
             "no motion was found that the corners of the frames have in common: the frames show different scenes, or "
             "no detail"
         )
-    return CameraPath(tuple(windows))
+    return CameraPath(tuple(windows), allowed)
 
 
 def shake(corners: Corners) -> tuple[Array, float]:

@@ -80,10 +80,13 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
     states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
 
-    Two frames of each part of 32 are judged: of a part that is worse and shakes more than as taken, no vibration is
-    undone. Frames that cannot be decoded, constant frames and copies are replaced by the frame before. The video is
-    encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of
-    the first frames of each part is compared with that of the input: a video that shakes more is not written.
+    Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
+
+    Two frames of each part of 32 are judged. Of a part that is worse, or that path and tones do not explain, and that
+    shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone. Frames
+    that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in parts
+    in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of the first frames
+    of each part is compared with that of the input: a video that shakes more is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -237,7 +240,8 @@ def _restored_parts(
                 first = list(islice(tracked, _JUDGED_FRAMES))
                 verdicts[part] = verdict = video.verdict(first)
                 # Parallax makes two frames worse that shake less: corners decide.
-                is_worse = verdict is not None and verdict.overall == "worse" and video.shakes_more(motion, first)
+                is_doubted = not video.is_explained(motion, part) or (verdict and verdict.overall == "worse")
+                is_worse = bool(is_doubted) and video.shakes_more(motion, first)
                 for track, frame in chain(first, tracked):
                     yield video.left_alone(track) if is_worse else track, frame
 

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
+from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
+from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.execution.prefetch import prefetched
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -32,7 +35,7 @@ from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import window_record
 from rsvib_torch.video import Margins
-from rsvib_torch.video.camera_path import CameraPath, Tone, camera_path, shake
+from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
@@ -96,37 +99,20 @@ class VideoPasses:
         times = np.array(self.starts) + half
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
-        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
-        compared: dict[int, Corners] = {}  # with a gyroscope, corners between the chosen frames and the next ones
+        compared: dict[int, Corners] = {}  # with a gyroscope, corners between some frames and the next ones
 
         def pairs() -> Iterator[Corners | None]:
-            before: tuple[int, NDArray[np.uint8]] | None = None
-            follower = CornerFollower(self.frames.job.timing)
-            with closing(self.decoded()) as frames:
-                for index, frame in enumerate(frames):
+            with closing(
+                prefetched(self._followed(times, faults, shakes, compared), WINDOW_FRAMES)
+            ) as frames:  # a window is fitted in this thread meanwhile
+                for corners in frames:
                     progress()
-                    if isinstance(frame, str):
-                        faults[index] = frame
-                        continue
-                    grey = self.frames.grey(frame)
-                    if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
-                        faults[index] = f"frame {index} is constant, or a copy of the frame before"
-                        continue
-                    corners = follower.next(grey, self.starts[index])
-                    if before is not None:
-                        if corners is not None and before[0] == index - 1:
-                            shakes[index - 1] = shake(corners)
-                        if before[0] == index - 1 in chosen:
-                            starts = self.starts[index - 1 : index + 1]
-                            compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
-                        if corners is not None and self.stabilised:
-                            both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
-                            corners = replace(corners, times=both)
-                        yield corners
-                    before = index, grey
+                    yield from corners
 
         if self.rates is None:
-            path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
+            # Threads of BLAS wait for each other after every pair of frames: 3 to 20 times the processor time.
+            with threadpool_limits(limits=1, user_api="blas"):
+                path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
             places = path.places(times)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])
             polynomials = np.stack([path.derivatives(times, 1), path.derivatives(times, 2), shift], 1)
@@ -142,6 +128,41 @@ class VideoPasses:
         rotation = RecordedRotation.aligned(self.rates, found, times)
         turned = self._to_steady(times, rotation.apart)
         return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
+
+    def _followed(
+        self,
+        times: Array,
+        faults: dict[int, str],
+        shakes: dict[int, tuple[Array, float]],
+        compared: dict[int, Corners],
+    ) -> Generator[tuple[Corners | None, ...], None, None]:
+        """Of every frame, the corners between it and the usable frame before, if there is one; fills the tables."""
+        chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
+        before: tuple[int, NDArray[np.uint8]] | None = None
+        follower = CornerFollower(self.frames.job.timing)
+        with closing(self.decoded()) as frames:
+            for index, frame in enumerate(frames):
+                if isinstance(frame, str):
+                    faults[index] = frame
+                    yield ()
+                    continue
+                grey = self.frames.grey(frame)
+                if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
+                    faults[index] = f"frame {index} is constant, or a copy of the frame before"
+                    yield ()
+                    continue
+                corners = follower.next(grey, self.starts[index])
+                if before is not None:
+                    if corners is not None and before[0] == index - 1:
+                        shakes[index - 1] = shake(corners)
+                    if before[0] == index - 1 in chosen:
+                        starts = self.starts[index - 1 : index + 1]
+                        compared[index - 1] = followed_pair(before[1], grey, starts, self.frames.job.timing)
+                    if corners is not None and self.stabilised:
+                        both = np.broadcast_to(times[[before[0], index]], corners.times.shape)
+                        corners = replace(corners, times=both)
+                yield () if before is None else (corners,)
+                before = index, grey
 
     def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
         return steady_shifts(times, apart, self.steady, self.frames.size, self.crop_limit)
@@ -174,11 +195,15 @@ class VideoPasses:
         return FrameTrack(index, self.starts[index], motion.removed(index), motion.faults.get(index), exposure)
 
     def left_alone(self, track: FrameTrack) -> FrameTrack:
-        """What is removed from a frame of a part that restoration makes worse: no vibration."""
+        """What is removed from a frame of a part that restoration makes worse: rows are not moved apart."""
         if not isinstance(track.motion, Vibration):
             return track
-        still = track.motion.scaled(0.0) if self.steady == 0 else track.motion
-        return replace(track, motion=replace(still, amplitude=torch.zeros_like(still.amplitude)))
+        return replace(track, motion=replace(track.motion.scaled(0.0), image_shift=track.motion.image_shift))
+
+    def is_explained(self, motion: VideoMotion, part: int) -> bool:
+        """Whether the path of the camera and tones explain the corners of a part."""
+        path, frames = motion.path, motion.times[part * PART_FRAMES : (part + 1) * PART_FRAMES]
+        return not isinstance(path, CameraPath) or path.nearest(frames[len(frames) // 2]).residual < path.allowed
 
     def margins(self, motion: VideoMotion) -> Margins:
         """The widest margins of all frames: how far outside of the frame the content of its border was recorded."""
@@ -288,10 +313,26 @@ class VideoPasses:
         velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
         findings = tuple(self._findings(axis, tones) for axis in (0, 1))
+        if window.residual > path.allowed:
+            unexplained = Reason("corners_unexplained", None, window.residual, path.allowed)
+            findings = tuple((*(one for one in of if one.code != "no_tone"), unexplained) for of in findings)
+        timing, std = self.frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
+        coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
+        fit = ToneFit(
+            coefficients=coefficients[None],
+            frequencies=frequency[None],
+            active=amplitude[None] > 0,
+            drift=velocity[None, :, None],
+            covariance=np.empty((1, 0, 0)),
+            centre=np.zeros(1),
+            model=MotionModel(),
+        )
+        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
+        sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(tracks), rows)[0]
         return DetectedVibration(
             vibration=vibration,
-            std=VibrationStd(*(torch.from_numpy(np.array(value)) for value in values)),
-            gain=vibration.gain(self.frames.job.timing.frame_period),
+            std=with_row_time_std(std, vibration, sensitivity, timing),
+            gain=vibration.gain(timing.frame_period),
             residual=torch.full((2,), window.residual, dtype=torch.float64),
             reliable=torch.tensor([not reasons for reasons in findings]),
             findings=findings,

@@ -23,15 +23,15 @@ def hand(t):
     return np.stack([x, y, roll, 0.01 * np.sin(2 * np.pi * 0.5 * t)])
 
 
-def vibration(t, tones, decay):
-    """(2, ...) px; the tones decay with a time in s."""
+def vibration(t, tones, decay, sweep):
+    """(2, ...) px; the tones decay with a time in s, and their frequencies change by ``sweep`` in Hz/s."""
     parts = np.zeros((2, *t.shape))
     for axis, (size, frequency, phase) in tones.items():
-        parts[axis] = size * np.exp(-t / decay) * np.sin(2 * np.pi * frequency * t + phase)
+        parts[axis] = size * np.exp(-t / decay) * np.sin(2 * np.pi * (frequency + 0.5 * sweep * t) * t + phase)
     return parts
 
 
-def recorded(tones, subject=True, decay=np.inf):
+def recorded(tones, subject=True, decay=np.inf, sweep=0.0):
     """(T, H, W) counts: a scene whose left part is nearer, with a subject that walks through, as a hand records it."""
     scene = spline_filter(draw_scene(HEIGHT + 160, WIDTH + 160, 3), order=3)
     patch = draw_scene(200, 170, 9)
@@ -43,7 +43,7 @@ def recorded(tones, subject=True, decay=np.inf):
         total = np.zeros((HEIGHT, WIDTH))
         for sample in range(SAMPLES):
             t = number / RATE + y * TIMING.row_time + (sample + 0.5) / SAMPLES * TIMING.exposure_time
-            (dx, dy, roll, zoom), moved = hand(t), vibration(t, tones, decay)
+            (dx, dy, roll, zoom), moved = hand(t), vibration(t, tones, decay, sweep)
             near = np.where(x < 0.3 * WIDTH, 3.0 * np.sin(2 * np.pi * 0.7 * t), 0.0)
             # content at p appears at p + D(p): to first order, as the displacement is defined
             at_x = from_x - (dx + moved[0] + near - roll * from_y + zoom * from_x)
@@ -100,6 +100,18 @@ def test_a_vibration_that_decays_is_followed():
         for axis, (size, frequency, phase) in truth.items():
             expected = size * np.exp(-time / decay) * np.exp(1j * (2 * np.pi * frequency * time + phase - np.pi / 2))
             assert abs(tones[axis].coefficient - expected) < 0.06  # px
+
+
+def test_tones_that_sweep_are_followed():
+    truth, sweep = {0: (2.0, 40.0, 0.3), 1: (1.5, 63.0, 1.0)}, 24.0
+    path = fitted(recorded(truth, subject=False, sweep=sweep))[1]
+    assert all(window.residual < path.allowed for window in path.windows)
+    for time in (0.3, 0.7, 1.2):
+        for axis, (size, frequency, phase) in truth.items():
+            tones = [tone for tone in path.tones(time) if tone.axis == axis]
+            assert all(abs(tone.frequency - frequency - sweep * time) < 0.5 for tone in tones)
+            turned = 2 * np.pi * (frequency + 0.5 * sweep * time) * time + phase - np.pi / 2
+            assert abs(sum(tone.coefficient for tone in tones) - size * np.exp(1j * turned)) < 0.15  # px
 
 
 def test_corners_at_night_are_those_of_the_lights():

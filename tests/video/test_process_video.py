@@ -166,6 +166,16 @@ class _StoppedError(KeyboardInterrupt):
     """Ctrl-C at a chosen frame."""
 
 
+def test_tones_of_a_video_have_the_standard_deviation_of_the_row_time(clip, tmp_path):
+    row_time = 1.01 * 150e-6
+    timing = SensorTiming(row_time, 4 / 1.01, 1 / RATE / row_time, row_time_std=0.01 * row_time)
+    report = process_video(clip, tmp_path / "still.mp4", timing, **OPTIONS)
+    found = read_manifest(report.manifest).detections()[0]
+    for name in ("amplitude", "phase"):
+        error = getattr(found.vibration, name)[:, 0] - torch.tensor(getattr(VIBRATION, name))
+        assert bool((error.abs() < 2 * getattr(found.std, name)[:, 0]).all())
+
+
 @pytest.mark.parametrize("damage", [None, "damaged part"])
 def test_an_interrupted_run_is_resumed(clip, tmp_path, damage):
     options = {"border": "hold", "steady": 0.2, **OPTIONS}

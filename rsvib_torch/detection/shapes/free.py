@@ -21,6 +21,7 @@ from torch.nn import functional
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
+from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
 from rsvib_torch.detection.verdict import rotation_reasons, scene_reasons
@@ -201,6 +202,11 @@ def _detect(
     rows_of_report = torch.linspace(0, scale.height - 1, count, dtype=torch.float64, device=starts.device)
     times = starts[:, None] + rows_of_report * rowwise.row_time + 0.5 * rowwise.exposure_time
     fit = _fit_spline(replace(weighed, independent=share), spacing, record, table(times).ravel())
+    if rowwise.row_time_std:
+        by_row_time = displacements_by_row_time(measured, motion[0], rowwise, len(starts))
+        changed = replace(weighed, displacements=weighed.displacements + by_row_time, independent=share)
+        other = _fit_spline(changed, spacing, record, table(times).ravel())
+        fit = replace(fit, by_row_time=other.coefficients - fit.coefficients)
     motion = _motion(fit, (0.25 * scale.width, 0.25 * scale.height))  # px; beyond, frames share too little
     banded = measurements_of_curve(curve, rowwise, bands.band_step)
     of_middle: Motion = motion
@@ -386,6 +392,7 @@ class _SplineFit:
     # (K, W, W) float64 px^2 of each axis, covariances of W coefficients from the ``step`` k-th on; none while iterating
     covariances: list[Array]
     step: int = 1
+    by_row_time: Array | None = None  # (A, N) px, change by the standard deviation of the row time
 
     @property
     def knots(self) -> Array:
@@ -401,6 +408,9 @@ class _SplineFit:
         place = index - self.step * part[:, None]
         parts = [values[part[:, None, None], place[:, :, None], place[:, None]] for values in self.covariances]
         variances = [((weights @ of_axis) * weights).sum(-1) for of_axis in parts]
+        if self.by_row_time is not None:
+            changes = [(weights * of_axis[index][:, None]).sum(-1) for of_axis in self.by_row_time]
+            variances = [of_axis + np.square(change) for of_axis, change in zip(variances, changes, strict=True)]
         return np.maximum(np.stack(variances, -1), 0.0)
 
 

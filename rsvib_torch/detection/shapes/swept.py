@@ -12,6 +12,7 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import check_shapes
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.shapes.free import (
     MAX_BAND_ERROR,
     band_errors,
@@ -239,7 +240,13 @@ def _detect(
     covariances = covariances / float(independent[0])
     others = [_equally_good(one, float(independent[0]), covariances[axis]) for axis, one in enumerate(solved)]
     times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
-    uncertain = torch.stack([_rms_std(_relative(measured, _columns(times, fits[i])), covariances[i]) for i in range(2)])
+    columns = torch.stack([_relative(measured, _columns(times, fit)) for fit in fits])
+    by_row_time = tensor(displacements_by_row_time(measured, motion, rowwise, len(stack.images[0]))[0])
+    heavy = tensor(weighed.inverse_variances[0]).sqrt()[:, None, :].expand(by_row_time.shape).movedim(-1, 0)
+    design, data = (heavy[..., None] * columns).flatten(1, 2), (heavy * by_row_time.movedim(-1, 0)).flatten(1)
+    changes = torch.linalg.lstsq(design, data[..., None], driver="gelsd").solution  # (2, 6, 1) of the parameters
+    covariances = covariances + changes @ changes.mT
+    uncertain = torch.stack([_rms_std(columns[i], covariances[i]) for i in range(2)])
     moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
     against = bands_reasons(curve, stack.images.shape[-1], banded, motion)
     chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
