@@ -6,6 +6,7 @@ import psutil
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from small_stack import FRAMES, WINDOWS, process_small, write_small
 
 from rsvib_torch import SensorTiming
 from rsvib_torch.commands import terminal
@@ -84,3 +85,14 @@ def replace_free_memory(monkeypatch):
         monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
 
     return set_free
+
+
+@pytest.fixture(scope="session", name="whole")
+def process_whole(tmp_path_factory):
+    """A folder with a stack and the outputs of uninterrupted runs."""
+    folder = tmp_path_factory.mktemp("whole")
+    write_small(folder / "frames.tif")
+    for name in ("out.tif", "out.npy"):
+        report = process_small(folder / "frames.tif", folder / name)
+        assert (report.frames, report.windows, report.restored) == (FRAMES, WINDOWS, WINDOWS)
+    return folder

@@ -98,7 +98,7 @@ def refine(
         other, _ = robust_fit(refined.measurements, frequencies, active, start.model)
         # a pattern that was subtracted does not appear again
         again = _rounds(refined.frames.stacks(index), intervals, take_stacks([other], index), tones, False, has_pattern)
-        refined = _with_better(refined, again, index)
+        refined = with_better(refined, again, index)
     # Tones that the exact fit does not confirm are left out.
     if tones is None:
         fit = significant_only(refined.measurements, refined.fit, intervals)
@@ -484,10 +484,10 @@ def _is_nearly_blind(fit: ToneFit, intervals: Array) -> Array:
     return strongest.active[..., 0] & (offset_gain(strongest.frequencies, intervals)[..., 0] < _SMALL_GAIN)
 
 
-def _with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
-    """The result with another one of the stacks ``index`` where its residual in the typical row is smaller."""
+def with_better(first: FittedRows, second: FittedRows, index: Array) -> FittedRows:
+    """The result with another one of the stacks ``index`` where its residual in the typical row is smaller or known."""
     sizes = typical_size(first.measurements, first.fit)[index], typical_size(second.measurements, second.fit)
-    better = sizes[1] < sizes[0]
+    better = sizes[1] < without_nan(sizes[0], np.inf)
     place = np.arange(len(first.unknown))
     place[index[better]] = len(place) + np.flatnonzero(better)
     count, rounds = _room([first, second])

@@ -23,6 +23,7 @@ from rsvib_torch.results.reason import Reason
 Findings = tuple[tuple[Reason, ...], ...]  # the reasons against each axis
 
 _MIN_MEASURED = 0.5  # of the visible rows or bands
+_MIN_REGISTERED = 0.25  # of the bands; of 81 recordings with clouds, objects and large motions, the least was 0.35
 MAX_DISPLACEMENT_STD = 0.25  # of the displacement of the rows
 _MAX_WITHIN_ROW_TIME = 0.1  # px; condition (24) of the paper
 _MIN_MOTION = 0.05  # px between frames; offsets of bands have errors of this size
@@ -143,13 +144,16 @@ def _reasons_against_stack(stack: Table, timing: RowTiming, max_tones: float, le
 def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
     """For each stack, the reason against frames that show different scenes or noise; ``columns`` is their width in px.
 
-    Without it, 6 of 24 stacks of 2 to 8 frames of independent noise had reliable axes, with amplitudes of 5 to 52 px.
+    Without it, 6 of 24 stacks of 2 to 8 frames of independent noise had reliable axes, with amplitudes of 5 to 52 px;
+    and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one.
     """
-    shares, what = similar_share(curve, columns).tolist(), {"what": "the row bands"}
-    return [
-        [Reason("rows_not_registered", None, share, _MIN_MEASURED, what)] if share < _MIN_MEASURED else []
-        for share in shares
-    ]
+    registered = curve.good.double().mean((1, 2)).tolist()
+    against: list[list[Reason]] = []
+    for similar, found in zip(similar_share(curve, columns).tolist(), registered, strict=True):
+        share, limit = (found, _MIN_REGISTERED) if found < _MIN_REGISTERED else (similar, _MIN_MEASURED)
+        what = {"what": "the row bands"}
+        against.append([Reason("rows_not_registered", None, share, limit, what)] if share < limit else [])
+    return against
 
 
 def with_reasons_of_all(of_all: list[Reason], findings: Findings) -> Findings:

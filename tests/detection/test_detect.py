@@ -140,7 +140,8 @@ def test_frames_with_little_overlap_do_not_affect_the_other_stacks_of_a_batch(di
     together = detect_vibration(torch.stack([apart, wide[:, :, :150]])[:, :, None], timing, search=8)
     alone = detect_vibration(wide[:, :, :150], timing, search=8)
     assert together.reliable.tolist() == [[False, False], [True, True]]
-    torch.testing.assert_close(together[1].vibration.amplitude, alone.vibration.amplitude, rtol=0, atol=0.02)  # px
+    amplitude = together[1].vibration.amplitude[:, :1]  # the other stack may have more tones
+    torch.testing.assert_close(amplitude, alone.vibration.amplitude, rtol=0, atol=0.02)  # px
 
 
 @pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])

@@ -209,11 +209,6 @@ class _Search:
         # nearly blind, for the verdict. Both fits are compared with the weights of the richer one.
         if self.tones is None:
             passed = self.decreases(weighted, residual, residual_of(self.measurements, fit))
-            if self.accuracy and not first:
-                # Bands that move within their height contain twice the frequency of a tone, as a large tone if that is
-                # nearly blind. Of 200 recordings in four and eight frames, three were refused because of it.
-                largest = fit.amplitude[..., :-1].max(-1)
-                passed = passed & ((fit.amplitude[..., -1] <= largest) | (largest == 0))
             passed = self.open_axes & passed & _resolved(self.measurements, fit) & (self.is_visible(fit) | first)
             while bool(passed.any()) and not bool((passed == self.open_axes).all()):
                 self.open_axes = passed
@@ -335,6 +330,14 @@ def _with_blind_tones(measurements: Measurements, weighted: Measurements, fit: T
     return robust_fit(measurements, frequencies, active, fit.model)[0]
 
 
+def too_small(fit: ToneFit, intervals: Array, exposure_time: float) -> Array:
+    """(B, A, K) bool, tones of large gain whose offsets are below ``MIN_OFFSET``."""
+    gain = offset_gain(fit.frequencies, intervals)
+    attenuation = np.abs(np.sinc(fit.frequencies * exposure_time))
+    small: Array = (fit.amplitude * attenuation * gain < MIN_OFFSET) & (gain >= MIN_GAIN)
+    return small & fit.active
+
+
 def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array) -> ToneFit:
     """The fit without the tones, other than the strongest of an axis, that are not significant or too small.
 
@@ -348,9 +351,7 @@ def significant_only(measurements: Measurements, fit: ToneFit, intervals: Array)
     while True:
         # 1. The weakest tone (or family) of each axis that is neither significant nor needed.
         size, std = fit.amplitude, amplitude_std(fit)
-        gain = offset_gain(fit.frequencies, intervals)
-        attenuation = np.abs(np.sinc(fit.frequencies * measurements.exposure_time))
-        small = (size * attenuation * gain < MIN_OFFSET) & (gain >= MIN_GAIN)
+        small = too_small(fit, intervals, measurements.exposure_time)
         kept = ((size > MIN_SIGNIFICANCE * std) & ~small) | (size == size.max(-1, keepdims=True)) | needed
         kept = split_axis(kept & fit.active, -1, -1, harmonics).any(-1)
         families = split_axis(fit.active, -1, -1, harmonics).any(-1)
