@@ -24,7 +24,7 @@ from rsvib_torch.detection.tones.fit import (
     ToneFit,
     displacement_std,
     fit_tones,
-    is_bounded,
+    fitted_again,
     motion_of_fit,
     residual_of,
     shrunk,
@@ -43,7 +43,7 @@ from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_r
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
-from rsvib_torch.numerics.tables import Array, select_stacks, table, tables, take_stacks
+from rsvib_torch.numerics.tables import Array, table, tables, take_stacks
 from rsvib_torch.options import MAX_TONES, DetectionMethod, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
@@ -152,11 +152,11 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     if fitted.refined is None:
         fit = with_unknown_errors(measurements, fitted.fit)
     else:
-        measurements, fit = _without_aliasing(fitted.refined, fitted.fit, intervals, timing)
+        measurements, fit = _with_errors_of_scene(fitted.refined, fitted.fit, intervals, timing)
         small = too_small(fit, intervals, timing.exposure_time) & (fit.amplitude < fit.amplitude.max(-1, keepdims=True))
         if options.max_tones < math.inf and small.any():  # aliasing was taken for further tones
             kept = fit_tones(measurements, fit, fit.active & ~small, fit.model)
-            measurements, fit = _without_aliasing(fitted.refined, kept, intervals, timing)
+            measurements, fit = _with_errors_of_scene(fitted.refined, kept, intervals, timing)
     known_std = displacement_std(fit, row_starts, timing.exposure_time)
     stated, if_hidden = with_further_tones(measurements, fit, row_starts, number_is_known=options.tones is not None)
     vibration, std = stated.vibration()
@@ -193,14 +193,13 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     )
 
 
-def _without_aliasing(
+def _with_errors_of_scene(
     refined: FittedRows, fit: ToneFit, intervals: Array, timing: RowTiming
 ) -> tuple[Measurements, ToneFit]:
     """The rows in which aliasing has less weight, and the fit with what it and the scene add to its uncertainty."""
     measurements = with_weak_aliasing(refined.measurements, fit)
-    exact = fit_tones(measurements, fit, fit.active, fit.model)
-    exact = replace(exact, covariance=exact.covariance + covariance_of_changes(refined.unknown))
-    fit = select_stacks(is_bounded(exact, timing.exposure_time), exact, fit)
+    fit = fitted_again(measurements, fit)
+    fit = replace(fit, covariance=fit.covariance + covariance_of_changes(refined.unknown))
     fit = with_errors_of_blocks(measurements, fit)
     fit = without_aliasing(measurements, fit, refined.aliasing)
     return measurements, with_unknown_amplitudes(fit, refined.aliasing, intervals, timing.exposure_time)

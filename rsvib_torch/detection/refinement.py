@@ -26,7 +26,7 @@ from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, MeasuredRows
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
-    fit_tones,
+    fitted_again,
     is_bounded,
     model_displacements,
     motion_of_fit,
@@ -396,9 +396,8 @@ def conclude(frames: GroupedFrames, measured: MeasuredRows, fit: ToneFit) -> Fit
     weighted = measurements.reweighted(residual)
     share = weighted.independent_fraction(residual) * measurements.share_counted(residual)
     weighted = replace(weighted, independent=share)
-    exact = fit_tones(weighted, fit, fit.active, fit.model)
-    fit = select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)  # the exact fit may diverge
-    tones = measurements.relative(model_displacements(measurements, replace(fit, drift=np.zeros_like(fit.drift))))
+    fit = fitted_again(weighted, fit)
+    tones = model_displacements(measurements, replace(fit, drift=np.zeros_like(fit.drift)))
     other = OtherMotion.of(measurements, tones, residual, measured.differential())
     return FittedRows(
         weighted,

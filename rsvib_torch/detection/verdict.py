@@ -148,10 +148,9 @@ def scene_reasons(curve: OffsetCurve, columns: int) -> list[list[Reason]]:
     and a motion beyond the search range, of which a sixth of the bands was registered, had a wrong one.
     """
     registered = curve.good.double().mean((1, 2)).tolist()
-    against: list[list[Reason]] = []
+    against, what = list[list[Reason]](), {"what": "the row bands"}
     for similar, found in zip(similar_share(curve, columns).tolist(), registered, strict=True):
         share, limit = (found, _MIN_REGISTERED) if found < _MIN_REGISTERED else (similar, _MIN_MEASURED)
-        what = {"what": "the row bands"}
         against.append([Reason("rows_not_registered", None, share, limit, what)] if share < limit else [])
     return against
 

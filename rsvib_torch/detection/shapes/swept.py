@@ -241,11 +241,12 @@ def _detect(
     others = [_equally_good(one, float(independent[0]), covariances[axis]) for axis, one in enumerate(solved)]
     times = tensor(measured.exposure_starts[0]) + 0.5 * measured.exposure_time - 0.5 * (record[0] + record[1])
     columns = torch.stack([_relative(measured, _columns(times, fit)) for fit in fits])
-    by_row_time = tensor(displacements_by_row_time(measured, motion, rowwise, len(stack.images[0]))[0])
-    heavy = tensor(weighed.inverse_variances[0]).sqrt()[:, None, :].expand(by_row_time.shape).movedim(-1, 0)
-    design, data = (heavy[..., None] * columns).flatten(1, 2), (heavy * by_row_time.movedim(-1, 0)).flatten(1)
-    changes = torch.linalg.lstsq(design, data[..., None], driver="gelsd").solution  # (2, 6, 1) of the parameters
-    covariances = covariances + changes @ changes.mT
+    if rowwise.row_time_std:
+        by_row_time = tensor(displacements_by_row_time(measured, motion, rowwise, len(stack.images[0]))[0])
+        heavy = tensor(weighed.inverse_variances[0]).sqrt()[:, None, :].expand(by_row_time.shape).movedim(-1, 0)
+        design, data = (heavy[..., None] * columns).flatten(1, 2), (heavy * by_row_time.movedim(-1, 0)).flatten(1)
+        changes = torch.linalg.lstsq(design, data[..., None], driver="gelsd").solution  # (2, 6, 1) of the parameters
+        covariances = covariances + changes @ changes.mT
     uncertain = torch.stack([_rms_std(columns[i], covariances[i]) for i in range(2)])
     moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
     against = bands_reasons(curve, stack.images.shape[-1], banded, motion)

@@ -390,6 +390,12 @@ def fit_tones(
     return problem.fit(state.values, problem.covariance(state, np.sqrt(problem.variances(state))))
 
 
+def fitted_again(measurements: Measurements, fit: ToneFit) -> ToneFit:
+    """``fit_tones`` from an earlier fit, and that fit itself for stacks where it diverges."""
+    exact = fit_tones(measurements, fit, fit.active, fit.model)
+    return select_stacks(is_bounded(exact, measurements.exposure_time), exact, fit)
+
+
 def with_errors_of_blocks(measurements: Measurements, fit: ToneFit) -> ToneFit:
     """The fit with standard deviations that are at least those by the scatter of blocks of the scene.
 

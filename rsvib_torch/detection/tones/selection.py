@@ -271,7 +271,7 @@ class _Search:
 def _disturbed(measurements: Measurements, residual: Array) -> Array:
     """(B,) bool: a stretch of outliers may have biased a fit, which leaves more than 5 % of the motion of some rows."""
     most = quantile(measurements.sizes(residual), 0.9, 1)
-    whole = median(measurements.sizes(measurements.relative(measurements.displacements)), 1)
+    whole = median(measurements.sizes(measurements.displacements), 1)
     return ~np.all(most < 0.05 * whole, -1)
 
 

@@ -48,15 +48,7 @@ from rsvib_torch.detection.tones.fit import (
 )
 from rsvib_torch.execution.chunking import runs
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.tables import (
-    Array,
-    pseudo_inverse,
-    split_axis,
-    tensor,
-    unit_wave,
-    valid_mean,
-    without_nan,
-)
+from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, tensor, unit_wave, valid_mean, without_nan
 
 # Mean, and standard deviations of b, c and s, of x and of y over the expected size of b; chosen with 220 recordings of
 # drawn and real scenes. In 60 others each behind optics of 0.4 and 0.55 px, with one tone in 2 to 8 frames, the rms
