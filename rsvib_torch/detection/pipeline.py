@@ -259,10 +259,11 @@ def fit_directly(
         frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs=not doubtful)
     refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
     # Bands that move within their height contain twice the frequency of a tone, as a tone that is larger than the frame
-    # if it is nearly blind (3 of 200 recordings in four and eight frames): one tone of each axis is tried alone.
-    lost = ~(refined.measurements.weights > 0).any((1, 2)) & (fit.active.sum(-1) > options.model.harmonics).any(-1)
-    if options.tones is None and lost.any():
-        index = np.flatnonzero(lost)
+    # if it is nearly blind (3 of 200 recordings in four and eight frames), or hide a tone: where the rows contradict the
+    # fit, one tone of each axis is tried.
+    contradicted = ~(refined.other_motion.unexplained <= refined.other_motion.permitted).all(-1) & ~refined.abandoned
+    if options.tones is None and contradicted.any():
+        index = np.flatnonzero(contradicted)
         single = _tones_of_bands(start, timing, replace(options, tones=1), accuracy=0.15)
         again = refine(frames.stacks(index), intervals, take_stacks([single], index), None, may_abandon=doubtful)
         explained = np.flatnonzero((again.other_motion.unexplained <= again.other_motion.permitted).all(-1))
