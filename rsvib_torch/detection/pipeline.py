@@ -202,7 +202,10 @@ def _with_errors_of_scene(
     fit = replace(fit, covariance=fit.covariance + covariance_of_changes(refined.unknown))
     fit = with_errors_of_blocks(measurements, fit)
     fit = without_aliasing(measurements, fit, refined.aliasing)
-    return measurements, with_unknown_amplitudes(fit, refined.aliasing, intervals, timing.exposure_time)
+    unexplained = refined.other_motion.unexplained
+    return measurements, with_unknown_amplitudes(
+        fit, refined.aliasing, unexplained, intervals, timing.exposure_time, span=measurements.span
+    )
 
 
 def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:

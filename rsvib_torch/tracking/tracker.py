@@ -325,7 +325,9 @@ class VibrationTracker:
         if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
             return state.without_track("the rows are far from where the motion places them")
         aliasing = table(scene.gradients.aliasing)
-        fit = with_unknown_amplitudes(fit, aliasing, np.diff(starts), self._rows.exposure_time, known=0)
+        fit = with_unknown_amplitudes(
+            fit, aliasing, other.unexplained, np.diff(starts), self._rows.exposure_time, known=0
+        )
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
         tones = self._judged(frame, fit, measurements, other)
         trusted = np.array([not against for against in tones.findings])
