@@ -262,8 +262,8 @@ def fit_directly(
         frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale, pairs=not doubtful)
     refined = refine(frames, intervals, fit, options.tones, may_abandon=doubtful, has_pattern=hypothesis.has_pattern)
     # Bands that move within their height contain twice the frequency of a tone, as a tone that is larger than the frame
-    # if it is nearly blind (3 of 200 recordings in four and eight frames), or hide a tone: where the rows contradict the
-    # fit, one tone of each axis is tried.
+    # if it is nearly blind (3 of 200 recordings in four and eight frames), or none (1 of 60 in two frames, with another
+    # axis that was wrong): where the rows contradict the fit, one tone of each axis is tried.
     contradicted = ~(refined.other_motion.unexplained <= refined.other_motion.permitted).all(-1) & ~refined.abandoned
     if options.tones is None and contradicted.any():
         index = np.flatnonzero(contradicted)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import linalg
+from scipy import linalg, special
 from torch import Tensor
 from torch.nn import functional
 
@@ -625,13 +625,13 @@ def _report(
     index, weights = spline_taps(table(times).ravel(), fit.start, fit.spacing, fit.coefficients.shape[-1])
     std = tensor(np.sqrt(fit.variances(index, weights[:, None]))[:, 0]).unflatten(0, times.shape)
     seen_and_unseen = _visible_and_common(fit, measured)
-    blind = _nearly_blind(motion, timing, len(times), seen_and_unseen[1])
-    std_seen, unseen = map(tensor, seen_and_unseen)
-    std = torch.hypot(std, tensor(blind * math.sqrt(_IF_BLIND**2 - 1)) * unseen)
-    unseen = tensor(np.where(blind, _IF_BLIND, 1.0)) * unseen
-    rest = tensor(measured.unexplained(residual_of_motion(measured, motion))[0])
     value = motion.displacement(times)
     value = value - value.mean((0, 1))
+    # The power at other frequencies says nothing about a tone that displaces all frames nearly alike.
+    blind = _blind_tone(table(value), table(times), seen_and_unseen[0])
+    std = torch.hypot(std, tensor(blind))
+    std_seen, unseen = tensor(seen_and_unseen[0]), tensor(np.hypot(seen_and_unseen[1], blind))
+    rest = tensor(measured.unexplained(residual_of_motion(measured, motion))[0])
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
@@ -656,41 +656,60 @@ def _report(
     )
 
 
-# Errors of tones within 8 % of the frame rate in five frames (80 axes) were 12.7 times the standard deviation of the
-# displacement common to all frames (rms; 2.7 times at 5 %, 0.5 times at 11 %), and are 3.4 times with this factor
-_IF_BLIND = 4.0
+# px, standard deviation of the quadratures of a nearly blind tone before it is measured: vibrations have a few pixels
+_BLIND_SIZE = 3.0
+# of the energy of the visible motion; such tones left 1e-3 of it, walks, smooth motions and sums of tones more than 0.1
+_LEFT_BY_BLIND = 0.05
 
 
-def _nearly_blind(motion: FreeMotion, timing: SensorTiming, num_frames: int, unseen: Array) -> Array:
-    """(A,) bool, axes whose motion is concentrated near a multiple of the frame rate, where frames move nearly alike.
+def _blind_tone(values: Array, times: Array, noise: Array) -> Array:
+    """(A,) px, rms displacement of all frames alike by a tone near a multiple of the frame rate, or 0.
 
-    The amplitude there may be anything from the visible one upwards. ``unseen`` (A,) px is the standard deviation of
-    the common displacement that the power at other frequencies suggests.
+    Of a tone at ``1 + e`` times the frame rate, the frames show ``2 pi e`` of its amplitude, and e only in the change
+    of that from frame to frame. The rms displacement is the mean over all e of its posterior, where such a tone beside
+    a uniformly accelerated motion explains the visible motion. Displacements of 120 tones of 1.5 px within 8 % of the
+    frame rate in five frames had errors of up to 1.1 px: 12 standard deviations (rms) without it, 0.6 with it; 98 % of
+    the 95 % intervals contain the truth.
+
+    ``values`` (T, R, A) px are the displacements of rows at ``times`` (T, R) in s, ``noise`` (A,) px is the standard
+    deviation of their visible part.
     """
-    starts = table(timing.frame_starts(num_frames))
-    intervals = np.diff(starts)
-    # the spectrum of three frames does not separate multiples of the frame rate; unequal intervals have no blind tone
-    if num_frames < 4 or np.ptp(intervals) > 0.01 * intervals[0]:
-        return np.zeros_like(unseen, dtype=bool)
-    # 1. Spectrum of the motion without a straight line.
-    turns = np.linspace(0.0, num_frames - 0.1, 32 * num_frames)  # in frame periods
-    values = table(motion.displacement(tensor(starts[0] + turns * intervals.mean())))
-    line = np.stack([np.ones_like(turns), turns], -1)
-    values = values - line @ np.linalg.lstsq(line, values)[0]
-    window = np.hanning(len(turns))
+    starts = times[:, 0]
+    period, frames = np.diff(starts).mean(), len(starts)
+    largest = np.zeros(values.shape[-1])
+    # the change within three frames is that of an acceleration; unequal intervals have no blind tone
+    if frames < 4 or np.ptp(np.diff(starts)) > 0.01 * period:
+        return largest
+    turns = (times - times.mean()) / period
 
-    def amplitude(multiples: Array) -> Array:
-        """(A,) px, the largest of these multiples of the frame rate."""
-        waves = np.exp(-2j * math.pi * multiples[:, None] * turns) * window
-        return np.asarray(2 * np.abs(waves @ values).max(0) / window.sum())
+    def visible(functions: Array) -> Array:
+        """Functions (T, R, ...) of the displacement less their means over the frames, as columns (T R, ...)."""
+        return (functions - functions.mean(0)).reshape(-1, *functions.shape[2:])
 
-    # 2. Peaks near multiples of the frame rate, against the amplitudes beside them, the noise and the whole motion.
-    blind = np.zeros_like(unseen, dtype=bool)
+    # 1. The visible motion without a uniformly accelerated one.
+    drift, _ = np.linalg.qr(visible(np.stack([turns, np.square(turns)], -1)))
+    left = visible(values)
+    left = left - drift @ (drift.T @ left)
+    energy = np.square(left).sum(0)
+    distances = np.linspace(-0.75, 0.75, 61) / frames
     for multiple in range(1, 7):
-        peak = amplitude(multiple + np.linspace(-1.0, 1.0, 7) * min(0.15, 0.6 / num_frames))
-        beside = amplitude(multiple + np.array([-1.0, 1.0]) * min(0.5, 2.5 / num_frames))
-        blind |= (peak > 2 * beside) & (peak > 0.5 * unseen) & (peak > 0.2 * values.std(0))
-    return blind
+        # 2. Fits (E, 2, A) of tones of all e, and the variance of their measurements: rows are not independent.
+        angle = 2 * math.pi * (multiple + distances) * turns[..., None]
+        waves = visible(np.stack([np.cos(angle), np.sin(angle)], -1)).swapaxes(0, 1)  # (E, T R, 2)
+        waves = waves - drift @ (drift.T @ waves)
+        gram, right = waves.mT @ waves, waves.mT @ left
+        unexplained = energy - (right * np.linalg.solve(gram + 1e-9 * np.eye(2), right)).sum(1).max(0)
+        variance = 3 * np.maximum(np.square(noise), unexplained / len(left))
+        # 3. Posterior of the quadratures for each e, its evidence, and the mean square of the displacement.
+        for axis in np.flatnonzero(unexplained < _LEFT_BY_BLIND * energy):
+            precision = gram / variance[axis] + np.eye(2) / _BLIND_SIZE**2
+            covariance = np.linalg.inv(precision)
+            target = right[..., axis] / variance[axis]
+            mean = (covariance @ target[..., None])[..., 0]
+            evidence = 0.5 * (target * mean).sum(-1) - 0.5 * np.linalg.slogdet(precision)[1]
+            squares = np.square(mean).sum(-1) + np.trace(covariance, axis1=1, axis2=2)
+            largest[axis] = max(largest[axis], math.sqrt(0.5 * special.softmax(evidence) @ squares))
+    return largest
 
 
 def _visible_and_common(fit: _SplineFit, measured: Measurements) -> tuple[Array, Array]:
