@@ -252,7 +252,7 @@ def with_unknown_amplitudes(
     """The fit with errors of its tones that the models of noise, unequal blur and aliasing do not contain.
 
     ``aliasing`` (B,) px is the expected size of the bias, for which ``without_aliasing`` accounts on the first
-    ``known`` axes, and ``unexplained`` (B, 2) px the rms displacement of rows that nothing explains. ``intervals`` (M,)
+    ``known`` axes, and ``unexplained`` (B, A) px the rms displacement of rows that nothing explains. ``intervals`` (M,)
     are the times in s between the frames that are compared: a small gain amplifies errors of offsets. ``span`` (B,) in
     s is the time over which errors of the phase change the frequency.
     """
@@ -266,16 +266,16 @@ def with_unknown_amplitudes(
     unknown = (fit.tones * error[..., None] * [1.0, 1.0, 0.0]).reshape(*size.shape[:2], -1)  # of Re C, Im C and f
     unknown = np.pad(unknown, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))  # (B, A, P)
     # the bounds of Re C, Im C and f of a tone that is sampled uniformly have these proportions
-    common = np.zeros_like(size)
-    common[:, :2] = _UNEXPLAINED_IN_COMMON * unexplained[..., None]
-    of_frequency = math.sqrt(12) * common / (2 * math.pi * np.maximum(size, 1e-300) * np.reshape(span, (-1, 1, 1)))
+    common = np.broadcast_to(_UNEXPLAINED_IN_COMMON * without_nan(unexplained, 0.0)[..., None], size.shape)
+    per_size = np.divide(common, size, out=np.zeros_like(size), where=fit.active & (size > 0))
+    of_frequency = math.sqrt(12) * per_size / (2 * math.pi * np.reshape(span, (-1, 1, 1)))
     in_common = (np.stack([common, common, of_frequency], -1) * fit.active[..., None]).reshape(*size.shape[:2], -1)
     in_common = np.pad(in_common, ((0, 0), (0, 0), (0, fit.drift.shape[-1])))
     covariance, (axes, parameters) = fit.covariance.copy(), unknown.shape[1:]
     of_axes = covariance.reshape(len(covariance), axes, parameters, axes, parameters)
     for axis in range(axes):
         of_axes[:, axis, :, axis] += unknown[:, axis, :, None] * unknown[:, axis, None]
-        of_axes[:, axis, :, axis] += np.square(in_common[:, axis, :, None]) * np.eye(parameters)
+        np.einsum("bpp->bp", of_axes[:, axis, :, axis])[...] += np.square(in_common[:, axis])
     return replace(fit, covariance=covariance)
 
 
