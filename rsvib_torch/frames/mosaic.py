@@ -68,21 +68,25 @@ def _smoothed(images: Tensor, weights: tuple[float, ...]) -> Tensor:
     return functional.conv2d(rows, taps[None, None, :, None]).view(images.shape)
 
 
-def is_mosaic(images: Tensor, *, block: int = 16, least: float = 3.0) -> Tensor:
+def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) -> Tensor:
     """Whether images (B, H, W) are mosaics of colours: (B,) bool.
 
-    Chequered differences of a mosaic have the same sign where the colour is the same. Their mean square over blocks,
-    relative to that of a white spectrum near 1/2 cycle per px, is 7 to 35 in mosaics (three photographs, drawn scenes,
-    one with a tenth of the colour) and at most 0.9 in grey images (nine photographs, drawn scenes, noise).
+    Chequered differences of a mosaic have the same sign where the colour is the same. Their mean square over blocks of
+    16 x 16 px, relative to that of a white spectrum near 1/2 cycle per px, is 7 to 35 in mosaics (three photographs,
+    drawn scenes, one with a tenth of the colour) and at most 0.9 in grey images (nine photographs, drawn scenes,
+    noise). Of many ``blocks`` along an axis, so many are used, evenly spread; None for all. With 32 the mean is within
+    a fifth of that of all in mosaics of eight photographs of 1 to 22 Mpx, and at most 0.7 in the grey photographs, but
+    0.3 to 4.6 instead of 0.7 in a resolution chart.
     """
-    if min(images.shape[-2:]) < block + 2:
+    size = 16
+    if min(images.shape[-2:]) < size + 2:
         return torch.zeros(len(images), dtype=torch.bool, device=images.device)
-    high = images.diff(n=2, dim=-1).diff(n=2, dim=-2)
-    row, column = (torch.arange(size, device=images.device) for size in high.shape[-2:])
-    blocks = functional.avg_pool2d(high * (1 - 2 * ((row[:, None] + column) % 2)), block)
-    white = (8 / 3 / block) ** 2  # mean square of blocks of white noise
-    of_blocks, of_pixels = (values.square().mean((-2, -1)) for values in (blocks, high))
-    return of_blocks > least * white * of_pixels
+    rows, columns = (max(size, 0 if blocks is None else (length - 2) // blocks) for length in images.shape[-2:])
+    high = images.unfold(-2, size + 2, rows).unfold(-2, size + 2, columns).diff(n=2, dim=-1).diff(n=2, dim=-2)
+    place = torch.arange(size, device=images.device)
+    of_blocks = (high * (1 - 2 * ((place[:, None] + place) % 2))).mean((-2, -1))
+    white = (8 / 3 / size) ** 2  # mean square of blocks of white noise
+    return of_blocks.square().mean((-2, -1)) > least * white * high.square().mean((-4, -3, -2, -1))
 
 
 def mosaic_free(images: Tensor) -> Tensor:
