@@ -80,20 +80,17 @@ def _box_sum(images: Tensor, size: int) -> Tensor:
     return images
 
 
-def detailed_columns(images: Tensor, count: int) -> slice:
-    """The ``count`` neighbouring columns of images (..., H, W) with the largest squared row differences.
+def detailed_parts(images: Tensor, count: int) -> list[slice]:
+    """The ``count`` neighbouring columns with the largest squared row differences.
+
+    Those of the first frame of each stack (B, T, ..., H, W).
 
     Example:
         >>> image = torch.zeros(16, 12)
         >>> image[::2, 5:9] = 1
-        >>> detailed_columns(image, 4)
-        slice(5, 9, None)
+        >>> detailed_parts(image[None, None], 4)
+        [slice(5, 9, None)]
     """
-    return detailed_parts(images[None, None], count)[0]
-
-
-def detailed_parts(images: Tensor, count: int) -> list[slice]:
-    """``detailed_columns`` of the first frame of each stack (B, T, ..., H, W)."""
     width = images.shape[-1]
     if width <= count:
         return [slice(0, width)] * len(images)

@@ -267,11 +267,8 @@ def _coarse_offsets(frames: Tensor) -> Tensor:
     whole = frames[..., : height // factor * factor, : width // factor * factor]
     reduced = _standardised(functional.avg_pool2d(whole, factor))
     rows, columns = reduced.shape[-2:]
-    window = (
-        torch.hann_window(rows, periodic=False, dtype=reduced.dtype, device=reduced.device)[:, None]
-        * torch.hann_window(columns, periodic=False, dtype=reduced.dtype, device=reduced.device)
-    ).sqrt()
-    spectra = torch.fft.rfft2(reduced * window)
+    windows = (torch.hann_window(size, periodic=False, device=reduced.device).to(reduced) for size in (rows, columns))
+    spectra = torch.fft.rfft2(reduced * torch.outer(*windows).sqrt())
     cross = spectra[:, 1:] * spectra[:, :-1].conj()
     magnitude = cross.abs()
     floor = magnitude.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(magnitude.dtype).tiny)
