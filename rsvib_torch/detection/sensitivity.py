@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
@@ -75,18 +74,18 @@ def with_row_time_std(
     """Standard deviations of tones with that of the row time, which exposure and frame period in s do not share."""
     if not timing.row_time_std:
         return std
-
-    def widened(name: str, of: str, unit: Tensor) -> Tensor:
-        by = {time: getattr(sensitivity, f"{of}_by_{time}") for time in ("row_time", "frame_rows", "exposure_rows")}
-        change = unit * (by["row_time"] - by["frame_rows"] - by["exposure_rows"])
-        return torch.hypot(getattr(std, name), change * (timing.row_time_std / timing.row_time))
-
+    by_row_time, by_frame_rows, by_exposure_rows = (
+        torch.stack([getattr(sensitivity, f"{of}_by_{time}") for of in ("amplitude", "frequency", "phase")])
+        for time in ("row_time", "frame_rows", "exposure_rows")
+    )
+    change = (by_row_time - by_frame_rows - by_exposure_rows) * (timing.row_time_std / timing.row_time)
+    amplitude, frequency, phase = change
     return replace(
         std,
-        amplitude=widened("amplitude", "amplitude", vibration.amplitude),
-        frequency=widened("frequency", "frequency", vibration.frequency),
-        period=widened("period", "frequency", 1 / vibration.frequency.clamp(min=1e-300)),
-        phase=widened("phase", "phase", torch.ones_like(vibration.phase)),
+        amplitude=torch.hypot(std.amplitude, vibration.amplitude * amplitude),
+        frequency=torch.hypot(std.frequency, vibration.frequency * frequency),
+        period=torch.hypot(std.period, frequency / vibration.frequency.clamp(min=1e-300)),
+        phase=torch.hypot(std.phase, phase),
     )
 
 
