@@ -267,7 +267,9 @@ def _coarse_offsets(frames: Tensor) -> Tensor:
     whole = frames[..., : height // factor * factor, : width // factor * factor]
     reduced = _standardised(functional.avg_pool2d(whole, factor))
     rows, columns = reduced.shape[-2:]
-    windows = (torch.hann_window(size, periodic=False, device=reduced.device).to(reduced) for size in (rows, columns))
+    windows = (
+        torch.hann_window(size, periodic=False, dtype=reduced.dtype, device=reduced.device) for size in (rows, columns)
+    )
     spectra = torch.fft.rfft2(reduced * torch.outer(*windows).sqrt())
     cross = spectra[:, 1:] * spectra[:, :-1].conj()
     magnitude = cross.abs()
