@@ -88,17 +88,7 @@ def assembled(
         reliable=magnitudes_from_row_order(torch.tensor(reliable, device="cpu"), timing),
         findings=tuple(findings_from_row_order(of_stack, timing) for of_stack in findings),
         sensitivity=sensitivity,
-        assumptions=tuple(
-            assumptions(
-                vibration[index],
-                sensitivity[index],
-                row_timing,
-                num_frames,
-                scale.height,
-                None if blur is None else blur[index, :2].tolist(),
-            )
-            for index in range(len(findings))
-        ),
+        assumptions=assumptions(vibration, sensitivity, row_timing, num_frames, scale.height, blur),
         timing=timing,
     ).to(curve.offsets.device)
 

@@ -275,7 +275,7 @@ def fit_directly(
     # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames differently.
     if doubtful and not scale.same_for_all_columns and not bool(refined.abandoned.all()):
         motion = motion_of_fit(shrunk(refined.fit, intervals), stacks.images.device)
-        if frames.differently_blurred(motion)[0].any():
+        if frames.differently_blurred(motion).any():
             frames = grouped_strips(stacks.images, stacks.valid, timing, motion, scale)
             again = refine(frames, intervals, refined.fit, options.tones, has_pattern=hypothesis.has_pattern)
             refined = replace(again, abandoned=refined.abandoned)

@@ -87,7 +87,7 @@ def refine(
     # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
     # one axis after the other.
     device = frames.groups[0].starts.device
-    blurred, _ = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
+    blurred = frames.differently_blurred(motion_of_fit(shrunk(start, intervals), device))
     tried = ~(blurred[:, None] | _is_nearly_blind(refined.fit, intervals))  # other axes count as tried
     while not tried.all():
         frequencies, mirrored = mirrored_frequencies(refined.measurements, refined.fit, start, tried)

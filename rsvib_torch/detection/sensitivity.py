@@ -4,12 +4,10 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
@@ -21,6 +19,7 @@ from rsvib_torch.numerics.tables import Array, pseudo_inverse, split_axis, table
 from rsvib_torch.results.presentation import AXIS_NAMES
 
 _STEP = 1e-4  # relative change of the timing, for differences
+_CHANGED = ("amplitude", "frequency")  # quantities whose change by a wrong timing is stated
 
 
 def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_rows: int) -> TimingSensitivity:
@@ -73,18 +72,20 @@ def with_row_time_std(
     std: VibrationStd, vibration: Vibration, sensitivity: TimingSensitivity, timing: SensorTiming | RowTiming
 ) -> VibrationStd:
     """Standard deviations of tones with that of the row time, which exposure and frame period in s do not share."""
-
-    def widened(name: str, of: str, unit: Tensor) -> Tensor:
-        by = {time: getattr(sensitivity, f"{of}_by_{time}") for time in ("row_time", "frame_rows", "exposure_rows")}
-        change = unit * (by["row_time"] - by["frame_rows"] - by["exposure_rows"])
-        return torch.hypot(getattr(std, name), change * (timing.row_time_std / timing.row_time))
-
+    if not timing.row_time_std:
+        return std
+    by_row_time, by_frame_rows, by_exposure_rows = (
+        torch.stack([getattr(sensitivity, f"{of}_by_{time}") for of in ("amplitude", "frequency", "phase")])
+        for time in ("row_time", "frame_rows", "exposure_rows")
+    )
+    change = (by_row_time - by_frame_rows - by_exposure_rows) * (timing.row_time_std / timing.row_time)
+    amplitude, frequency, phase = change
     return replace(
         std,
-        amplitude=widened("amplitude", "amplitude", vibration.amplitude),
-        frequency=widened("frequency", "frequency", vibration.frequency),
-        period=widened("period", "frequency", 1 / vibration.frequency.clamp(min=1e-300)),
-        phase=widened("phase", "phase", torch.ones_like(vibration.phase)),
+        amplitude=torch.hypot(std.amplitude, vibration.amplitude * amplitude),
+        frequency=torch.hypot(std.frequency, vibration.frequency * frequency),
+        period=torch.hypot(std.period, frequency / vibration.frequency.clamp(min=1e-300)),
+        phase=torch.hypot(std.phase, phase),
     )
 
 
@@ -111,17 +112,14 @@ def assumptions(
     timing: RowTiming,
     num_frames: int,
     num_rows: int,
-    blur: Sequence[float] | None = None,
-) -> tuple[str, ...]:
-    """What the frames cannot contradict, with its effect on one vibration in image axes, one sentence for each.
+    blur: Array | None = None,
+) -> tuple[tuple[str, ...], ...]:
+    """What the frames cannot contradict, with its effect on vibrations (B) in image axes, one sentence for each.
 
-    ``blur`` is the ratio of ``OtherMotion.blur`` and its standard deviation; None if it was not measured.
+    ``blur`` (B, 3) as in ``OtherMotion``; None if it was not measured.
     """
-    amplitude, frequency = tables(vibration.amplitude, vibration.frequency)
-    tones = [(axis, tone, float(frequency[axis, tone])) for axis, tone in np.argwhere(amplitude > 0)]
-    if not tones:
-        return ()
-    sentences = []
+    # 1. Sentences about all stacks.
+    sentences, times = [], ["exposure_rows"]
     if timing.frame_start_times is None:
         # two frames show frequencies relative to the row time, more frames relative to the frame rate
         uncertain = f" ± {timing.row_time_std:.2g}" if timing.row_time_std else ""
@@ -142,28 +140,37 @@ def assumptions(
             f"{what}, readout direction, scan axis and order of the frames: two frames cannot contradict them, more "
             "frames can"
         )
-        name = "frame_rows" if timing.frame_start_times is None else "row_time"
-        sentences += _effects(name, tones, sensitivity, getattr(timing, name))
-    sentences += _effects("exposure_rows", tones, sensitivity, timing.exposure_rows)
-    if blur is not None:
-        sentences += _exposure_range(tones, timing, *blur)
-    return tuple(sentences)
+        times.insert(0, "frame_rows" if timing.frame_start_times is None else "row_time")
+    # 2. Effects on the tones of each stack.
+    amplitudes, frequencies = tables(vibration.amplitude, vibration.frequency)
+    changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _CHANGED)) for name in times}
+    of_stacks = []
+    for stack, frequency in enumerate(frequencies):
+        tones = [(axis, tone, float(frequency[axis, tone])) for axis, tone in np.argwhere(amplitudes[stack] > 0)]
+        of_stack = [(name, [change[stack] for change in changes[name]]) for name in times]
+        effects = [text for name, change in of_stack for text in _effects(name, tones, change, timing)]
+        if blur is not None:
+            effects += _exposure_range(tones, timing, *blur[stack, :2].tolist())
+        of_stacks.append((*sentences, *effects) if tones else ())
+    return tuple(of_stacks)
 
 
 _Tones = list[tuple[int, int, float]]  # axis, number and frequency in Hz of each tone
 
 
-def _effects(name: str, tones: _Tones, sensitivity: TimingSensitivity, value: float) -> list[str]:
-    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
+def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) -> list[str]:
+    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %.
+
+    ``changes`` (A, K) are the sensitivities of the quantities ``_CHANGED`` to that time.
+    """
     of_tones = []
-    quantities = ("amplitude", "frequency")
-    changes = tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in quantities))
     for axis, tone, frequency in tones:
-        of_tone = zip(quantities, (change[axis, tone] for change in changes), strict=True)
+        of_tone = zip(_CHANGED, (change[axis, tone] for change in changes), strict=True)
         texts = [f"{of} {change:+.2g} %" for of, change in of_tone if abs(change) > 0.1]
         if texts:
             of_tones.append(f"{AXIS_NAMES[axis]} {frequency:.4g} Hz: {', '.join(texts)}")
-    return [f"{name}={value:g}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []
+    stated = f"{name}={getattr(timing, name):g}"
+    return [f"{stated}: if it is stated 1 % too large, this changes {'; '.join(of_tones)}"] if of_tones else []
 
 
 def _exposure_range(tones: _Tones, timing: RowTiming, ratio: float, std: float) -> list[str]:

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.checks.values import check_choice
-from rsvib_torch.frames.pixels import fill_with_means
+from rsvib_torch.frames.pixels import fill_with_means, smoothed
 from rsvib_torch.options import Mosaic
 
 _LUMINANCE = (0.25, 0.5, 0.25)  # shares of red, green and blue in a mosaic
@@ -59,30 +59,25 @@ def fill_by_colour(frames: Tensor, missing: Tensor) -> Tensor:
     return functional.pixel_shuffle(fill_with_means(functional.pixel_unshuffle(frames, 2), holes), 2)
 
 
-def _smoothed(images: Tensor, weights: tuple[float, ...]) -> Tensor:
-    """Images (..., H, W) after a symmetric filter along both axes, with mirrored boundaries."""
-    half = len(weights) // 2
-    taps = torch.tensor(weights, dtype=images.dtype, device=images.device)
-    wide = functional.pad(images.reshape(-1, 1, *images.shape[-2:]), (half,) * 4, mode="reflect")
-    rows = functional.conv2d(wide, taps[None, None, None])
-    return functional.conv2d(rows, taps[None, None, :, None]).view(images.shape)
-
-
-def is_mosaic(images: Tensor, *, block: int = 16, least: float = 3.0) -> Tensor:
+def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) -> Tensor:
     """Whether images (B, H, W) are mosaics of colours: (B,) bool.
 
-    Chequered differences of a mosaic have the same sign where the colour is the same. Their mean square over blocks,
-    relative to that of a white spectrum near 1/2 cycle per px, is 7 to 35 in mosaics (three photographs, drawn scenes,
-    one with a tenth of the colour) and at most 0.9 in grey images (nine photographs, drawn scenes, noise).
+    Chequered differences of a mosaic have the same sign where the colour is the same. Their mean square over blocks of
+    16 x 16 px, relative to that of a white spectrum near 1/2 cycle per px, is 7 to 35 in mosaics (three photographs,
+    drawn scenes, one with a tenth of the colour) and at most 0.9 in grey images (nine photographs, drawn scenes,
+    noise). Of many ``blocks`` along an axis, so many are used, evenly spread; None for all. With 32 the mean is within
+    a fifth of that of all in mosaics of eight photographs of 1 to 22 Mpx, and at most 0.7 in the grey photographs, but
+    0.3 to 4.6 instead of 0.7 in a resolution chart.
     """
-    if min(images.shape[-2:]) < block + 2:
+    size = 16
+    if min(images.shape[-2:]) < size + 2:
         return torch.zeros(len(images), dtype=torch.bool, device=images.device)
-    high = images.diff(n=2, dim=-1).diff(n=2, dim=-2)
-    row, column = (torch.arange(size, device=images.device) for size in high.shape[-2:])
-    blocks = functional.avg_pool2d(high * (1 - 2 * ((row[:, None] + column) % 2)), block)
-    white = (8 / 3 / block) ** 2  # mean square of blocks of white noise
-    of_blocks, of_pixels = (values.square().mean((-2, -1)) for values in (blocks, high))
-    return of_blocks > least * white * of_pixels
+    rows, columns = (max(size, 0 if blocks is None else (length - 2) // blocks) for length in images.shape[-2:])
+    high = images.unfold(-2, size + 2, rows).unfold(-2, size + 2, columns).diff(n=2, dim=-1).diff(n=2, dim=-2)
+    place = torch.arange(size, device=images.device)
+    of_blocks = (high * (1 - 2 * ((place[:, None] + place) % 2))).mean((-2, -1))
+    white = (8 / 3 / size) ** 2  # mean square of blocks of white noise
+    return of_blocks.square().mean((-2, -1)) > least * white * high.square().mean((-4, -3, -2, -1))
 
 
 def mosaic_free(images: Tensor) -> Tensor:
@@ -92,7 +87,7 @@ def mosaic_free(images: Tensor) -> Tensor:
     with the scene. Five pixels instead of three: the error of a detected displacement decreases from 0.004 to 0.001 px,
     from 0.034 px without a filter (drawn scene of 256 px, noise 0.002).
     """
-    return _smoothed(images, (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16))
+    return smoothed(images, (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16))
 
 
 def luminance(colours: Tensor) -> Tensor:
@@ -108,7 +103,7 @@ def interpolated_colours(frames: Tensor, colours: Tensor) -> Tensor:
     """
     weights = (0.25, 0.5, 0.25)
     measured = measures(colours)
-    difference = (frames - _smoothed(frames, weights)) * measured
-    difference = _smoothed(difference, weights) / _smoothed(measured.to(frames.dtype), weights).expand_as(difference)
+    difference = (frames - smoothed(frames, weights)) * measured
+    difference = smoothed(difference, weights) / smoothed(measured.to(frames.dtype), weights).expand_as(difference)
     own = (difference * measured).sum(-3, keepdim=True)
     return frames - own + difference

@@ -52,6 +52,21 @@ def enlarged(images: Tensor, scale: int) -> Tensor:
     return images
 
 
+def smoothed(images: Tensor, weights: Sequence[float]) -> Tensor:
+    """Images (..., H, W) after a filter of odd length along both axes, with mirrored boundaries.
+
+    Sums of shifted images take half to a tenth of the time of ``conv2d``.
+    """
+    half = len(weights) // 2
+    result = functional.pad(images.reshape(-1, *images.shape[-2:]), (half,) * 4, mode="reflect")
+    for dim in (-1, -2):
+        first, *others = (result.narrow(dim, lag, images.shape[dim]) for lag in range(len(weights)))
+        result = first * weights[0]
+        for shifted, weight in zip(others, weights[1:], strict=True):
+            result.add_(shifted, alpha=weight)
+    return result.view(images.shape)
+
+
 def _box_sum(images: Tensor, size: int) -> Tensor:
     """Sums over squares of ``size`` px, clipped at the edges, from running sums."""
     half = size // 2
@@ -65,20 +80,17 @@ def _box_sum(images: Tensor, size: int) -> Tensor:
     return images
 
 
-def detailed_columns(images: Tensor, count: int) -> slice:
-    """The ``count`` neighbouring columns of images (..., H, W) with the largest squared row differences.
+def detailed_parts(images: Tensor, count: int) -> list[slice]:
+    """The ``count`` neighbouring columns with the largest squared row differences.
+
+    Those of the first frame of each stack (B, T, ..., H, W).
 
     Example:
         >>> image = torch.zeros(16, 12)
         >>> image[::2, 5:9] = 1
-        >>> detailed_columns(image, 4)
-        slice(5, 9, None)
+        >>> detailed_parts(image[None, None], 4)
+        [slice(5, 9, None)]
     """
-    return detailed_parts(images[None, None], count)[0]
-
-
-def detailed_parts(images: Tensor, count: int) -> list[slice]:
-    """``detailed_columns`` of the first frame of each stack (B, T, ..., H, W)."""
     width = images.shape[-1]
     if width <= count:
         return [slice(0, width)] * len(images)

@@ -368,9 +368,9 @@ class Vibration(
 
         Condition (24): the discrete point spread function of Eqs. (25)-(39) requires less than 0.1 px in a row time.
         """
-        cycles = self.frequency.detach() * duration
+        cycles = self.frequency * duration
         path = torch.where(cycles < 0.5, 2.0 * torch.sin(math.pi * cycles), 4.0 * cycles)
-        return (self.amplitude.detach() * path).sum(-1) + self.image_motion.detach().abs() * duration
+        return ((self.amplitude * path).sum(-1) + self.image_motion.abs() * duration).detach()
 
     def periods_within(self, duration: float) -> Tensor:
         """Periods of the fastest tone in ``duration`` seconds, (..., 2); tones below 1e-4 px do not count.
@@ -378,8 +378,8 @@ class Vibration(
         Roll and zoom count from 1e-7 on, which is 1e-4 px at 1000 px from the centre.
         """
         smallest = self.amplitude.new_tensor([1e-4, 1e-4, 1e-7, 1e-7][: self.amplitude.shape[-2]])
-        visible = self.amplitude.detach() > smallest[:, None]
-        return torch.where(visible, self.frequency.detach() * duration, 0.0).amax(-1)
+        visible = self.amplitude > smallest[:, None]
+        return torch.where(visible, self.frequency * duration, 0.0).amax(-1).detach()
 
     def timed_from(self, origin: float | Tensor) -> Self:
         """The same motion with another time origin, less the constant that the image motion adds to it.

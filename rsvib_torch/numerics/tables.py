@@ -85,8 +85,11 @@ def cos_sin(angle: Array) -> tuple[Array, Array]:
     """Cosine and sine of float64 angles in rad; PyTorch takes a third of the time of NumPy for many, 5 us for one."""
     if angle.size < _MANY:
         return np.cos(angle), np.sin(angle)
+    cosine, sine = np.empty_like(angle), np.empty_like(angle)
     values = torch.from_numpy(angle)
-    return values.cos().numpy(), values.sin().numpy()
+    torch.cos(values, out=torch.from_numpy(cosine))
+    torch.sin(values, out=torch.from_numpy(sine))
+    return cosine, sine
 
 
 def unit_wave(angle: Array) -> Array:

@@ -8,8 +8,11 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from rsvib_torch.numerics.tables import Array, table, tensor
 
 BINNING = 4  # columns that are averaged in the search for whole pixels; a parabola recovers the single pixel
 LAGS = 4  # px, reach of a fine correlation surface to either side: 9 samples fix the peak to 0.001 px (subpixel_peak)
@@ -122,22 +125,18 @@ def fine_offsets(task: BandTask, shift: Tensor, surface: Tensor, valid: Tensor) 
 
 
 @cache
-def _polynomial_fit(size: int) -> Tensor:
-    """Matrix (size, size) from samples at -(size // 2) ... size // 2 to the coefficients of the polynomial."""
-    places = torch.arange(size, dtype=torch.float64, device="cpu") - size // 2
-    matrix: Tensor = torch.linalg.inv(torch.vander(places, increasing=True))
-    return matrix
+def _polynomials(size: int) -> Array:
+    """Matrices (3, size, size) from samples at -(size // 2) ... size // 2 to the coefficients of the polynomial.
+
+    The second and third are those of its first and second derivatives.
+    """
+    matrices = [np.linalg.inv(np.vander(np.arange(size) - size // 2.0, increasing=True))]
+    for _ in range(2):
+        matrices.append(np.roll(np.arange(size)[:, None] * matrices[-1], -1, 0))
+    return np.stack(matrices)
 
 
-@cache
-def _derivative_terms(size: int) -> tuple[Tensor, Tensor]:
-    """Factors and exponents (3, size) of the powers 0 ... size - 1, of their first and of their second derivatives."""
-    order = torch.arange(size, dtype=torch.float64, device="cpu")
-    factors = torch.stack([torch.ones_like(order), order, order * (order - 1)])
-    exponents = (order - torch.arange(3, dtype=torch.float64, device="cpu")[:, None]).clamp(min=0)
-    return factors, exponents
-
-
+@np.errstate(divide="ignore", invalid="ignore")
 def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
     """Maximum of the polynomial through all samples of surfaces (M, A, B), by Newton's method from the centre.
 
@@ -147,30 +146,28 @@ def subpixel_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
     result is the position (M, 2) as (row, column) relative to the centre, NaN where no maximum lies within one pixel of
     it, and the value there (M,); float64.
     """
-    count, rows, columns = surface.shape
-    device = surface.device
-    fit_rows, fit_columns = (_polynomial_fit(size).to(device) for size in (rows, columns))
-    terms = [[term.to(device) for term in _derivative_terms(size)] for size in (rows, columns)]
-    polynomial = fit_rows @ surface.to(torch.float64) @ fit_columns.T
-    position = polynomial.new_zeros(count, 2)
-    converging = torch.ones(count, dtype=torch.bool, device=device)
+    samples = table(surface).astype(np.float64)
+    count, rows, columns = samples.shape
+    position, converging = np.zeros((count, 2)), np.ones(count, dtype=bool)
     for _ in range(5):  # Newton's method doubles the digits: 5 steps from within half a pixel reach 1e-9 px
         # 1. The value, and its derivatives by the row (down) and by the column (right) up to the second order.
         across, along = (
-            factors * place[:, None, None] ** exponents
-            for place, (factors, exponents) in zip(position.unbind(-1), terms, strict=True)
+            (np.vander(place, size, increasing=True) @ _polynomials(size)).swapaxes(0, 1)
+            for place, size in zip(position.T, (rows, columns), strict=True)
         )
-        derivatives = (across @ polynomial @ along.mT).flatten(1).unbind(-1)
+        derivatives = (across @ samples @ along.mT).reshape(count, 9).T
         value, right, by_columns, down, mixed, _, by_rows = derivatives[:7]
         if rows == 1:
-            by_rows = -torch.ones_like(mixed)
+            by_rows = -np.ones(count)
         if columns == 1:
-            by_columns = -torch.ones_like(mixed)
+            by_columns = -np.ones(count)
         # 2. A step to the maximum, where there is one.
-        determinant = by_rows * by_columns - mixed * mixed
+        determinant = by_rows * by_columns - np.square(mixed)
         converging = converging & (determinant > 0) & (by_rows < 0)
-        move = torch.stack([mixed * right - by_columns * down, mixed * down - by_rows * right], dim=-1)
-        step = (move / determinant[:, None]).clamp(-0.5, 0.5)
-        position = torch.where(converging[:, None], position + step, position)
-    converging = converging & (position.abs() <= 1.0).all(-1)
-    return torch.where(converging[:, None], position, torch.nan), value
+        move = np.stack([mixed * right - by_columns * down, mixed * down - by_rows * right], -1)
+        step = np.clip(move / determinant[:, None], -0.5, 0.5)
+        position = np.where(converging[:, None], position + step, position)
+    converging = converging & (np.abs(position) <= 1.0).all(-1)
+    position[~converging] = np.nan
+    peaks = tensor(np.column_stack([position, value])).to(surface.device)
+    return peaks[:, :2], peaks[:, 2]

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import reduce
 
+import numpy as np
 import torch
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
@@ -21,6 +21,7 @@ from rsvib_torch.execution.chunking import at_once, chunks, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.orientation import offsets_from_row_order, sequence_from_row_order
+from rsvib_torch.frames.pixels import smoothed
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
@@ -33,6 +34,8 @@ from rsvib_torch.results.presentation import Result
 # Correlation of bands of independent noise times the root of their pixels: medians of 12.6 (32 x 128 px), 10.4 (32 x
 # 256 px) and 10.6 (32 x 320 px) were measured, of the bands that count as registered.
 _CHANCE = 14.0
+_GAUSSIAN = np.exp(-0.5 * np.arange(-3.0, 4.0) ** 2)  # of 1 px
+_GAUSSIAN /= _GAUSSIAN.sum()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -215,10 +218,8 @@ def _bands_of_pairs(
     """
     band_rows, search = options.band_rows, options.search
     batch, num_frames, _, width = grey.shape
-    # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise;
-    # contiguous images are filtered 14 times faster
-    sigma = torch.ones(1, 2, dtype=grey.dtype, device="cpu")  # px; from numbers Kornia makes it on the default device
-    grey = _without_row_means(gaussian_blur2d(grey.contiguous(), (7, 7), sigma))
+    # a Gaussian of 1 px band-limits the correlation, so that whole-pixel lags determine its peak, and damps noise
+    grey = _without_row_means(smoothed(grey, _GAUSSIAN.tolist()))
     first, second = grey[:, :-1].flatten(0, 1), grey[:, 1:].flatten(0, 1)
     # Pairs at a time: their transforms (2.5 MB each) stay in the cache of a CPU.
     parts = chunks(num_frames - 1, batch * 2**21, grey.device)
@@ -266,11 +267,10 @@ def _coarse_offsets(frames: Tensor) -> Tensor:
     whole = frames[..., : height // factor * factor, : width // factor * factor]
     reduced = _standardised(functional.avg_pool2d(whole, factor))
     rows, columns = reduced.shape[-2:]
-    window = (
-        torch.hann_window(rows, periodic=False, dtype=reduced.dtype, device=reduced.device)[:, None]
-        * torch.hann_window(columns, periodic=False, dtype=reduced.dtype, device=reduced.device)
-    ).sqrt()
-    spectra = torch.fft.rfft2(reduced * window)
+    windows = (
+        torch.hann_window(size, periodic=False, dtype=reduced.dtype, device=reduced.device) for size in (rows, columns)
+    )
+    spectra = torch.fft.rfft2(reduced * torch.outer(*windows).sqrt())
     cross = spectra[:, 1:] * spectra[:, :-1].conj()
     magnitude = cross.abs()
     floor = magnitude.mean((-2, -1), keepdim=True).clamp(min=torch.finfo(magnitude.dtype).tiny)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER
 from rsvib_torch.frames.grey import constant_frame
-from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.imaging.sensor_model import sharpened
 from rsvib_torch.io.full_scale import beyond_full_scale
@@ -92,7 +92,7 @@ def pair_verdict(
     The time origin of the motion is the middle of the first frame, and the other one starts an ``interval`` in s later.
     """
     if timing.scan_axis == -2:
-        frames = frames[..., detailed_columns(frames, _JUDGED_COLUMNS)]
+        frames = frames[..., detailed_parts(frames[None, None], _JUDGED_COLUMNS)[0]]
     if not bool((motion.amplitude > 0).any()):
         return None
     start = -0.5 * ((frames.shape[-1 if timing.scan_axis == -1 else -2] - 1) * timing.row_time + timing.exposure_time)

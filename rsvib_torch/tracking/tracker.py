@@ -50,7 +50,7 @@ from rsvib_torch.execution.precision import full_precision, outside_graphs, with
 from rsvib_torch.frames.entry_points import module_options
 from rsvib_torch.frames.grey import GreyFrames, without_mosaic
 from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.frames.pixels import detailed_columns
+from rsvib_torch.frames.pixels import detailed_parts
 from rsvib_torch.frames.prepare import PreparedFrames, prepare_frames
 from rsvib_torch.motion.timing import MAX_SPAN, SensorTiming, check_timing
 from rsvib_torch.motion.vibration import Vibration
@@ -489,7 +489,7 @@ class VibrationTracker:
         started = ToneFilter.started(time, coefficients, frequency, drift, all_std, self._rows.exposure_time)
         before, last = state.frames[-2:]
         columns = (
-            slice(None) if self.options.columns is None else detailed_columns(last.images[0, 0], self.options.columns)
+            slice(None) if self.options.columns is None else detailed_parts(last.images[:1], self.options.columns)[0]
         )
         track = _Track(started, before.spectra(columns), before.time, columns)
         return self._measured(replace(state, track=track))

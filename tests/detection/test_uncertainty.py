@@ -214,14 +214,15 @@ def test_standard_deviations_contain_that_of_the_row_time():
 def test_assumptions_state_what_the_frames_cannot_contradict():
     truth = mean_sine([2.0], [55.0], [0.4], starts_of(TIMING, 2), TIMING.exposure_time)
     fit = fitted(measured(truth, TIMING), [55.0])
-    vibration = vibration_of_fit(fit)[0][0]
-    sensitivity = timing_sensitivity(fit, TIMING, 2, ROWS)[0]
-    two = assumptions(vibration, sensitivity, TIMING, 2, ROWS)
+    vibration = vibration_of_fit(fit)[0]
+    sensitivity = timing_sensitivity(fit, TIMING, 2, ROWS)
+    (two,) = assumptions(vibration, sensitivity, TIMING, 2, ROWS)
     effect = next(text for text in two if text.startswith("frame_rows=110:"))
     assert effect.endswith("x 55 Hz: amplitude -5.5 %")  # frequencies follow from the rows of a frame
     assert any("two frames" in text for text in two)
-    four = assumptions(vibration, sensitivity, replace(TIMING, frame_start_times=(0.0, 0.05, 0.1, 0.15)), 4, ROWS)
+    (four,) = assumptions(vibration, sensitivity, replace(TIMING, frame_start_times=(0.0, 0.05, 0.1, 0.15)), 4, ROWS)
     assert not any("row_time" in text or "two frames" in text for text in four)
-    assert assumptions(replace(vibration, amplitude=0 * vibration.amplitude), sensitivity, TIMING, 2, ROWS) == ()
+    assert assumptions(replace(vibration, amplitude=0 * vibration.amplitude), sensitivity, TIMING, 2, ROWS) == ((),)
     still = replace(vibration, frequency=0 * vibration.frequency)  # of a fit without meaning
-    assert any("two frames" in text for text in assumptions(still, sensitivity, TIMING, 2, ROWS, (1.0, 0.5)))
+    (of_still,) = assumptions(still, sensitivity, TIMING, 2, ROWS, np.array([[1.0, 0.5, 0.0]]))
+    assert any("two frames" in text for text in of_still)

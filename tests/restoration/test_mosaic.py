@@ -208,8 +208,9 @@ def test_detection_in_raw_frames():
     frames = raw(clean)
     assert error(frames) < 0.02  # px; 0.06 without the filter
     grey = torch.from_numpy(clean.mean(1)).float()
-    assert is_mosaic(frames).all()
-    assert not is_mosaic(grey).any()
+    for blocks in (None, 4):
+        assert is_mosaic(frames, blocks=blocks).all()
+        assert not is_mosaic(grey, blocks=blocks).any()
     assert not is_mosaic(torch.randn(3, 64, 64, generator=torch.Generator().manual_seed(1))).any()
     column = torch.arange(128)[None, :].expand(128, -1)
     assert not is_mosaic(torch.sin(2.9 * column).float()[None])  # detail near 1/2 cycle per px

@@ -485,13 +485,11 @@ def blur_ratio(
         weight = both.unfold(2, 5, 1).amin(-1)
 
         # 2. The expected difference. Derivatives across rows are of fourth order, from two neighbours on each side.
-        def neighbour(step: int, mean: Tensor = mean) -> Tensor:
-            return mean[:, :, 2 + step : mean.shape[2] - 2 + step]
-
+        inner = mean.shape[2] - 4
+        above_2, above, here, below, below_2 = (mean.narrow(2, row, inner) for row in range(5))
         by_x = (2j * math.pi * u[low]).to(mean.dtype)
-        here = neighbour(0)
-        by_y = 8 / 12 * (neighbour(1) - neighbour(-1)) - 1 / 12 * (neighbour(2) - neighbour(-2))
-        by_yy = 16 / 12 * (neighbour(1) + neighbour(-1)) - 1 / 12 * (neighbour(2) + neighbour(-2)) - 30 / 12 * here
+        by_y = 8 / 12 * (below - above) - 1 / 12 * (below_2 - above_2)
+        by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * here
         change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
         expected = (change[..., 0, 0] * by_x.square()) * here
         expected += (2 * change[..., 0, 1] / block * by_x) * by_y

@@ -130,19 +130,14 @@ class GroupedFrames:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
         return torch.stack(blur_ratio(self.groups, self.timing, self.view(motion)), -1)
 
-    def differently_blurred(self, motion: Vibration) -> tuple[Array, Array]:
-        """``warping.differently_blurred`` of the frames of any group of each stack, two bool (B,)."""
+    def differently_blurred(self, motion: Vibration) -> Array:
+        """Whether the frames of any group of each stack are blurred differently, (B,) bool, as in ``warping``."""
         view, height = self.view(motion), self.groups[0].spectra.height
         of_groups = [
-            differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))
+            differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))[0]
             for group in self.groups
         ]
-        stacks = len(motion.amplitude)
-        different, very_different = (
-            table(torch.cat([part.unflatten(0, (stacks, -1)) for part in parts], 1).any(1))
-            for parts in zip(*of_groups, strict=True)
-        )
-        return different, very_different
+        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in of_groups], 1).any(1))
 
 
 def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:

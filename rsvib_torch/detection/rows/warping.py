@@ -93,11 +93,12 @@ def _moments(paths: Tensor, weights: Tensor, order: int) -> Tensor:
     return powers.sum(3)
 
 
-# px^2 and px^3, differences of moments up to which blur counts as equal: the third displace fine detail by 0.001 px
-_EQUAL = (0.03, 0.0024)
-# px^2 and px^3, the same for blur that derivatives equalise: amplitudes of recordings without noise change by 5e-5 px
-# and less against pairs (2e-4 px at 0.2 and 0.03); 16 frames of 512 x 512 px with two tones take 0.78 of the time
-_NEARLY_EQUAL = (0.1, 0.008)
+# px, px^2 and px^3: differences of paths and of their second and third moments up to which blur counts as equal; the
+# third moments displace fine detail by 0.001 px
+_EQUAL = (0.5, 0.03, 0.0024)
+# the same for blur that derivatives equalise: amplitudes of recordings without noise change by 5e-5 px and less against
+# pairs (2e-4 px at 0.2 and 0.03); 16 frames of 512 x 512 px with two tones take 0.78 of the time
+_NEARLY_EQUAL = (math.inf, 0.1, 0.008)
 
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
@@ -111,11 +112,13 @@ def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: 
 
 def _differences(paths: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """``differently_blurred`` of paths from ``_paths``."""
-    moments = [_moments(paths, weights, order).flatten(3) for order in (2, 3)]
-    ranges = torch.stack([(one.amax(1) - one.amin(1)).flatten(1).amax(1) for one in moments], -1)  # (B, 2)
-    distance = (paths.amax(1) - paths.amin(1)).flatten(1).amax(1)  # px
-    different = (ranges > ranges.new_tensor(_EQUAL)).any(-1) | (distance > 0.5)
-    return different, (ranges > ranges.new_tensor(_NEARLY_EQUAL)).any(-1)
+    orders = [values.flatten(3) for values in (paths, _moments(paths, weights, 2), _moments(paths, weights, 3))]
+    values = torch.cat(orders, -1)
+    ranges = (values.amax(1) - values.amin(1)).amax(1)
+    sizes = [of_order.shape[-1] for of_order in orders]
+    limits = torch.from_numpy(np.repeat([_EQUAL, _NEARLY_EQUAL], sizes, -1)).to(ranges)
+    different, very_different = (ranges[:, None] > limits).any(-1).unbind(-1)
+    return different, very_different
 
 
 # Warp
@@ -161,10 +164,10 @@ def warp_to_scene(
     Returns:
         Function from a slice of the scene rows to warped spectra (B, G, s, U).
     """
-    different, very_different = _differences(*_paths(positions.exposure_starts[..., ::8], timing, motion))
+    paths, weights = _paths(positions.exposure_starts, timing, motion)
+    different, very_different = _differences(paths[:, :, ::8], weights)
     if not bool(different.any()):
         return lambda part: spectra.warped(positions.rows[..., part], positions.shift[..., part])
-    paths, weights = _paths(positions.exposure_starts, timing, motion)
     paths = paths * different[:, None, None, None, None]
     if positions.rows.shape[1] > 2 or not bool(very_different.any()):
         return _warp_with_mean_moments(spectra, positions, paths, weights)

@@ -277,14 +277,14 @@ class _Problem:
     def in_std(self, jacobian: Array, residual: Array) -> tuple[Array, Array]:
         """Derivatives (B, N G A, M) by the free parameters and residual (B, N G A, 1), in standard deviations."""
         columns = self._whitened(self.root, jacobian)
-        whitened = (self.root @ residual[..., None]).reshape(*columns.shape[:2], 1)
+        whitened = (residual @ self.root[:, :, 0].mT).reshape(*columns.shape[:2], 1)
         return columns if self.to_all is None else columns @ self.to_all, whitened
 
     def evaluate(self, values: Array) -> _Estimate:
         """Residual and normal equations at the parameters ``values`` (B, 2, P)."""
         jacobian = self.jacobian(values)
         linear = np.where(self.is_frequency, 0.0, values)[:, None, None]
-        residual = self.measurements.displacements - (jacobian * linear).sum(-1)
+        residual = self.measurements.displacements - np.vecdot(jacobian, linear)
         columns, whitened = self.in_std(jacobian, residual)
         right = (columns.mT @ whitened)[..., 0]
         return _Estimate(values, jacobian, residual, np.square(whitened).sum((1, 2)), columns.mT @ columns, right)
