@@ -89,15 +89,21 @@ def grey_frames(
                 "needed; mark fewer pixels by NaN or ignore"
             )
     # a frame without detail has no displacement; every 16th row is enough to find that a frame is not constant
-    if bool(_constant(images[..., ::16, :]).any()) and bool((constant := _constant(images)).any()):
-        raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
+    constant = _constant(images[..., ::16, :])
+    if bool(constant.any()):
+        constant = _constant(images)
+        if bool(constant.any()):
+            raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
     # a copy of a frame was exposed at another time than its place in the stack states
-    if bool(_repeated(images[..., ::16, :]).any()) and bool((repeated := _repeated(images)).any()):
-        first = repeated.nonzero()[0].tolist()[-1]
-        raise ValueError(
-            f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat "
-            "frames), and its time is wrong; remove copies and state the times of the others in frame_start_times"
-        )
+    repeated = _repeated(images[..., ::16, :])
+    if bool(repeated.any()):
+        repeated = _repeated(images)
+        if bool(repeated.any()):
+            first = repeated.nonzero()[0].tolist()[-1]
+            raise ValueError(
+                f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat "
+                "frames), and its time is wrong; remove copies and state the times of the others in frame_start_times"
+            )
     # all channels show the same displacement; the pattern of a colour mosaic does not move with the scene
     images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])
     return GreyFrames(images, valid, prepared.batched, prepared.image_timing)

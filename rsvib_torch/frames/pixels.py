@@ -81,9 +81,9 @@ def _box_sum(images: Tensor, size: int) -> Tensor:
 
 
 def detailed_parts(images: Tensor, count: int) -> list[slice]:
-    """The ``count`` neighbouring columns with the largest squared row differences.
+    """The ``count`` neighbouring columns of each stack whose squared row differences in the first frame are largest.
 
-    Those of the first frame of each stack (B, T, ..., H, W).
+    ``images`` are stacks (B, T, ..., H, W).
 
     Example:
         >>> image = torch.zeros(16, 12)
