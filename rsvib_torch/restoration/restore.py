@@ -30,7 +30,8 @@ from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.frame_motion import FrameMotion, motion_of_frames, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
+from rsvib_torch.restoration.verdict.judge import judge_stacks
+from rsvib_torch.restoration.verdict.restoration_verdict import RestorationVerdict
 from rsvib_torch.restoration.verdict.trust import trusted_vibration, vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
