@@ -22,12 +22,7 @@ from rsvib_torch.restoration.exact.similar_patches import similar_patches
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
-from rsvib_torch.restoration.scene_model.finer_grid import (
-    SCALE,
-    FinerObservation,
-    finer_kernels,
-    fit_polynomial_prior,
-)
+from rsvib_torch.restoration.scene_model.finer_grid import SCALE, FinerObservation, fit_polynomial_prior
 
 # Luminance, red - blue, and magenta - green. Orthonormal, so that white noise stays white; the three components of a
 # scene are nearly independent, those of the colours are not.
@@ -192,7 +187,7 @@ def restore_mosaic(
             )
             if len(members) == 1 or _same_colours(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
-            kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height)
+            kernels = FinerObservation.kernels_of_rows(moved, node_weights, frames.new_ones(len(members)), height)
             observation = FinerObservation(kernels, height, length, frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()
