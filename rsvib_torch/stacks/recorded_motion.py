@@ -131,7 +131,7 @@ def _aligned_runs(
     # 1. The run in the middle, at all offsets; then the others, near its clock.
     starts = timing.frame_starts(info.shape[0])
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    limits = offset_range(recorded, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
+    limits = offset_range(recorded.start, recorded.end, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
     order = [runs[len(runs) // 2], *runs[: len(runs) // 2], *runs[len(runs) // 2 + 1 :]]
     found: list[ClockAlignment] = []
     middles: list[float] = []

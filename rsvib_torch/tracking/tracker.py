@@ -552,7 +552,5 @@ def _end_of_line(places: tuple[tuple[float, Tensor], ...]) -> Tensor:
     last, path = places[-1]
     if len(places) < 3:
         return path
-    times = torch.tensor([time for time, _ in places], dtype=torch.float64, device=path.device)
-    columns = torch.stack([torch.ones_like(times), times - last], -1)
-    place: Tensor = torch.linalg.lstsq(columns, torch.stack([path for _, path in places])).solution[0]
-    return place
+    times = np.array([time for time, _ in places]) - last
+    return path.new_tensor(np.polyfit(times, table(torch.stack([path for _, path in places])), 1)[1])
