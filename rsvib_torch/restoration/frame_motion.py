@@ -120,7 +120,7 @@ class FrameMotion:
 def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
     """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
     starts = timing.frame_starts(num_frames, vibration.device)
-    middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
+    middle = starts + timing.time_to_middle(num_rows)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift, num_rows)
 

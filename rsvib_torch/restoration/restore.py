@@ -229,8 +229,7 @@ def restore_each(
         findings = tuple(one for stack in followed.findings for one in stack)
         followed = replace(followed.mapped(lambda values: values.flatten(0, 1)), findings=findings)
     moved = followed.vibration.timed_from(followed.times)
-    start = -0.5 * ((height - 1) * frames.timing.row_time + frames.timing.exposure_time)
-    timing = replace(frames.image_timing, frame_start_times=(start,))
+    timing = replace(frames.image_timing, frame_start_times=(-frames.timing.time_to_middle(height),))
     trusted, left_alone = trusted_vibration(replace(followed, vibration=moved), timing, 1, height)
     axes = trusted.moving_axes()
     # 2. Only frames that move are restored.

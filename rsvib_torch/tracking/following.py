@@ -33,7 +33,7 @@ from rsvib_torch.options import FollowOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, tones_of_rows
-from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle, vibration_at_frame
+from rsvib_torch.tracking.tracked_frame import TrackedTones, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
 _BANDS = RegistrationOptions()
@@ -297,5 +297,5 @@ def _assembled(
         reliable=magnitudes_from_row_order(reliable, timing),
         findings=tuple(findings_from_row_order(of_frame, timing) for of_frame in findings),
         assumptions=((),) * len(found),
-        times=tensor(starts + time_to_middle(stack.images.shape[-2], timing.in_row_order())),
+        times=tensor(starts + timing.time_to_middle(stack.images.shape[-2])),
     ).to(stack.images.device)
