@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -239,7 +238,7 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
 
 
 def restore_in_strips(
-    method: Callable[..., Tensor], images: Tensor, motion: FrameMotion, options: Mapping[str, Any]
+    method: Callable[..., Tensor], images: Tensor, motion: FrameMotion, options: Mapping[str, object]
 ) -> Tensor:
     """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom.
 

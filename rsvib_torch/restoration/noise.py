@@ -157,11 +157,6 @@ def noise_of_blurred_frames(
     motion: FrameMotion,
     ignore: Tensor | None = None,
     high_pass: Tensor | None = None,
-    *,
-    min_frequency: float = 0.12,
-    max_transfer: float = 0.05,
-    min_share: float = 0.02,
-    row_step: int = 8,
 ) -> Tensor:
     """Noise power (B, T) of each frame from its motion blur.
 
@@ -170,11 +165,13 @@ def noise_of_blurred_frames(
     power is that of the noise, whatever the texture. Fisher scoring estimates a, S and the noise together, for powers
     with exponential distributions about their means (Whittle 1953).
 
-    Frequencies below ``min_frequency`` cycles per px are not used: scenes are too strong to be informative about noise
-    there. The blur blocks the scene where T is below ``max_transfer``. NaN for a frame with fewer than four usable
-    squares, and for a stack with a share of such values of T below ``min_share``. T is computed for one of ``row_step``
-    rows. Other arguments as above ``ESTIMATORS``.
+    NaN for a frame with fewer than four usable squares, and for a stack whose blur blocks the scene at too few
+    frequencies. Arguments as above ``ESTIMATORS``.
     """
+    min_frequency = 0.12  # cycles per px; below, scenes are too strong to be informative about noise
+    max_transfer = 0.05  # T, below which the blur blocks the scene
+    min_share = 0.02  # of the values of T that are below
+    row_step = 8  # rows, for one of which T is computed
     num_stacks, num_frames = frames.shape[:2]
     shape, device = frames.shape[-2:], frames.device
     result = np.full((num_stacks, num_frames), math.nan)

@@ -38,7 +38,7 @@ from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrio
 from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
-_MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
+MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 _FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
 
@@ -88,11 +88,6 @@ def restore_exact(
         warn_of_frames(differences, model.places(scenes))
     restored: Tensor = images.unflatten(0, (len(frames), -1))
     return restored
-
-
-def given_level(noise: float) -> float:
-    """A stated noise level, at least the lowest that single precision supports."""
-    return max(noise, _MIN_LEVEL)
 
 
 def scene_period(motion: FrameMotion, width: int) -> int:
@@ -304,7 +299,7 @@ def model_frames(
             powers = powers.unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
-    powers = powers.clamp(min=_MIN_LEVEL**2)
+    powers = powers.clamp(min=MIN_LEVEL**2)
     frame_weights = powers.reciprocal()
     unit_variance = frame_weights.mean(1).reciprocal()
 

@@ -13,7 +13,7 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.exact import given_level, scene_period
+from rsvib_torch.restoration.exact.exact import MIN_LEVEL, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
@@ -154,7 +154,7 @@ def restore_mosaic(
     check_prior(options.prior, scale=scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
     partition = Partition(options.chunk_frequencies, options.segments)
-    stated = None if options.noise == "auto" else given_level(options.noise)
+    stated = None if options.noise == "auto" else max(options.noise, MIN_LEVEL)
     # 2. The displacement of each row during its exposure, and the period that it requires.
     displacement, node_weights = motion.exposures
     length = scene_period(motion, width)
