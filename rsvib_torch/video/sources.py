@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal, Protocol, get_args
 
+import cv2
 import numpy as np
 
 from rsvib_torch.checks.values import check_choice, check_whole_number
@@ -92,8 +93,6 @@ class CameraSource:
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; times are whole frame periods apart."""
-        import cv2  # noqa: PLC0415
-
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # only the error below is shown
         try:
