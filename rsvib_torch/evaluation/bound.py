@@ -150,9 +150,8 @@ class _Places:
         rows = torch.arange(recording.size[0], dtype=torch.float64, device=starts.device)
         place = recording.origin[0] + rows[:, None] - displacement[..., 1]
         cell = place.floor()
-        lower = bspline_weights(place - cell, _DEGREE - 1)
         first, taps = spread_taps(cell, bspline_weights(place - cell, _DEGREE))
-        _, slopes = spread_taps(cell, functional.pad(lower, (1, 0)) - functional.pad(lower, (0, 1)))
+        _, slopes = spread_taps(cell, bspline_weights(place - cell, _DEGREE, derivative=1))
         sensitivity = recording.sensitivity(starts[..., None] + times.to(starts.device))
         return cls(first - _DEGREE // 2, taps, slopes, displacement[..., 0], weights, sensitivity, recording.axes)
 

@@ -13,7 +13,6 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
@@ -23,14 +22,13 @@ from rsvib_torch.export.exported import Size, num_rows_of
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
 
 _RATE_STEP = 1e-9  # rad/s, of the integers in the file; 1000 s of equal rounding errors add up to 5e-7 rad
 _LOWEST_RATE = 1000.0  # Hz; from here the rate is doubled, so that 1 / rate is a short decimal number
 _LARGEST_ERROR = 2e-7  # rad, of the attitude that the trapezoidal rule gives
 _MOST_SAMPLES = 5_000_000  # 150 MB of text
 _DIRECTIONS = {(-2, "forward"): 0, (-2, "reverse"): 1, (-1, "forward"): 2, (-1, "reverse"): 3}
-
-Array = NDArray[np.float64]
 
 
 @checks_arguments

@@ -25,7 +25,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 from scipy.spatial.transform import Rotation
 
@@ -39,6 +38,7 @@ from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.field import displacement_at
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import IsdModel
 from rsvib_torch.text import quoted
 
@@ -48,7 +48,6 @@ _COLUMNS = 17  # columns at which the displacement is evaluated; it changes smoo
 _PADDING = 4  # rows before and behind the frame, so that 8 quaternions surround every row
 _FIXED_POINT_STEPS = 10  # the displacement changes by less than 5 % over a pixel: 1e-13 px
 
-Array = NDArray[np.float64]
 _Row = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 

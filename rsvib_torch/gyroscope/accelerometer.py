@@ -23,12 +23,7 @@ _MOST_CLOCKS = 100  # that are tried; each takes 2 ms
 # px; errors by aliasing repeat where a scene rests: 0.0014 px at 411 Hz in 8 to 200 frames, beside 0.8 px at 137 Hz
 _REPEATED = 0.001
 
-
-class _Span(NamedTuple):
-    """Start and end of a record in s."""
-
-    start: float
-    end: float
+_Span = tuple[float, float]  # start and end of a record, or of its possible offsets, in s
 
 
 class _Fit(NamedTuple):
@@ -204,10 +199,8 @@ def compare_accelerometer(
 
     # 1. Clock: the lags at which record and tones correlate, those by other periods of the tones included.
     limits = offsets if offset is None else (offset, offset)
-    clock = _Span(*offset_range(_Span(stamps[0], stamps[-1]), first, last, limits))
-    tried = (
-        [offset] if offset is not None else _resembling(stamps, values, axes, angular, known, _Span(first, last), clock)
-    )
+    clock = offset_range(float(stamps[0]), float(stamps[-1]), first, last, limits)
+    tried = [offset] if offset is not None else _resembling(stamps, values, axes, angular, known, (first, last), clock)
 
     # 2. Tones of the record while the frames were taken. The clock follows from their phases: that with the best ones.
     def fitted(start: float, rounds: int) -> _Fit:
@@ -271,14 +264,14 @@ def _resembling(
 ) -> list[float]:
     """Offsets of the clock, within limits, at which a record correlates with tones, the best one first."""
     step = float(np.median(np.diff(stamps)))
-    model = _model(np.arange(frames.start, frames.end, step), axes, angular, known)
+    model = _model(np.arange(*frames, step), axes, angular, known)
     # each axis by its own size, so that none outweighs the other
     used = sorted(set(axes.tolist()))
     sums = [
         signal.correlate(values[:, a], model[:, a], "valid") / (values[:, a].std() * model[:, a].std()) for a in used
     ]
-    lags = stamps[0] - frames.start + step * np.arange(len(sums[0]))
-    total = np.where((lags >= clock.start - step) & (lags <= clock.end + step), np.sum(sums, 0), -np.inf)
+    lags = stamps[0] - frames[0] + step * np.arange(len(sums[0]))
+    total = np.where((lags >= clock[0] - step) & (lags <= clock[1] + step), np.sum(sums, 0), -np.inf)
     peaks = signal.find_peaks(np.pad(total, 1, constant_values=-np.inf), height=_AS_GOOD * total.max())[0] - 1
     return [float(lags[peak]) for peak in peaks[np.argsort(-total[peaks])][:_MOST_CLOCKS]]
 

@@ -264,7 +264,7 @@ def align_motion(
     bands = options.bands()
     rowwise, curve, (first, last) = start_curve(stack, timing, bands)
     turned = recorded.to_row_order(timing).to("cpu")
-    low, high = offset_range(turned, first, last, options.offsets)
+    low, high = offset_range(turned.start, turned.end, first, last, options.offsets)
     measured = measurements_of_curve(curve, rowwise, bands.band_step)
     offset, other = best_offset(measured, turned, low, high, rowwise)
     clock = FittedClock(offset + 0.5 * (first + last), 1.0, (1.0, 1.0), (0.0, 0.0), 0.5 * (first + last))

@@ -1,27 +1,20 @@
 """Offsets between two clocks: those for which a recording covers the frames, and limits."""
 
-from typing import Protocol
-
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.results.reason import Reason
 
 
-class _Recording(Protocol):
-    @property
-    def start(self) -> float: ...
-
-    @property
-    def end(self) -> float: ...
-
-
 def offset_range(
-    recorded: _Recording, first: float, last: float, limits: tuple[float, float] | None
+    start: float, end: float, first: float, last: float, limits: tuple[float, float] | None
 ) -> tuple[float, float]:
-    """Range of offsets in s for which a recording covers the time from ``first`` to ``last``, within ``limits``."""
-    low, high = recorded.start - first, recorded.end - last
+    """Range of offsets in s, within ``limits``, for which a recording covers the time from ``first`` to ``last``.
+
+    The recording is from ``start`` to ``end`` on its own clock.
+    """
+    low, high = start - first, end - last
     if high < low:
         raise ValueError(
-            f"the recording of {recorded.end - recorded.start:.4g} s is shorter than the frames, {last - first:.4g} s; "
+            f"the recording of {end - start:.4g} s is shorter than the frames, {last - first:.4g} s; "
             "are its times in another unit?"
         )
     if limits is not None:

@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.gyroscope.text_logs import angular_rates, check_orientation
+from rsvib_torch.numerics.tables import Array
 
-Array = NDArray[np.float64]
 _MAX_PACKETS = 10**5  # 28 hours; cameras write one per second
 _SMALLEST_TURN = 1e-3  # half of an angle in rad; 1 px with a focal length of 500 px
 

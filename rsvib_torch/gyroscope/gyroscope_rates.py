@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -14,10 +13,9 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import MAX_SAMPLES
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Result
 from rsvib_torch.text import text_table
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

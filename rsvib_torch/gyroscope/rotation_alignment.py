@@ -158,7 +158,7 @@ def align_rates(
     if camera is not None:
         camera.check_size(*((height, width) if timing.scan_axis == -1 else (width, height)))
     begin, last = float(starts[0, 0]), float(starts[-1, 1]) + height * timing.row_time + timing.exposure_time
-    limits = offset_range(rates, begin, last, offsets)
+    limits = offset_range(rates.start, rates.end, begin, last, offsets)
     middle = 0.5 * (begin + last)
     known = None if fit_focal_length else camera
     free = [True, True, True, True, fit_scale, fit_focal_length, fit_row_time]

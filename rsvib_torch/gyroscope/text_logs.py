@@ -10,17 +10,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import rows_of_numbers, text_lines
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates, orientation_matrix
 from rsvib_torch.motion.recorded import SECONDS
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.text import one_line, quoted
-
-Array = NDArray[np.float64]
 
 RADIANS = {"rad/s": 1.0, "deg/s": math.pi / 180}
 _UNIT = {"rad/s": "rad/s", "rad_s": "rad/s", "rads": "rad/s", "deg/s": "deg/s", "deg_s": "deg/s", "dps": "deg/s"}

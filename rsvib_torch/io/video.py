@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.stack_info import H264, VIDEO, FrameError, StackInfo, readable_stack
 from rsvib_torch.io.time_metadata import camera_name
+from rsvib_torch.numerics.tables import Array
 
 CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
@@ -79,7 +79,7 @@ def _decoded_as(layout: Any) -> tuple[str, float]:
     return ("rgb24", 255.0) if bits <= 8 else ("rgb48le", 65535.0)
 
 
-def _pixels(frame: Any) -> NDArray[Any]:
+def _pixels(frame: Any) -> Array:
     """Pixels (H, W) or (3, H, W) of a decoded frame."""
     unspecified, untagged_height = 2, 576  # players assume the colours of HDTV for taller videos without a tag
     matrix = "ITU709" if frame.colorspace == unspecified and frame.height > untagged_height else None
@@ -214,13 +214,13 @@ class VideoReader:
         self._container, self._next = open_container(self._path), 0
         self._decoding, self._early = _frames(self._container), None
 
-    def frame(self, index: int) -> NDArray[Any]:
+    def frame(self, index: int) -> Array:
         """Pixels of a frame as stored."""
         return _pixels(self._decoded(index))
 
-    def planes(self, index: int) -> NDArray[Any]:
+    def planes(self, index: int) -> Array:
         """Planes of a frame, (3 H / 2, W), Y above U and V; colours keep their counts, and chroma its resolution."""
-        planes: NDArray[Any] = self._decoded(index).to_ndarray()
+        planes: Array = self._decoded(index).to_ndarray()
         return planes
 
     def _decoded(self, index: int) -> Any:
@@ -333,13 +333,13 @@ class VideoEncoder:
             video.pix_fmt, encoder.colorspace = "yuv420p", picture.colorspace
             encoder.color_range = _FULL_RANGE if picture.levels[1] == 255.0 else picture.color_range
 
-    def write(self, frame: NDArray[Any], tick: int) -> None:
+    def write(self, frame: Array, tick: int) -> None:
         """Encode a frame with a presentation time."""
         encoded = self._converted(frame)
         encoded.pts, encoded.time_base = tick, self.unit
         self._container.mux(self._stream.encode(encoded))
 
-    def _converted(self, frame: NDArray[Any]) -> Any:
+    def _converted(self, frame: Array) -> Any:
         if self._picture is not None:
             return _av().VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="yuv420p")
         counts = np.moveaxis(frame, 0, -1) if frame.shape[:-2] == (3,) else frame.reshape(frame.shape[-2:])
@@ -406,7 +406,7 @@ def open_output(path: Path, opened: ExitStack) -> Any:
     return opened.enter_context(_av().open(str(path), "w", format=CONTAINERS[path.suffix.lower()], options=options))
 
 
-def write_video(path: Path, info: StackInfo, frames: Iterator[NDArray[Any]], compression: str | None) -> None:
+def write_video(path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None) -> None:
     """Write a video frame by frame; arguments as in ``StackFormat.write``."""
     with ExitStack() as opened:
         source, output = open_source(info, opened), open_output(path, opened)
@@ -427,7 +427,7 @@ _PART_OPTIONS = {"preset": "ultrafast", "crf": "14", "bf": "0"}
 @contextmanager
 def part_of_video(
     file: BinaryIO, video: Path, info: StackInfo, picture: Picture | None
-) -> Iterator[Callable[[NDArray[Any]], None]]:
+) -> Iterator[Callable[[Array], None]]:
     """Encode consecutive frames of a video into a new file; only ``join_parts`` gives them their times.
 
     The ending of ``video`` selects container and codec. The block gets a function that encodes a frame; the file is

@@ -225,6 +225,10 @@ class SensorTiming:
         """Time m T_row between the exposure starts of consecutive frames in seconds."""
         return self.frame_rows * self.row_time
 
+    def time_to_middle(self, num_rows: int) -> float:
+        """Time in s from the exposure start of a frame of ``num_rows`` rows to its middle."""
+        return 0.5 * ((num_rows - 1) * self.row_time + self.exposure_time)
+
     @property
     def frame_rate(self) -> float:
         """Frames per second."""

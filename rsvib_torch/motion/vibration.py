@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, Self
+from typing import Self
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -17,6 +16,7 @@ from rsvib_torch.checks.values import check_number, check_whole_number
 from rsvib_torch.motion.camera import Camera
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import MAX_BATCH, SensorTiming, row_axes
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import Result, axis_head, axis_rows
 from rsvib_torch.text import measured_text, text_table
 
@@ -45,7 +45,7 @@ _LIMITS = {
 _NOT_NEGATIVE = ("amplitude", "frequency")
 _MAX_BLIND = 10_000_000  # blind frequencies; 80 MB
 
-TensorLike = Tensor | NDArray[Any] | float | Sequence[float] | Sequence[Sequence[float]]
+TensorLike = Tensor | Array | float | Sequence[float] | Sequence[Sequence[float]]
 
 
 def _per_tone(values: dict[str, TensorLike], device: torch.device | None) -> list[Tensor]:

@@ -13,8 +13,8 @@ from rsvib_torch.execution.chunking import runs
 from rsvib_torch.numerics.tables import Array, table, tensor
 
 
-def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
-    """Weights of the ``degree + 1`` B-splines that are not zero at a position.
+def bspline_weights(fraction: Tensor, degree: int, derivative: int = 0) -> Tensor:
+    """Weights of the ``degree + 1`` B-splines that are not zero at a position, or their derivatives.
 
     The value at ``x = n + fraction`` is ``sum_k weights[k] c[n - degree // 2 + k]`` with coefficients ``c``
     of a spline of odd degree; 1 is linear interpolation. Fractions (...) in [0, 1] have weights (..., degree + 1).
@@ -23,6 +23,9 @@ def bspline_weights(fraction: Tensor, degree: int) -> Tensor:
         >>> bspline_weights(torch.tensor(0.25), 1).tolist()
         [0.75, 0.25]
     """
+    if derivative:
+        lower = bspline_weights(fraction, degree - 1, derivative - 1)
+        return torch.nn.functional.pad(lower, (1, 0)) - torch.nn.functional.pad(lower, (0, 1))
     highest, *others = torch.tensor(_polynomials(degree), dtype=fraction.dtype, device=fraction.device)
     weights: Tensor = highest
     for lower in others:
@@ -45,10 +48,7 @@ def spline_taps(
     """
     place = np.clip((times - start) / spacing, 0.0, count - degree)
     cell = np.minimum(np.floor(place), count - degree - 1.0)
-    factors = table(bspline_weights(tensor(place - cell), degree - derivative))
-    ends = [(0, 0)] * place.ndim
-    for _ in range(derivative):
-        factors = (np.pad(factors, [*ends, (1, 0)]) - np.pad(factors, [*ends, (0, 1)])) / spacing
+    factors = table(bspline_weights(tensor(place - cell), degree, derivative)) / spacing**derivative
     return cell.astype(np.int64)[..., None] + np.arange(degree + 1), factors
 
 

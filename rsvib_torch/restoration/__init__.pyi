@@ -4,8 +4,9 @@ from .noise import estimate_noise
 from .restoration_mtf import RestorationMtf, restoration_mtf
 from .restoration_warning import RestorationWarning
 from .restore import VibrationRestorer, restore
-from .verdict.judge import RestorationVerdict, judge_restoration
+from .verdict.judge import judge_restoration
 from .verdict.pairs import TooLittleInCommonError
+from .verdict.restoration_verdict import RestorationVerdict
 from .verdict.trust import displacement_uncertainty, trusted_vibration
 
 __all__ = [

@@ -14,34 +14,27 @@ from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.execution.chunking import at_once, runs
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.imaging.trajectory import Quadrature, exposure_trajectory
-from rsvib_torch.numerics.fourier import extend_rows, extended_length
+from rsvib_torch.numerics.fourier import extend_rows, extended_length, squared_modulus, waves
 from rsvib_torch.numerics.splines import bspline_weights, mirrored
 from rsvib_torch.options import BandedOptions
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.noise import estimate_noise
 
 
-def _waves(frequencies: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Real and imaginary part of exp(-2 pi i frequency place), shape of places + shape of frequencies."""
-    angle = -2 * math.pi * places[..., None] * frequencies
-    return angle.cos(), angle.sin()
-
-
-def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> tuple[Tensor, Tensor]:
-    """Transfer functions of shifting by ``places`` px with a B-spline of ``degree``."""
+def _spline_transfer(places: Tensor, frequencies: Tensor, degree: int) -> Tensor:
+    """Transfer function (..., U) of shifting by ``places`` px with a B-spline of ``degree``."""
     cell = places.detach().floor()
-    weights = bspline_weights(places - cell, degree)
     samples = bspline_weights(torch.zeros((), dtype=places.dtype, device=places.device), degree)
     taps = torch.arange(degree + 1, dtype=places.dtype, device=places.device) - degree // 2
-    at_rest = samples @ _waves(frequencies, taps)[0] if degree > 1 else torch.ones_like(frequencies)
-    real, imaginary = _waves(frequencies, cell[..., None] + taps)
-    weights = weights[..., None]
-    return (weights * real).sum(-2) / at_rest, (weights * imaginary).sum(-2) / at_rest
+    at_rest = samples @ waves(taps, frequencies).real if degree > 1 else torch.ones_like(frequencies)
+    weights = bspline_weights(places - cell, degree)[..., None]
+    moved: Tensor = (weights * waves(cell[..., None] + taps, frequencies)).sum(-2) / at_rest
+    return moved
 
 
-_TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], int, Quadrature]] = {
+_TRANSFERS: dict[str, tuple[Callable[[Tensor, Tensor], Tensor], int, Quadrature]] = {
     "linear": (lambda places, u: _spline_transfer(places, u, 1), 1, "midpoint"),
-    "cubic": (lambda places, u: _waves(u, places), 3, "gauss"),
+    "cubic": (waves, 3, "gauss"),
 }
 
 
@@ -63,24 +56,16 @@ def _noise_to_signal(frames: Tensor, value: float | Literal["auto"]) -> Tensor:
 def _filters(
     displacement: Tensor, node_weights: Tensor, grid: tuple[Tensor, Tensor], weight: Tensor, interpolation: str
 ) -> Tensor:
-    """Real and imaginary parts (n, 2, V, U) of Wiener filters of slabs, of displacement (n, N, 2) in the exposure."""
+    """Wiener filters (n, V, U) of slabs at all lags across rows, of displacement (n, N, 2) in the exposure."""
     u, v = grid
     along_rows, degree, _ = _TRANSFERS[interpolation]
     along = along_rows(displacement[..., 0], u)
-    across = (part.transpose(-2, -1) * node_weights.to(v) for part in _spline_transfer(displacement[..., 1], v, degree))
-    a, b = torch.cat(along, dim=-2), tuple(across)
-    # complex products as real matrix products: [Re; Im] of the transfer function, (n, 2, V, U)
-    transfer = torch.cat([torch.cat([b[0], -b[1]], -1), torch.cat([b[1], b[0]], -1)], dim=-2) @ a
-    transfer = transfer.unflatten(-2, (2, len(v)))
+    across = _spline_transfer(displacement[..., 1], v, degree) * node_weights.to(v)[:, None]
+    transfer = across.mT @ along
     prior = 4 * (torch.sin(math.pi * v).square()[:, None] + torch.sin(math.pi * u).square())
-    damped = torch.addcmul(transfer[:, 0].square(), transfer[:, 1], transfer[:, 1])
-    damped = torch.addcmul(damped, weight[:, None, None], prior).clamp(min=torch.finfo(u.dtype).tiny)
-    response = transfer / damped[:, None]
-    # inverse Fourier transform over v of the conjugate, at all lags of the slab
-    lags = torch.fft.fftfreq(len(v), d=1.0 / len(v), dtype=v.dtype, device=v.device)
-    cosine, sine = (part / len(v) for part in _waves(v, lags))
-    inverse = torch.cat([torch.cat([cosine, -sine], -1), torch.cat([-sine, -cosine], -1)], dim=-2)
-    filters: Tensor = (inverse @ response.flatten(1, 2)).unflatten(-2, (2, len(v)))
+    damped = torch.addcmul(squared_modulus(transfer), weight[:, None, None], prior)
+    response = transfer.conj() / damped.clamp(min=torch.finfo(u.dtype).tiny)
+    filters: Tensor = torch.fft.ifft(response, dim=-2)
     return filters
 
 
@@ -92,7 +77,7 @@ def _aligned_spectra(frames: Tensor, motion: FrameMotion, u: Tensor, length: int
     spectra = torch.fft.rfft(extend_rows(frames, length)).transpose(-3, -2).flatten(0, 2)
     aligned_rows = 256  # at a time; bounds the memory
     moved = [
-        lines * torch.complex(*(part.to(frames.dtype) for part in _waves(u, -places)))[:, None]
+        lines * waves(places, -u).to(lines.dtype)[:, None]
         for lines, places in zip(spectra.split(aligned_rows), mean.flatten().split(aligned_rows), strict=True)
     ]
     aligned: Tensor = torch.cat(moved).unflatten(0, (B * T, H))
@@ -144,18 +129,14 @@ def restore_banded(
 
     lags = torch.fft.fftfreq(size, d=1.0 / size, device=frames.device, dtype=torch.float32).round().to(torch.int64)
     kept = torch.arange(stride, device=frames.device) - (stride - 1) // 2
-    spectra = torch.view_as_real(_aligned_spectra(frames, motion, u, length)).movedim(-1, 0).contiguous()
+    spectra = _aligned_spectra(frames, motion, u, length)
     restored = frames.new_empty(B * T * len(centres), stride, C, W)
     chunks = runs(len(slab_rows), chunk_rows)
     advance = steps(len(chunks), "chunks")
     for chunk in chunks:
         bank = _filters(displacement[chunk], node_weights, grid, weight[chunk], interpolation)
         source = mirrored(slab_rows[chunk, None, None] + kept[:, None] - lags, H)  # (n, stride, V)
-        a, b = bank[:, 0, None, :, None], bank[:, 1, None, :, None]
-        real, imaginary = spectra[:, image[chunk, None, None], source]  # each (n, stride, V, C, U)
-        rows_out = torch.complex(
-            torch.addcmul(real * a, imaginary, b, value=-1).sum(2), torch.addcmul(real * b, imaginary, a).sum(2)
-        )
+        rows_out = (spectra[image[chunk, None, None], source] * bank[:, None, :, None]).sum(2)  # (n, stride, C, U)
         restored[chunk] = torch.fft.irfft(rows_out, n=length)[..., :W]
         advance()
     stacked: Tensor = restored.unflatten(0, (B, T, len(centres))).flatten(2, 3)[:, :, :H]

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -120,7 +119,7 @@ class FrameMotion:
 def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
     """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
     starts = timing.frame_starts(num_frames, vibration.device)
-    middle = starts + 0.5 * ((num_rows - 1) * timing.row_time + timing.exposure_time)
+    middle = starts + timing.time_to_middle(num_rows)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift, num_rows)
 
@@ -239,7 +238,7 @@ def _strips(motion: Motion, size: tuple[int, int], first: float, last: float) ->
 
 
 def restore_in_strips(
-    method: Callable[..., Tensor], images: Tensor, motion: FrameMotion, options: Mapping[str, Any]
+    method: Callable[..., Tensor], images: Tensor, motion: FrameMotion, options: Mapping[str, object]
 ) -> Tensor:
     """Frames restored by one of ``METHODS``, in strips of columns if the motion has roll or zoom.
 

@@ -23,8 +23,8 @@ from rsvib_torch.numerics.fourier import squared_modulus, waves
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
-from rsvib_torch.restoration.scene_model.observation import row_kernels
-from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts, taper
+from rsvib_torch.restoration.scene_model.observation import RowKernels
+from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, power_transfer, spread_starts, taper
 
 # Squares for power spectra, and which parts of images count
 
@@ -157,11 +157,6 @@ def noise_of_blurred_frames(
     motion: FrameMotion,
     ignore: Tensor | None = None,
     high_pass: Tensor | None = None,
-    *,
-    min_frequency: float = 0.12,
-    max_transfer: float = 0.05,
-    min_share: float = 0.02,
-    row_step: int = 8,
 ) -> Tensor:
     """Noise power (B, T) of each frame from its motion blur.
 
@@ -170,11 +165,13 @@ def noise_of_blurred_frames(
     power is that of the noise, whatever the texture. Fisher scoring estimates a, S and the noise together, for powers
     with exponential distributions about their means (Whittle 1953).
 
-    Frequencies below ``min_frequency`` cycles per px are not used: scenes are too strong to be informative about noise
-    there. The blur blocks the scene where T is below ``max_transfer``. NaN for a frame with fewer than four usable
-    squares, and for a stack with a share of such values of T below ``min_share``. T is computed for one of ``row_step``
-    rows. Other arguments as above ``ESTIMATORS``.
+    NaN for a frame with fewer than four usable squares, and for a stack whose blur blocks the scene at too few
+    frequencies. Arguments as above ``ESTIMATORS``.
     """
+    min_frequency = 0.12  # cycles per px; below, scenes are too strong to be informative about noise
+    max_transfer = 0.05  # T, below which the blur blocks the scene
+    min_share = 0.02  # of the values of T that are below
+    row_step = 8  # rows, for one of which T is computed
     num_stacks, num_frames = frames.shape[:2]
     shape, device = frames.shape[-2:], frames.device
     result = np.full((num_stacks, num_frames), math.nan)
@@ -188,7 +185,9 @@ def noise_of_blurred_frames(
     used = constant(_pooled_frequencies, dtype=u.dtype, device=device) > min_frequency
     displacement, node_weights = motion.exposures
     of_squares = displacement[:, :, rows]  # (B, T, n, rows, N, 2)
-    blur = _power_transfer(of_squares[:, :, :, row_step // 2 :: row_step], node_weights, u, v)
+    of_rows = of_squares[:, :, :, row_step // 2 :: row_step]
+    weights = constant(_row_weights, of_rows.shape[3], dtype=u.dtype, device=device)
+    blur = (power_transfer(of_rows, node_weights, u, v) * weights[:, None, None]).sum(-3)
     transfer = table(_pooled(blur)[..., used])
     blocked = (transfer < max_transfer).mean((1, 2, 3)) >= min_share
     stacks = blocked.nonzero()[0].tolist()
@@ -267,16 +266,6 @@ def _square_counts(shape: torch.Size, most: int) -> list[int]:
     counts = [2 * extent // _SIDE - 1 for extent in shape]
     excess = max(1.0, math.sqrt(math.prod(counts) / most))
     return [max(1, round(count / excess)) for count in counts]
-
-
-def _power_transfer(displacement: Tensor, node_weights: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Power transfer (..., U, V) of the blur of rows with displacement (..., R, N, 2), weighted by the window."""
-    along = waves(displacement[..., 0], u) * node_weights[:, None]
-    across = waves(displacement[..., 1], v)
-    size = displacement.shape[-3]
-    weights = constant(_row_weights, size, dtype=u.dtype, device=u.device)
-    transfer = squared_modulus(along.transpose(-2, -1) @ across)
-    return (transfer * weights[:, None, None]).sum(-3)
 
 
 def _pooled(values: Tensor) -> Tensor:
@@ -381,7 +370,7 @@ def _residual_power(
     """
     num_rows, width = images.shape[-2:]
     moved = displacement.flatten(0, 1)
-    kernels = row_kernels(moved, node_weights, moved.new_ones(len(moved)), num_rows, 4 * _MIN_SIDE)
+    kernels = RowKernels.of_rows(moved, node_weights, moved.new_ones(len(moved)), num_rows, 4 * _MIN_SIDE)
     count = min(num_frequencies, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images, kernels, chosen)

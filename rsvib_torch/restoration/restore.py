@@ -30,7 +30,8 @@ from rsvib_torch.restoration.exact.mosaic_scene import restore_mosaic
 from rsvib_torch.restoration.frame_motion import FrameMotion, motion_of_frames, restore_in_strips
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
 from rsvib_torch.restoration.richardson_lucy import restore_richardson_lucy
-from rsvib_torch.restoration.verdict.judge import RestorationVerdict, judge_stacks
+from rsvib_torch.restoration.verdict.judge import judge_stacks
+from rsvib_torch.restoration.verdict.restoration_verdict import RestorationVerdict
 from rsvib_torch.restoration.verdict.trust import trusted_vibration, vibration_to_undo
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
@@ -228,8 +229,7 @@ def restore_each(
         findings = tuple(one for stack in followed.findings for one in stack)
         followed = replace(followed.mapped(lambda values: values.flatten(0, 1)), findings=findings)
     moved = followed.vibration.timed_from(followed.times)
-    start = -0.5 * ((height - 1) * frames.timing.row_time + frames.timing.exposure_time)
-    timing = replace(frames.image_timing, frame_start_times=(start,))
+    timing = replace(frames.image_timing, frame_start_times=(-frames.timing.time_to_middle(height),))
     trusted, left_alone = trusted_vibration(replace(followed, vibration=moved), timing, 1, height)
     axes = trusted.moving_axes()
     # 2. Only frames that move are restored.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rsvib_torch.execution.progress import steps
 from rsvib_torch.imaging.blur import RowPSF, RowVaryingBlur, trajectory_psf
+from rsvib_torch.numerics.splines import correlated, mirrored
 from rsvib_torch.options import RichardsonLucyOptions
 from rsvib_torch.restoration.dewarp import restore_dewarp
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
@@ -113,9 +114,7 @@ def _at_pixels(coefficients: Tensor) -> Tensor:
     """Values at the pixels of cubic B-splines with mirrored ends, (..., H, W)."""
     for dim in (-2, -1):
         length = coefficients.shape[dim]
-        before = coefficients.narrow(dim, min(1, length - 1), 1)
-        after = coefficients.narrow(dim, max(length - 2, 0), 1)
-        padded = torch.cat([before, coefficients, after], dim)
-        sides = padded.narrow(dim, 0, length) + padded.narrow(dim, 2, length)
-        coefficients = (4.0 * coefficients + sides) / 6.0
+        near = mirrored(torch.arange(-1, length + 1, device=coefficients.device), length)
+        samples = coefficients.new_tensor([[1 / 6, 4 / 6, 1 / 6]])
+        coefficients = correlated(coefficients.index_select(dim, near), samples, dim)[0]
     return coefficients

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_methods
 from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_number, described, needed_package
 from rsvib_torch.files.reading import Table
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.higher_packages import imported
 from rsvib_torch.results.reason import texts
 from rsvib_torch.results.result_files import figure_png, result_of, save_result, write_figure
@@ -128,7 +128,7 @@ def check_pixel_size(pixel_size: float | None) -> float | None:
 
 
 _DIMENSIONS = {"A": "axis", "F": "frequency", "K": "tone", "N": "row", "P": "pair", "R": "row", "T": "frame"}
-Variable = tuple[tuple[str, ...], NDArray[Any], dict[str, str]]  # names of dimensions, values, attributes
+Variable = tuple[tuple[str, ...], Array, dict[str, str]]  # names of dimensions, values, attributes
 
 
 # Results

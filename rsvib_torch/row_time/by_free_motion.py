@@ -18,21 +18,11 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.numerics.splines import spline_taps
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.row_time.joint_fit import FramePlaces
-from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord
+from rsvib_torch.row_time.row_tones import MAX_CHI_SQUARE, Candidate, RowRecord, RowTimeFit
 
 DEGREE = 7  # a simulated motion of 8 Hz bandwidth needs knots of 11 ms to its noise, and of 8 ms with degree 3
 _GRID_FRAMES = 24  # frames whose minima over the grid of row times are refined with all frames
 GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wider for motions that are accepted
-
-
-@dataclass(frozen=True, eq=False)
-class SplineRowTime:
-    """Row time of a spline fit."""
-
-    row_time: float  # seconds, negative for a reverse readout
-    std: float  # its standard deviation
-    others: tuple[Candidate, ...]  # other row times at which a spline with as few knots explains the displacements
-    spacing: float  # seconds between knots
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +37,10 @@ class _Evaluation:
 
 def row_time_of_splines(
     places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
-) -> SplineRowTime | None:
-    """Row time from ``low`` to ``high`` s at which the fewest knots explain the displacements; None if no motion does.
+) -> tuple[RowTimeFit, float] | None:
+    """Row time from ``low`` to ``high`` s at which the fewest knots explain the displacements, and their distance in s.
 
-    ``places`` are rows from the top of the image; readout directions are 1.0 and -1.0.
+    None if no motion explains them. ``places`` are rows from the top of the image; readout directions are 1.0 and -1.0.
     """
     problem = _Problem.of(places, num_rows, high)
     coarse_problem = _Problem.of(places.of_first_frames(_GRID_FRAMES), num_rows, high)
@@ -89,7 +79,7 @@ def row_time_of_splines(
         if one.chi_square < found[0].chi_square + noise * MAX_CHI_SQUARE
         and abs(one.row_time - best.row_time) > 5 * (std + one.std * math.sqrt(noise))
     )
-    return SplineRowTime(best.row_time, std, others, finer)
+    return RowTimeFit(best.row_time, std, others), finer
 
 
 @dataclass(frozen=True, eq=False)

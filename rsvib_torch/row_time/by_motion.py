@@ -25,8 +25,9 @@ from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time import RowTimeCalibration
 from rsvib_torch.row_time.by_free_motion import row_time_of_splines
-from rsvib_torch.row_time.by_tones import CameraClock, RowTimeFit, bands_of_frames, row_time_of_tones
+from rsvib_torch.row_time.by_tones import CameraClock, bands_of_frames, row_time_of_tones
 from rsvib_torch.row_time.joint_fit import FramePlaces, rows_of_frames
+from rsvib_torch.row_time.row_tones import RowTimeFit
 
 P = ParamSpec("P")
 
@@ -134,11 +135,9 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         if found.findings:
             places = _measured_freely(stack, clock, options, curve)
             spline = row_time_of_splines(places, num_rows, low, high, directions)
-            if spline is not None and spline.std < MAX_RELATIVE_STD * abs(spline.row_time):
-                notes.append(
-                    f"the motion is no sum of few tones: a spline with knots {1e3 * spline.spacing:.3g} ms apart"
-                )
-                found = RowTimeFit(spline.row_time, spline.std, spline.others, None, None, ())
+            if spline is not None and spline[0].std < MAX_RELATIVE_STD * abs(spline[0].row_time):
+                found, spacing = spline
+                notes.append(f"the motion is no sum of few tones: a spline with knots {1e3 * spacing:.3g} ms apart")
     return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)
 
 
@@ -180,7 +179,7 @@ def _measured_freely(
 
 
 def _undetermined(reason: Reason) -> RowTimeFit:
-    return RowTimeFit(math.nan, math.nan, (), None, None, (reason,))
+    return RowTimeFit(math.nan, math.nan, findings=(reason,))
 
 
 def _result(found: RowTimeFit, clock: CameraClock, notes: list[str]) -> RowTimeCalibration:

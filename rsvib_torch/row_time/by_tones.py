@@ -28,6 +28,7 @@ from rsvib_torch.row_time.joint_fit import FramePlaces, fit_row_time, rows_of_fr
 from rsvib_torch.row_time.row_tones import (
     MAX_CHI_SQUARE,
     Candidate,
+    RowTimeFit,
     RowTones,
     candidates,
     find_row_tones,
@@ -57,18 +58,6 @@ class CameraClock:
     def allows(self, row_time: float) -> bool:
         """Whether a signed row time in s is possible."""
         return self.low <= abs(row_time) <= self.high and math.copysign(1.0, row_time) in self.directions
-
-
-@dataclass(frozen=True, eq=False)
-class RowTimeFit:
-    """Row time of the frames of one stack."""
-
-    row_time: float  # seconds, negative for a reverse readout
-    std: float  # its standard deviation
-    others: tuple[Candidate, ...]  # other row times that explain the frames as well
-    exposure_time: float | None  # in s, measured from the blur; None if it was not
-    exposure_std: float | None  # its standard deviation
-    findings: tuple[Reason, ...]  # reasons why the row time is not certain
 
 
 def turned(stack: GreyFrames, direction: float) -> GreyFrames:

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 from rsvib_torch.numerics.tables import Array
+from rsvib_torch.results.reason import Reason
 
 F_THRESHOLD = 14.0  # decrease of chi-square per parameter, as for tones of known timing (tones/selection.py)
 MAX_CHI_SQUARE = 30.0  # above that of the best row time, for another one that explains the frames as well
@@ -161,6 +162,18 @@ class Candidate:
     std: float  # its standard deviation
     # sum over the tones of the squared distance of ``nu P / T_row - phi`` from a whole number, over its variance
     chi_square: float
+
+
+@dataclass(frozen=True, eq=False)
+class RowTimeFit:
+    """Row time of the frames of one stack."""
+
+    row_time: float  # seconds, negative for a reverse readout
+    std: float  # its standard deviation
+    others: tuple[Candidate, ...] = ()  # other row times that explain the frames as well
+    exposure_time: float | None = None  # in s, measured from the blur; None if it was not
+    exposure_std: float | None = None  # its standard deviation
+    findings: tuple[Reason, ...] = ()  # reasons why the row time is not certain
 
 
 def candidates(

@@ -13,6 +13,7 @@ import torch
 
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.execution.prefetch import in_order, in_threads
+from rsvib_torch.files.reading import Table
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows
 from rsvib_torch.stacks.windows import Window
@@ -59,7 +60,7 @@ def _compute_on_worker(job: StackJob, window: Window, one_thread: bool) -> Store
 
 def _dask_client(scheduler: str, workers: int) -> Any:
     """A client of the scheduler at an address, or of a number of workers on this machine, which end with it."""
-    options: dict[str, Any] = {"address": scheduler, "timeout": 30}
+    options: Table = {"address": scheduler, "timeout": 30}
     if scheduler == "local":
         options = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
         options |= {"dashboard_address": None, "silence_logs": logging.ERROR}

@@ -10,13 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, channel_axis
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.detection import DetectionResult, detect_vibration
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.mosaic import check_mosaic, colour_frames
 from rsvib_torch.frames.pixels import enlarged
 from rsvib_torch.io import full_scale as scales
@@ -27,6 +27,7 @@ from rsvib_torch.io.stack_reading import PathLike, open_stack, read_stack_info
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import (
     BadFrames,
     OptionTable,
@@ -51,7 +52,7 @@ from rsvib_torch.stacks.window_restoration import (
 from rsvib_torch.stacks.windows import Window, cut_windows, window_record, window_timing
 from rsvib_torch.tracking.following import follow_vibration
 
-WindowFrames = list[NDArray[Any] | str]  # pixels as stored, or why a frame cannot be read
+WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,8 +88,8 @@ class WindowResult(Summarised):
 class StoredWindow:
     """Frames of a window as they are stored, and the content of its ``WindowRecord``."""
 
-    frames: list[NDArray[Any]]
-    record: dict[str, Any]
+    frames: list[Array]
+    record: Table
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +202,9 @@ class StackJob:
         readout = self.info.shape[int(self.timing.scan_axis)] * self.timing.row_time + self.timing.exposure_time
         return self.motion.within(first - readout, last + 2 * readout).retimed(first).to(self.device)
 
-    def _usable(self, window: Window, pixels: WindowFrames) -> tuple[dict[int, NDArray[Any]], dict[int, str]]:
+    def _usable(self, window: Window, pixels: WindowFrames) -> tuple[dict[int, Array], dict[int, str]]:
         """The frames of a window that can be used, and why others cannot."""
-        usable: dict[int, NDArray[Any]] = {}
+        usable: dict[int, Array] = {}
         faults: dict[int, str] = {}
         for index, frame in zip(window.frames, pixels, strict=True):
             fault = frame_fault(frame, index, self.full_scale, self.info.nodata)
@@ -213,14 +214,14 @@ class StackJob:
                 usable[index] = frame
         return usable, faults
 
-    def _images(self, frames: Mapping[int, NDArray[Any]]) -> Tensor:
+    def _images(self, frames: Mapping[int, Array]) -> Tensor:
         """Frames as stored as (T, H, W) or (T, C, H, W), full scale 1."""
         if not frames:
             return torch.empty((0, *self.info.shape[1:]), dtype=torch.float32, device="cpu")
         stored = np.stack(list(frames.values()))
         return counts_to_frames(stored, self.full_scale, str(self.source), self.info.nodata).to(self.device)
 
-    def _followed(self, as_taken: WindowResult, usable: Mapping[int, NDArray[Any]]) -> WindowResult:
+    def _followed(self, as_taken: WindowResult, usable: Mapping[int, Array]) -> WindowResult:
         """The result of a window whose vibration is followed, from its usable frames and those around it."""
         window, kept = as_taken.window, list(as_taken.indices)
         if not kept:
@@ -255,7 +256,7 @@ class StackJob:
         """
         dtype = np.dtype(self.info.dtype)
 
-        def counts(images: Tensor) -> NDArray[Any]:
+        def counts(images: Tensor) -> Array:
             return scales.frames_to_counts(images, dtype, self.full_scale, self.info.nodata)
 
         if result.restored and not result.indices:
@@ -277,7 +278,7 @@ class StackJob:
                 frames.append(frame)
         return StoredWindow(frames, self.record(result, len(frames)))
 
-    def record(self, result: WindowResult, written: int) -> dict[str, Any]:
+    def record(self, result: WindowResult, written: int) -> Table:
         """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
@@ -298,7 +299,7 @@ class StackJob:
         )
 
 
-def stored_frame(read: Callable[[int], NDArray[Any]], index: int) -> NDArray[Any] | str:
+def stored_frame(read: Callable[[int], Array], index: int) -> Array | str:
     """A frame as stored, or why it cannot be read."""
     try:
         return read(index)
@@ -309,7 +310,7 @@ def stored_frame(read: Callable[[int], NDArray[Any]], index: int) -> NDArray[Any
 def read_windows(job: StackJob, windows: Iterable[Window]) -> Generator[tuple[Window, WindowFrames], None, None]:
     """Windows with the pixels of their frames, or why they cannot be read; frames that two share are read once."""
     with closing(job.open()) as reader:
-        last: dict[int, NDArray[Any] | str] = {}  # the last frames of the window before
+        last: dict[int, Array | str] = {}  # the last frames of the window before
         shared = 1 + (2 * MARGIN if job.follow else 0)
         for window in windows:
             frames = [last[index] if index in last else stored_frame(reader.frame, index) for index in window.frames]
@@ -326,7 +327,7 @@ def options_of_windows(restoration: OptionTable) -> list[str]:
     return [name for name in _TOGETHER if given.get(name) is True or given.get(name) not in (None, False, 1)]
 
 
-def single_frame_options(restoration: OptionTable) -> dict[str, Any]:
+def single_frame_options(restoration: OptionTable) -> Table:
     """Options of ``restore`` without those that frames which are restored one by one do not have."""
     for name in options_of_windows(restoration):
         raise ValueError(f"{name} is not available for frames that are followed one by one; use windows instead")
@@ -361,7 +362,7 @@ def plan_job(
         full_scale = scales.required_full_scale(stated, np.dtype(info.dtype), source)
     timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
-    timing.check_rows(info.shape[-1 if timing.scan_axis == -1 else -2])
+    timing.check_rows(info.shape[int(timing.scan_axis)])
     detection = dict(options.detection or {})
     VibrationOptions(**detection)  # raises an error for wrong ones
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
@@ -408,7 +409,7 @@ def plan_job(
 
 @checks_arguments
 def restore_block(
-    frames: NDArray[Any],
+    frames: Array,
     timing: SensorTiming,
     *,
     detection: Mapping[str, Any] | None = None,
@@ -417,7 +418,7 @@ def restore_block(
     channels: Channels = None,
     force: bool = False,
     device: str = "cpu",
-) -> NDArray[Any]:
+) -> Array:
     """Detect the vibration in a block of frames and restore them; the result has the shape and data type of the block.
 
     For ``dask.array.map_overlap`` with an overlap of one frame, and similar tools. The time origin is the first frame

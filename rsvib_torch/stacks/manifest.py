@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from rsvib_torch.checks.arguments import checks_arguments
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_info import split_range
 from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVibration
 from rsvib_torch.motion.timing import SensorTiming
@@ -43,16 +44,16 @@ def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[st
 class StackManifest(Result, file_format="rsvib stack"):
     """Content of ``manifest.json``."""
 
-    input: dict[str, Any]  # name, size and hash of the stack
-    settings: dict[str, Any]  # sensor and options
-    versions: dict[str, Any]  # of the packages that computed it
-    output: dict[str, Any] | None  # name of the output; None for detection only
+    input: Table  # name, size and hash of the stack
+    settings: Table  # sensor and options
+    versions: Table  # of the packages that computed it
+    output: Table | None  # name of the output; None for detection only
     bad_frames: dict[str, str]  # index of each frame that could not be used, with the reason
     windows: tuple[WindowRecord, ...]
     not_kept: tuple[str, ...] = ()  # metadata of the input that the output does not contain
     margins: dict[str, int] | None = None  # px that were cut off the sides of the frames of a video
     # of a video with the path of a gyroscope: its axes, clock and bias (rad/s), and the focal length (px)
-    gyroscope: dict[str, Any] | None = None
+    gyroscope: Table | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,9 +74,9 @@ class StackManifest(Result, file_format="rsvib stack"):
         lines = []
         for record, frame, found, middle in self._results():
             ends = (record.first, record.last) if frame is None else (frame, frame)
-            first: dict[str, Any] = {"window": record.window, "first_frame": ends[0], "last_frame": ends[1]}
+            first: Table = {"window": record.window, "first_frame": ends[0], "last_frame": ends[1]}
             first |= {"start_s": record.start_time, "middle_time_s": middle}
-            last: dict[str, Any] = {"frames": record.frames, "outcome": record.outcome}
+            last: Table = {"frames": record.frames, "outcome": record.outcome}
             last["bad_frames"] = len(record.bad_frames)
             last["note"] = record.error or "; ".join(map(str, record.left_alone))
             last |= {} if record.restored_frames is None else {"restored_frames": record.restored_frames}
@@ -87,7 +88,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         starts, half_frame = None, 0.0
         if self.settings.get("sensor") is not None:
             timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
-            half_frame = 0.5 * ((self.input["shape"][timing.scan_axis] - 1) * timing.row_time + timing.exposure_time)
+            half_frame = timing.time_to_middle(self.input["shape"][timing.scan_axis])
             starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
         for record in self.windows:
             found: list[tuple[int | None, DetectedVibration | None]] = [(None, record.detection)]
@@ -121,7 +122,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         """``rms_shaking`` of a video; None of a stack that was processed in windows."""
         return rms_shaking(record.shaking for record in self.windows) or None
 
-    def totals(self) -> dict[str, Any]:
+    def totals(self) -> Table:
         """Summary of the windows of a stack: numbers of windows, gain, tones of each axis, and axes left unchanged.
 
         Tones are medians over the reliable windows, with the standard deviation over the windows.
@@ -129,7 +130,7 @@ class StackManifest(Result, file_format="rsvib stack"):
         windows, found = self.windows, self.detections()
         gains = [record.predicted_gain for record in windows if record.predicted_gain is not None]
         names = AXIS_NAMES[: max((one.vibration.num_axes for one in found if one is not None), default=2)]
-        unchanged: dict[str, dict[str, Any]] = {name: {} for name in names}
+        unchanged: dict[str, Table] = {name: {} for name in names}
         for record in windows:
             for reason in record.left_alone:
                 if reason.axis in unchanged:
@@ -235,7 +236,7 @@ class StackManifest(Result, file_format="rsvib stack"):
 _SAME_TONE = 0.03  # of the frequency, or 4 std: a tone of the next window closer than this is the same one
 
 
-def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> dict[str, Any]:
+def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) -> Table:
     """Number of windows in which an axis is reliable, and median and spread of its tones over them, strongest first.
 
     The tones of a window continue those of nearly the same frequency in the windows before, the nearest ones first.
@@ -256,7 +257,7 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
             if i not in pairs:
                 tones.append([])
             tones[pairs.get(i, -1)].append((amplitude, frequency))
-    described: list[dict[str, Any]] = []
+    described: list[Table] = []
     for tone in tones:
         described.append({"windows": len(tone), "first": tone[0][0], "last": tone[-1][0]})
         for name, values in zip(("amplitude", "frequency"), zip(*tone, strict=True), strict=True):
@@ -264,7 +265,7 @@ def _tones_over_windows(found: Sequence[DetectedVibration | None], axis: int) ->
     return {"reliable_windows": len(reliable), "tones": sorted(described, key=lambda tone: -tone["amplitude"])}
 
 
-def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> dict[str, Any]:
+def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> Table:
     """Name, size and hash of a file, with ``NAME.json`` beside it, or of a folder.
 
     The hash covers the names and sizes of all files, and up to ``most`` evenly spaced blocks of up to ``most`` of them,
@@ -289,7 +290,7 @@ def fingerprint(path: Path, *, block: int = 1 << 16, most: int = 32) -> dict[str
     return {"name": name, "bytes": sum(sizes), "sha256_of_samples": digest.hexdigest()}
 
 
-def manifest_header(job: StackJob, output: str | None, compression: str | None) -> dict[str, Any]:
+def manifest_header(job: StackJob, output: str | None, compression: str | None) -> Table:
     """Everything on which the result depends, as JSON: a run is resumed only if it is unchanged."""
     given = None
     if job.given is not None or job.motion is not None:
@@ -312,7 +313,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
         "versions": {name: version(name) for name in ("rsvib_torch", "torch", "numpy")},
         "output": None if output is None else {"name": output, "compression": compression},
     }
-    copy: dict[str, Any] = json.loads(json.dumps(header))
+    copy: Table = json.loads(json.dumps(header))
     return copy
 
 
@@ -328,9 +329,7 @@ _UNITS = {
 }
 
 
-def manifest_text(
-    header: dict[str, Any], records: Iterable[dict[str, Any]], not_kept: Sequence[str] = (), **results: Any
-) -> str:
+def manifest_text(header: Table, records: Iterable[Table], not_kept: Sequence[str] = (), **results: Any) -> str:
     """A manifest as JSON, from the content of its ``WindowRecord``s."""
     windows = list(records)
     bad = {index: reason for record in windows for index, reason in record["bad_frames"].items()}

@@ -4,18 +4,18 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike
 from rsvib_torch.io.stack_writing import check_info_target, metadata_not_kept, stack_files, write_frames
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
@@ -146,7 +146,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             first = result
         return job.stored(result, pixels)
 
-    def compute(folder: RunFolder) -> dict[str, Any]:
+    def compute(folder: RunFolder) -> Table:
         remaining = [window for window in windows if window.index not in folder]
         frames = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
@@ -162,7 +162,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
         return {"not_kept": metadata_not_kept(job.info, sink, (folder.written, *out.shape[1:]))}
 
-    def stored(folder: RunFolder) -> Iterator[NDArray[Any]]:
+    def stored(folder: RunFolder) -> Iterator[Array]:
         for name in folder.files():
             with folder.open(name) as file:
                 yield from np.load(file, allow_pickle=False)

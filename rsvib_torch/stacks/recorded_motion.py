@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
 from rsvib_torch.gyroscope.clock_range import offset_range, outside
 from rsvib_torch.gyroscope.corner_tracks import corner_tracks
@@ -83,7 +83,7 @@ def align_stack(
         size = info.shape[-2:] if timing.scan_axis == -2 else info.shape[:-3:-1]
         of_pairs = torch.stack([starts[index], starts[index + 1]], -1)
         fit_focal_length = camera is None or fit_gain
-        more: dict[str, Any] = {"offsets": offsets, "fit_focal_length": fit_focal_length, "fit_row_time": fit_row_time}
+        more: Table = {"offsets": offsets, "fit_focal_length": fit_focal_length, "fit_row_time": fit_row_time}
         return align_rates(tracks, of_pairs, size, timing, recorded, camera, **more)
     runs = compared_runs(info.shape[0])
     if len(runs) == 1:
@@ -131,7 +131,7 @@ def _aligned_runs(
     # 1. The run in the middle, at all offsets; then the others, near its clock.
     starts = timing.frame_starts(info.shape[0])
     readout = info.shape[int(timing.scan_axis)] * timing.row_time + timing.exposure_time
-    limits = offset_range(recorded, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
+    limits = offset_range(recorded.start, recorded.end, 0.0, float(starts[-1] - starts[0]) + readout, offsets)
     order = [runs[len(runs) // 2], *runs[: len(runs) // 2], *runs[len(runs) // 2 + 1 :]]
     found: list[ClockAlignment] = []
     middles: list[float] = []

@@ -27,14 +27,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.arguments import check_fields
 from rsvib_torch.files import atomic
 from rsvib_torch.files.atomic import nearest_folder, sync
 from rsvib_torch.files.free_memory import size_text
 from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_writing import stack_files
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RunOptions
 from rsvib_torch.results.presentation import Summarised
 from rsvib_torch.stacks.job import WindowResult
@@ -147,7 +148,7 @@ class RunFolder:
                 raise self._refusal("it has another name than files of a run", name)
         return names
 
-    def _read_journal(self, header: dict[str, Any], names: Iterable[str], *, resume: bool) -> None:
+    def _read_journal(self, header: Table, names: Iterable[str], *, resume: bool) -> None:
         """Find the windows whose files are as they were written; a journal without windows begins anew."""
         start_over = f"delete {self.path} to start over"
         stored, end = None, 0
@@ -186,10 +187,10 @@ class RunFolder:
             if not whole:
                 del self._windows[window]
 
-    def _entry(self, window: int) -> dict[str, Any]:
+    def _entry(self, window: int) -> Table:
         """The line of a window, which is not kept in memory."""
         place, size, _ = self._windows[window]
-        entry: dict[str, Any] = json.loads(os.pread(self._journal, size, place).partition(b" ")[2])
+        entry: Table = json.loads(os.pread(self._journal, size, place).partition(b" ")[2])
         return entry
 
     def _append(self, entry: Mapping[str, Any]) -> tuple[int, int]:
@@ -219,7 +220,7 @@ class RunFolder:
         """A file of the folder for reading."""
         return os.fdopen(os.open(name, os.O_RDONLY | _SAFELY, dir_fd=self._folder), "rb")
 
-    def add(self, record: Mapping[str, Any], names: Sequence[str] = (), array: NDArray[Any] | None = None) -> None:
+    def add(self, record: Mapping[str, Any], names: Sequence[str] = (), array: Array | None = None) -> None:
         """Enter the ``WindowRecord`` of a window with its closed files, and an array, which becomes the last of them.
 
         It is on the disk when the function returns.
@@ -248,7 +249,7 @@ class RunFolder:
         """Number of their frames."""
         return sum(frames for *_, frames in self._windows.values())
 
-    def records(self) -> Iterator[dict[str, Any]]:
+    def records(self) -> Iterator[Table]:
         """Records of the finished windows in order."""
         return (self._entry(window)["record"] for window in sorted(self._windows))
 
@@ -355,11 +356,11 @@ class StackReport(Summarised):
 def run_to_file(
     sink: Path,
     options: RunOptions,
-    header: dict[str, Any],
+    header: Table,
     *,
     inputs: Iterable[Path],
     windows: int,
-    compute: Callable[[RunFolder], dict[str, Any]],
+    compute: Callable[[RunFolder], Table],
     write: Callable[[RunFolder], None],
 ) -> StackReport:
     """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.values import MAX_NUMBER
@@ -20,6 +19,7 @@ from rsvib_torch.motion.detected_vibration import DetectedVibration, FollowedVib
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RestorationOptions
 from rsvib_torch.restoration import RestorationVerdict, TooLittleInCommonError
 from rsvib_torch.restoration.restore import check_optics, restore_each, restore_prepared, unchanged_frames
@@ -64,8 +64,7 @@ def restore_trusted(
     at most ``most_pairs`` are compared. They are returned as taken if nothing moves, or, without ``force``, if
     restoration makes them worse.
     """
-    rows = frames.shape[-1 if timing.scan_axis == -1 else -2]
-    vibration, left_alone = vibration_to_undo(motion, timing, len(frames), rows)
+    vibration, left_alone = vibration_to_undo(motion, timing, len(frames), frames.shape[int(timing.scan_axis)])
     frames = frames if first_frames is None else frames[:first_frames]
     chosen = RestorationOptions(**options)
     joint, scale, optics = chosen.joint, chosen.scale, check_optics(chosen.optics)
@@ -95,7 +94,7 @@ def pair_verdict(
         frames = frames[..., detailed_parts(frames[None, None], _JUDGED_COLUMNS)[0]]
     if not bool((motion.amplitude > 0).any()):
         return None
-    start = -0.5 * ((frames.shape[-1 if timing.scan_axis == -1 else -2] - 1) * timing.row_time + timing.exposure_time)
+    start = -timing.time_to_middle(frames.shape[int(timing.scan_axis)])
     prepared = prepare_frames(frames, replace(timing, frame_start_times=(start, start + interval)), channels="first")
     with suppress(TooLittleInCommonError), torch.no_grad():
         return judge_prepared(prepared, restore_prepared(prepared, motion, options), motion, most_pairs=1)
@@ -111,7 +110,7 @@ def without_data(frames: Tensor, taken: Tensor) -> Tensor:
     return frames.masked_fill(missing if len(frames) == len(taken) else missing.all(0), torch.nan)
 
 
-def frame_fault(frame: NDArray[Any] | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
+def frame_fault(frame: Array | str, index: int, full_scale: float | None, nodata: float | None) -> str | None:
     """Why a frame as stored, or the error of reading it, cannot be used; None if it can be."""
     if isinstance(frame, str):
         return frame

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 
 from rsvib_torch.checks.values import check_whole_number
+from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict
@@ -103,12 +104,12 @@ class WindowRecord:
 
 def window_record(
     verdict: RestorationVerdict | None, bad_frames: Mapping[int, str], *, restored: bool, **known: Any
-) -> dict[str, Any]:
+) -> Table:
     """Content of a ``WindowRecord`` as JSON, from a verdict and the other fields."""
     record = {**known, "frames": "restored" if restored else "as taken", "bad_frames": bad_frames}
     record |= {"outcome": None, "summary": None, "predicted_gain": None}
     if verdict is not None:
         gain = verdict.predicted_gain.nanmean()
         record |= {"outcome": verdict.overall, "summary": verdict.sentence, "predicted_gain": gain}
-    plain: dict[str, Any] = plain_values(record)
+    plain: Table = plain_values(record)
     return plain

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.tones.fit import displacement_std, residual_of
+from rsvib_torch.detection.verdict import Findings
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.execution.progress import steps
@@ -32,7 +33,7 @@ from rsvib_torch.options import FollowOptions, RegistrationOptions
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, tones_of_rows
-from rsvib_torch.tracking.tracked_frame import TrackedTones, time_to_middle, vibration_at_frame
+from rsvib_torch.tracking.tracked_frame import TrackedTones, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
 _BANDS = RegistrationOptions()
@@ -74,22 +75,18 @@ class _Follower(VibrationTracker):
 
 
 @dataclass(frozen=True, eq=False)
-class _AxisAtFrame:
-    """An axis at a frame by one tracker, in row order, with the time origin of the stack."""
+class _AtFrame:
+    """Both axes at a frame by one tracker, in row order, with the time origin of the stack."""
 
-    vibration: dict[str, Tensor]  # values of ``Vibration`` (K,) and ()
-    std: dict[str, Tensor]  # values of ``VibrationStd``
-    residual: float  # px
-    against: tuple[Reason, ...]
-    moved: Array  # (N,) px, displacement of rows by the tones, without their mean
-
-    @property
-    def displacement_std(self) -> float:
-        """px, of the displacement of the rows."""
-        return float(self.std["displacement"])
+    vibration: Vibration  # (2, K)
+    std: VibrationStd  # (2, K)
+    known_std: Array  # (2,) px, of the displacement of the rows
+    residual: Array  # (2,) px
+    findings: Findings  # reasons against each axis
+    moved: Array  # (N, 2) px, displacement of rows by the tones, without their mean
 
 
-_Judged = tuple[_AxisAtFrame | None, tuple[Reason, ...]]
+_Judged = tuple[_AtFrame | None, tuple[Reason, ...]]  # what an axis is known from, and the reasons against it
 
 
 @frames_options(FollowOptions)
@@ -158,10 +155,7 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
             for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
         ]
         judged = [
-            [
-                _judged([one[axis] for one in both if one is not None], AXIS_NAMES[axis], others[axis])
-                for axis in range(2)
-            ]
+            [_judged([one for one in both if one is not None], axis, others[axis]) for axis in range(2)]
             for both in at_frames
         ]
         findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
@@ -208,7 +202,7 @@ def _tracked(
 
 def _at_frame(
     tones: TrackedTones | None, start: float, origin: float, rows: RowTiming, height: int, direction: int
-) -> list[_AxisAtFrame] | None:
+) -> _AtFrame | None:
     """Both axes at a frame that starts at ``start`` in s, from tones with the time origin ``origin``.
 
     ``direction`` is -1 for tones backwards in time: sin(-2 pi f t + phi) = sin(2 pi f t + pi - phi).
@@ -226,36 +220,30 @@ def _at_frame(
             image_acceleration=signs * vibration.image_acceleration,
         )
     vibration = vibration.timed_from(-origin)
-    std = replace(std, phase=torch.hypot(std.phase, 2 * math.pi * origin * std.frequency))
     exposures = table(rows.row_starts(1, height)[0, ::8])
     known = displacement_std(tones.fit, exposures, rows.exposure_time)[0]
+    phase_std = torch.hypot(std.phase, 2 * math.pi * origin * std.frequency)
+    std = replace(std, phase=phase_std, displacement=tensor(known))
     residual = np.nanmean(np.abs(residual_of(tones.measurements, tones.fit)[0]), (0, 1))
-    middles = start + tensor(exposures) + 0.5 * rows.exposure_time
-    axes = []
-    for axis in range(2):
-        one = {name: getattr(vibration, name)[axis] for name in (*_TONE, *_DRIFT)}
-        stds = {name: getattr(std, name)[axis] for name in (*_TONE, *_DRIFT, "period")}
-        stds["displacement"] = tensor(known)[axis]
-        waves = torch.sin(2 * math.pi * one["frequency"] * middles[:, None] + one["phase"])
-        moved = table((waves * one["amplitude"] * torch.sinc(one["frequency"] * rows.exposure_time)).sum(-1))
-        against = tones.findings[axis]
-        axes.append(_AxisAtFrame(one, stds, float(residual[axis]), against, moved - moved.mean()))
-    return axes
+    without_drift = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
+    moved = table(without_drift.mean_displacement(start + tensor(exposures), rows.exposure_time))
+    return _AtFrame(vibration, std, known, residual, tones.findings, moved - moved.mean(0))
 
 
-def _judged(known: Sequence[_AxisAtFrame], name: str, other: float | None) -> _Judged:
+def _judged(known: Sequence[_AtFrame], axis: int, other: float | None) -> _Judged:
     """An axis at a frame by the tracker that knows its displacement better, and the reasons against it."""
+    name = AXIS_NAMES[axis]
     if not known:
         return None, (Reason("not_followed", name),)
-    trusted = [one for one in known if not one.against]
-    best = min(trusted or known, key=lambda one: one.displacement_std)
-    if best.against:
-        return best, best.against
+    trusted = [one for one in known if not one.findings[axis]]
+    best = min(trusted or known, key=lambda one: float(one.known_std[axis]))
+    if best.findings[axis]:
+        return best, best.findings[axis]
     if len(known) > 1:
-        first, second = (one.moved for one in known)
+        first, second = (one.moved[:, axis] for one in known)
         least, share, deviations = _MAX_APART
-        std = math.hypot(*(one.displacement_std for one in known))
-        allowed = max(least, share * float(np.sqrt(np.square(best.moved).mean())), deviations * std)
+        std = math.hypot(*(one.known_std[axis] for one in known))
+        allowed = max(least, share * float(np.sqrt(np.square(best.moved[:, axis]).mean())), deviations * std)
         apart = float(np.sqrt(np.square(second - first).mean()))
         if not apart < allowed:
             return best, (Reason("directions_differ", name, apart, allowed),)
@@ -273,7 +261,7 @@ def _with_reasons_of_axes(findings: Sequence[Sequence[tuple[Reason, ...]]]) -> l
 
 
 def _assembled(
-    found: Sequence[Sequence[_AxisAtFrame | None]],
+    found: Sequence[Sequence[_AtFrame | None]],
     findings: Sequence[Sequence[tuple[Reason, ...]]],
     starts: Array,
     stack: GreyFrames,
@@ -281,14 +269,14 @@ def _assembled(
     """The result in image axes, from each frame and axis that is known."""
     timing = stack.timing
     known = [(index, axis, one) for index, pair in enumerate(found) for axis, one in enumerate(pair) if one is not None]
-    count = max([1, *(len(one.vibration["amplitude"]) for _, _, one in known)])
+    count = max([1, *(one.vibration.amplitude.shape[-1] for _, _, one in known)])
 
     def of_axes(part: str, name: str, unknown: float) -> Tensor:
         """(T, 2, K) values of tones, padded with zeros, or (T, 2) others."""
         shape = (count,) if name in (*_TONE, "period") else ()
         values = torch.full((len(found), 2, *shape), unknown, dtype=torch.float64, device="cpu")
         for index, axis, one in known:
-            given = getattr(one, part)[name]
+            given = getattr(getattr(one, part), name)[axis]
             values[index, axis] = functional.pad(given, (0, count - len(given))) if shape else given
         return values
 
@@ -300,7 +288,7 @@ def _assembled(
     reliable = torch.tensor([[not of_axis for of_axis in of_frame] for of_frame in findings], device="cpu")
     residual = torch.full((len(found), 2), math.nan, dtype=torch.float64, device="cpu")
     for index, axis, one in known:
-        residual[index, axis] = one.residual
+        residual[index, axis] = float(one.residual[axis])
     return FollowedVibration(
         vibration=vibration,
         std=std.from_row_order(timing),
@@ -309,5 +297,5 @@ def _assembled(
         reliable=magnitudes_from_row_order(reliable, timing),
         findings=tuple(findings_from_row_order(of_frame, timing) for of_frame in findings),
         assumptions=((),) * len(found),
-        times=tensor(starts + time_to_middle(stack.images.shape[-2], timing.in_row_order())),
+        times=tensor(starts + timing.time_to_middle(stack.images.shape[-2])),
     ).to(stack.images.device)

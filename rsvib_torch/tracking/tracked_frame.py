@@ -27,11 +27,6 @@ from rsvib_torch.restoration.restore import restore_prepared, unchanged_frames
 TrackingState = Literal["searching", "tracking", "unusable"]
 
 
-def time_to_middle(height: int, timing: RowTiming) -> float:
-    """Time in s from the exposure start of a frame of ``height`` rows to its middle."""
-    return 0.5 * ((height - 1) * timing.row_time + timing.exposure_time)
-
-
 def vibration_at_frame(fit: ToneFit, timing: RowTiming, height: int) -> tuple[Vibration, VibrationStd]:
     """The tones at a frame with standard deviations that contain the effect of the row time.
 
@@ -154,6 +149,6 @@ class TrackedFrame:
     @property
     def _timed_from_middle(self) -> PreparedFrames:
         """The frame with the time origin of ``motion``."""
-        start = -time_to_middle(self.frame.images.shape[-2], self.frame.timing)
-        timing = replace(self.frame.image_timing, frame_start_times=(start,))
+        half = self.frame.timing.time_to_middle(self.frame.images.shape[-2])
+        timing = replace(self.frame.image_timing, frame_start_times=(-half,))
         return replace(self.frame, timing=timing.in_row_order(), image_timing=timing)

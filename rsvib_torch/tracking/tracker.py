@@ -61,7 +61,7 @@ from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.tracking.tone_filter import ToneFilter
-from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, time_to_middle
+from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState
 
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
@@ -321,7 +321,7 @@ class VibrationTracker:
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
-        fit = corrected.predicted(frame.time + time_to_middle(height, self._rows), mixed=False).as_fit(frame.time)
+        fit = corrected.predicted(frame.time + self._rows.time_to_middle(height), mixed=False).as_fit(frame.time)
         if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
             return state.without_track("the rows are far from where the motion places them")
         aliasing = table(scene.gradients.aliasing)
@@ -368,7 +368,7 @@ class VibrationTracker:
         track, frame = state.track, state.frames[-1]
         if track is None or track.tones is None or state.contradictions:
             return None
-        middle = frame.time + time_to_middle(frame.images.shape[-2], self._rows)
+        middle = frame.time + self._rows.time_to_middle(frame.images.shape[-2])
         predicted = track.filter.predicted(middle, mixed=False)
         path_std = track.filter.path_std(middle - track.filter.time)
         if not max(predicted.displacement_std(), path_std) < _MAX_UNMEASURED_STD:
@@ -507,7 +507,7 @@ class VibrationTracker:
             if track.start == state.time:  # the frame was measured
                 measurements = tones.measurements
             # The time origin of the tones is the first row, that of the motion the middle of the frame.
-            half = time_to_middle(prepared.images.shape[-2], self._rows)
+            half = self._rows.time_to_middle(prepared.images.shape[-2])
             motion = motion_of_fit(replace(tones.fit, centre=tones.fit.centre - half), device)[0]
             # An axis moves if its tones were reliable in one of the last frames.
             trusted = tensor(np.any(track.trusted, 0)).to(device)
@@ -554,7 +554,5 @@ def _end_of_line(places: tuple[tuple[float, Tensor], ...]) -> Tensor:
     last, path = places[-1]
     if len(places) < 3:
         return path
-    times = torch.tensor([time for time, _ in places], dtype=torch.float64, device=path.device)
-    columns = torch.stack([torch.ones_like(times), times - last], -1)
-    place: Tensor = torch.linalg.lstsq(columns, torch.stack([path for _, path in places])).solution[0]
-    return place
+    times = np.array([time for time, _ in places]) - last
+    return path.new_tensor(np.polyfit(times, table(torch.stack([path for _, path in places])), 1)[1])

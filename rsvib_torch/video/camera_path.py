@@ -465,7 +465,7 @@ def camera_path(
 
     A ``ValueError`` is raised if no window of frames has corners in a quarter of its pairs.
     """
-    readout = timing.row_time * size[0 if timing.scan_axis == -2 else 1]
+    readout = timing.row_time * size[int(timing.scan_axis)]
     averaged = timing.exposure_time, _PATCH_ROWS * reduction(*size) * timing.row_time
     allowed, windows = _UNEXPLAINED * reduction(*size), list[WindowPath]()
     waiting: list[Corners | None] = []

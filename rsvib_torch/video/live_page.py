@@ -5,6 +5,7 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,8 +70,6 @@ class PageOutput:
         """Show a frame; it is encoded if a browser shows the page."""
         if self._viewers == 0:
             return
-        import cv2  # noqa: PLC0415
-
         colours = frame if frame.ndim == 2 else np.ascontiguousarray(frame[..., ::-1])
         data = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
         with self._changed:

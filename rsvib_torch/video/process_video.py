@@ -5,15 +5,15 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from itertools import chain, count, groupby, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.validation import fields_of
 from rsvib_torch.execution.prefetch import in_threads
 from rsvib_torch.files.atomic import whole_file
+from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options
 from rsvib_torch.gyroscope.gpmf_track import read_camera_track
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -38,7 +38,7 @@ from rsvib_torch.stacks.run_folder import (
     run_to_file,
 )
 from rsvib_torch.video import Margins
-from rsvib_torch.video.video_frames import FrameTrack, RestoredFrame, VideoFrames
+from rsvib_torch.video.video_frames import Frame, FrameTrack, RestoredFrame, VideoFrames
 from rsvib_torch.video.video_passes import CHECKED_FRAMES, PART_FRAMES, VideoMotion, VideoPasses
 
 # A video that shakes more is refused: wrong settings make it 1.5 to 5 times as shaky. 0.1 px is not visible. Rows are
@@ -50,7 +50,6 @@ _JUDGED_FRAMES = 4  # of each part, two neighbouring ones of which are judged
 # What the manifest states of the alignment of a gyroscope.
 _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_length", "focal_length_std")
 
-Frame = NDArray[Any]
 Planes = list[Frame]
 _Restored = tuple[FrameTrack, RestoredFrame]
 
@@ -139,7 +138,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         },
     }
 
-    def compute(folder: RunFolder) -> dict[str, Any]:
+    def compute(folder: RunFolder) -> Table:
         nonlocal content
         done = count(1)  # both passes through the video count as half of it each
 

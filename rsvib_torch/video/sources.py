@@ -14,14 +14,15 @@ from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Protocol, get_args
+from typing import BinaryIO, Literal, Protocol, get_args
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import check_choice, check_whole_number
 from rsvib_torch.io import open_stack, read_stack_info, timing_from_first_frame
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.numerics.tables import Array
 
 PixelFormat = Literal["gray8", "gray16le", "rgb24", "bgr24"]
 _CHECK = 0.05  # s between checks whether the source has ended, or the session
@@ -32,7 +33,7 @@ _LONGEST_READ = 2.0  # s that the end of a session waits for a frame of the sour
 class TimedFrame:
     """A frame of a source."""
 
-    pixels: NDArray[Any]  # (H, W) or (3, H, W) counts, or floats whose full scale is 1
+    pixels: Array  # (H, W) or (3, H, W) counts, or floats whose full scale is 1
     time: float  # s from the first frame
     arrived: float  # s of ``time.perf_counter``, when it was read
 
@@ -92,8 +93,6 @@ class CameraSource:
 
     def frames(self) -> Iterator[TimedFrame]:
         """The frames; times are whole frame periods apart."""
-        import cv2  # noqa: PLC0415
-
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # only the error below is shown
         try:
@@ -171,7 +170,7 @@ class FileSource:
                 yield TimedFrame(pixels, start - self._starts[0], time.perf_counter())
 
 
-def _channels_first(pixels: NDArray[Any]) -> NDArray[Any]:
+def _channels_first(pixels: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
 
 

@@ -1,18 +1,18 @@
 """Pixels of restored video frames that the sensor did not record: a border that moves from frame to frame."""
 
 from dataclasses import astuple, dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.checks.arguments import checked_methods, checks_arguments
 from rsvib_torch.checks.values import check_whole_number, described
+from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import BorderName
 from rsvib_torch.tracking.tracked_frame import TrackedFrame
 
-Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
+Pixels = TypeVar("Pixels", Tensor, Array)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ _LOBES = 4  # of the kernel of Lanczos on each side
 # of pixels, or of Y and chroma: Y has 44.8 dB with Lanczos and 44.5 dB with the cubic kernel, chroma 46.9 and 47.0 dB
 _KERNELS = cv2.INTER_LANCZOS4, cv2.INTER_CUBIC
 
-Frame = NDArray[Any]
+Frame = Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class VideoFrames:
 
     def grey(self, frame: Frame) -> NDArray[np.uint8]:
         """The frame as 8-bit counts (H, W), in which corners are followed."""
-        luma: NDArray[Any] = self.luma(frame)
+        luma: Array = self.luma(frame)
         luma = luma if luma.ndim == 2 else luma.mean(0)
         if luma.dtype == np.uint8:
             return luma.astype(np.uint8, copy=False)
@@ -161,8 +161,7 @@ class VideoFrames:
         timing = self.job.timing
         if exposure is not None:
             timing = replace(timing, exposure_rows=min(exposure / timing.row_time, timing.frame_rows))
-        rows = self.size[0 if timing.scan_axis == -2 else 1]
-        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        half = timing.time_to_middle(self.size[int(timing.scan_axis)])
         if plane == 0:
             return replace(timing, frame_start_times=(-half,))
         return replace(

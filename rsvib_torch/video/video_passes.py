@@ -5,7 +5,6 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.execution.prefetch import prefetched
+from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
@@ -38,7 +38,7 @@ from rsvib_torch.video import Margins
 from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
-from rsvib_torch.video.video_frames import FrameTrack, VideoFrames
+from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
 
 PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an interrupted run repeats at most one part
 CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
@@ -46,8 +46,6 @@ _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
 _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
-
-Frame = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +92,7 @@ class VideoPasses:
     def motion(self, progress: Callable[[], None]) -> VideoMotion:
         """The motion of all frames, from corners that are followed from each usable frame to the next one."""
         timing = self.frames.job.timing
-        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
-        half = 0.5 * ((rows - 1) * timing.row_time + timing.exposure_time)
+        half = timing.time_to_middle(self.frames.size[int(timing.scan_axis)])
         times = np.array(self.starts) + half
         faults: dict[int, str] = {}
         shakes: dict[int, tuple[Array, float]] = {}
@@ -186,7 +183,7 @@ class VideoPasses:
         seconds = 0.5 * self.frames.job.timing.row_time * max(height, width)
         reach = np.abs(polynomial) * np.array([[seconds], [seconds**2], [1.0]])
         axes = 4 if reach[:, 2:].sum() * 0.5 * math.hypot(height, width) > _SMALLEST else 2
-        amplitude, frequency, phase = tone_tables(tones, axes)
+        amplitude, frequency, phase, *_ = tone_tables(tones, axes)
         return Vibration(amplitude, frequency, phase, *(values[:axes] for values in polynomial))
 
     def track(self, motion: VideoMotion, index: int) -> FrameTrack:
@@ -267,7 +264,7 @@ class VideoPasses:
         motion: VideoMotion,
         verdict: RestorationVerdict | None,
         first_frames: list[Frame],
-    ) -> dict[str, Any]:
+    ) -> Table:
         """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
         path = motion.path
         detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
@@ -296,14 +293,8 @@ class VideoPasses:
         middle = float(times[tracks[len(tracks) // 2].index])
         window = path.nearest(middle)
         tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
-        amplitude, frequency, phase = tone_tables(tones, 2)
-        size, rate = (np.full_like(amplitude, math.inf) for _ in range(2))
-        for axis in (0, 1):
-            of_axis = sorted((tone for tone in tones if tone.axis == axis), key=lambda tone: -abs(tone.coefficient))
-            size[axis, : len(of_axis)] = [
-                math.hypot(tone.amplitude_std, _GAIN_ERROR * abs(tone.coefficient)) for tone in of_axis
-            ]
-            rate[axis, : len(of_axis)] = [tone.frequency_std for tone in of_axis]
+        amplitude, frequency, phase, size, rate = tone_tables(tones, 2)
+        size = np.hypot(size, _GAIN_ERROR * amplitude)
         with np.errstate(divide="ignore", invalid="ignore"):
             phase_std = np.where(amplitude > 0, size / amplitude, math.inf)
             period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
@@ -327,7 +318,7 @@ class VideoPasses:
             centre=np.zeros(1),
             model=MotionModel(),
         )
-        rows = self.frames.size[0 if timing.scan_axis == -2 else 1]
+        rows = self.frames.size[int(timing.scan_axis)]
         sensitivity = timing_sensitivity(fit, timing.in_row_order(), len(tracks), rows)[0]
         return DetectedVibration(
             vibration=vibration,
@@ -355,13 +346,18 @@ class VideoPasses:
         return ()
 
 
-def tone_tables(tones: list[Tone], axes: int) -> tuple[Array, Array, Array]:
-    """Amplitude (px), frequency (Hz) and phase (rad) of ``Vibration``, (axes, K), of tones, the largest first."""
+def tone_tables(tones: list[Tone], axes: int) -> Array:
+    """Amplitude (px), frequency (Hz) and phase (rad) of ``Vibration``, of tones, the largest first: (5, axes, K).
+
+    The last two are the standard deviations of amplitude and frequency, which are infinite where there is no tone.
+    """
     of_axes = [[tone for tone in tones if tone.axis == axis] for axis in range(axes)]
-    amplitude, frequency, phase = np.zeros((3, axes, max(1, *map(len, of_axes))))
+    values = np.zeros((5, axes, max(1, *map(len, of_axes))))
+    values[3:] = math.inf
     for axis, of_axis in enumerate(of_axes):
         for number, tone in enumerate(sorted(of_axis, key=lambda tone: -abs(tone.coefficient))):
-            amplitude[axis, number], frequency[axis, number] = abs(tone.coefficient), tone.frequency
             # Re c exp(i a) = |c| sin(a + arg c + pi/2)
-            phase[axis, number] = np.angle(tone.coefficient) + 0.5 * math.pi
-    return amplitude, frequency, phase
+            phase = np.angle(tone.coefficient) + 0.5 * math.pi
+            size = abs(tone.coefficient), tone.frequency, phase, tone.amplitude_std, tone.frequency_std
+            values[:, axis, number] = size
+    return values

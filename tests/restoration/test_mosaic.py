@@ -27,7 +27,7 @@ from rsvib_torch.frames.mosaic import colour_frames, is_mosaic
 from rsvib_torch.restoration.exact.mosaic_scene import MosaicSolver
 from rsvib_torch.restoration.exact.scene_solver import Partition
 from rsvib_torch.restoration.frame_motion import frame_motion
-from rsvib_torch.restoration.scene_model.finer_grid import FinerObservation, PolynomialPrior, finer_kernels
+from rsvib_torch.restoration.scene_model.finer_grid import FinerObservation, PolynomialPrior
 
 SIZE, MARGIN, NOISE = 72, 24, 0.003
 
@@ -173,7 +173,7 @@ def test_gradient_of_the_least_squares_solution():
     generator = torch.Generator().manual_seed(1)
     motion = frame_motion(VIBRATION.expanded(1), TIMING.in_row_order(), 2, 24)
     displacement, node_weights = motion.exposures
-    kernels = finer_kernels(displacement[0], node_weights, torch.ones(2), 24)
+    kernels = FinerObservation.kernels_of_rows(displacement[0], node_weights, torch.ones(2), 24)
     observation = FinerObservation(kernels, 24, 32, torch.float64)
     prior = PolynomialPrior(torch.ones(7, 7, dtype=torch.float64), 32)
     precisions = [

@@ -137,8 +137,9 @@ def test_smooth_motion_continues_over_the_blanking_time(highest, known):
     found = row_time_of_splines(FramePlaces(measured, rows, frames, period), 256, 60e-6, period / 256, (1.0, -1.0))
     assert (found is not None) == known
     if found is not None:
-        assert not found.others
-        assert abs(found.row_time - row_time) < 4 * found.std < 0.02 * row_time
+        fit, _ = found
+        assert not fit.others
+        assert abs(fit.row_time - row_time) < 4 * fit.std < 0.02 * row_time
 
 
 @pytest.mark.parametrize(

@@ -76,8 +76,7 @@ class Knots:
         position = (self.stretch * torch.asinh(distance / self.stretch) - self.place[0]) / self.step
         cell = position.floor()
         index = cell.long()[:, None] + torch.arange(-1, 3, device=distance.device)
-        value, quadratic = (bspline_weights(position - cell, degree) for degree in (3, 2))
-        slope = torch.nn.functional.pad(quadratic, (1, 0)) - torch.nn.functional.pad(quadratic, (0, 1))
+        value, slope = (bspline_weights(position - cell, 3, derivative) for derivative in (0, 1))
         density = torch.rsqrt(1 + (distance / self.stretch).square()) / self.step
         inside = (index >= 0) & (index < len(self.place))
         return index.clamp(0, len(self.place) - 1), value * inside, slope * inside * density[:, None]

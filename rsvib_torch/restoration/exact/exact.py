@@ -7,7 +7,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -38,7 +38,7 @@ from rsvib_torch.restoration.scene_model.finer_grid import GRIDS, PolynomialPrio
 from rsvib_torch.restoration.scene_model.observation import SCENE_REACH, TAPS, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior, brightness, fit_prior
 
-_MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
+MIN_LEVEL = 1e-5  # of full scale, lowest noise level assumed; below, the systems lose digits in single precision
 _FRAME_BYTES = 2**26  # frames of scenes that are treated at a time on a CPU, beside the systems
 
 
@@ -90,11 +90,6 @@ def restore_exact(
     return restored
 
 
-def given_level(noise: float) -> float:
-    """A stated noise level, at least the lowest that single precision supports."""
-    return max(noise, _MIN_LEVEL)
-
-
 def scene_period(motion: FrameMotion, width: int) -> int:
     """Period in px of the scenes of all stacks with frames of ``width`` px."""
     # the boundary extension of blurred rows is filled; that of others is longer
@@ -134,7 +129,6 @@ class FrameModel:
     unknown: Tensor | None  # (B, T, C, H, W) bool, pixels without data and saturated ones; None for none
     clipped: Tensor | None  # (B, T, C, H, W) bool, the saturated ones
     strips: int  # number of neighbouring stacks that are strips of columns of the same frames
-    _known: dict[tuple[bytes, ...], RowKernels] = field(default_factory=dict)  # kernels of the last scenes
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
@@ -171,24 +165,13 @@ class FrameModel:
         return moved - self._shift[scenes.stack, scenes.reference][:, None]
 
     def _row_kernels(self, scenes: Scenes) -> RowKernels:
-        """Kernels of the frames of scenes, in the coordinates of their reference; those of the last call are kept."""
-        key = tuple(values.tobytes() for values in (scenes.stack, scenes.members, scenes.reference))
-        known = self._known.get(key)
-        if known is None:
-            index = self._indices(scenes)
-            displacement, node_weights = self.motion.exposures
-            shift = torch.as_tensor(self._shift[scenes.stack, scenes.reference], device=displacement.device)
-            moved = (displacement[index] - shift.view(-1, 1, 1, 1, 2)).flatten(0, 1)
-            make, height = GRIDS[self.scale][0], self.frames.shape[-2]
-            known = make(moved, node_weights, self.weights[index].flatten(), height)
-            self._known.clear()
-            self._known[key] = known
-        return known
-
-    def _weighted(self, kernels: RowKernels, contributes: NDArray[np.bool_]) -> RowKernels:
-        """Kernels of scenes, of weight 0 where frames do not contribute."""
-        used = torch.as_tensor(contributes.reshape(-1, 1), device=self.frames.device)
-        return replace(kernels, weight=kernels.weight * used)
+        """Kernels of the frames of scenes, in the coordinates of their reference; 0 where frames do not contribute."""
+        index = self._indices(scenes)
+        displacement, node_weights = self.motion.exposures
+        shift = torch.as_tensor(self._shift[scenes.stack, scenes.reference], device=displacement.device)
+        moved = (displacement[index] - shift.view(-1, 1, 1, 1, 2)).flatten(0, 1)
+        weights = self.weights[index] * torch.as_tensor(scenes.contributes, device=displacement.device)
+        return GRIDS[self.scale].kernels_of_rows(moved, node_weights, weights.flatten(), self.frames.shape[-2])
 
     def places(self, scenes: Scenes) -> list[Tensor]:
         """Mean displacement (M, R, 2) of the rows of the frames of each scene."""
@@ -220,19 +203,13 @@ class FrameModel:
             representative.append(found)
         # cross-validation of as many scenes at a time as the memory allows
         scene_bytes = 4 * self.frames[0, 0].numel() * scenes.members.shape[1]
-        strengths, together = np.ones(len(scenes.stack)), len(_blocks(self, scenes)) == 1
+        strengths = np.ones(len(scenes.stack))
         for part in runs(len(chosen), at_once(scene_bytes, self.frames.device, cpu_bytes=_FRAME_BYTES)):
-            some = take_stacks([scenes], np.array(chosen[part]))
+            some = replace(take_stacks([scenes], np.array(chosen[part])), contributes=same[chosen[part]])
             stack_of, member_of = self._indices(some)
-            # kernels that are used again if all scenes are solved together
-            if together:
-                frames_of = np.arange(same.size).reshape(same.shape)[chosen[part]].ravel()
-                kernels = self._row_kernels(scenes).of(torch.as_tensor(frames_of, device=stack_of.device))
-            else:
-                kernels = self._row_kernels(some)
             strengths[chosen[part]] = prior_strengths(
                 self.frames[stack_of, member_of],
-                self._weighted(kernels, same[chosen[part]]),
+                self._row_kernels(some),
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
                 self._blur_reaches(some)[:, None],
@@ -263,9 +240,8 @@ class FrameModel:
         data = extend_rows(self.frames[index] - self.mean[stack_of][:, None], self.period)
 
         # Observation operator, and precision of the prior.
-        kernels = self._weighted(self._row_kernels(scenes), scenes.contributes)
-        operator = GRIDS[self.scale][1]
-        observation = operator(kernels, self.frames.shape[-2], self.period, data.dtype, len(data))
+        kernels = self._row_kernels(scenes)
+        observation = GRIDS[self.scale](kernels, self.frames.shape[-2], self.period, data.dtype, len(data))
         level = self.level[stack_of]
         if isinstance(self.prior, RowPrior):
             factors = np.stack([scenes.strength, self._blur_reaches(scenes)])[..., None]
@@ -323,7 +299,7 @@ def model_frames(
             powers = powers.unflatten(0, (-1, len(chosen))).mean(1).repeat_interleave(strips, 0)
     else:
         powers = frames.new_full((B, T), noise**2)
-    powers = powers.clamp(min=_MIN_LEVEL**2)
+    powers = powers.clamp(min=MIN_LEVEL**2)
     frame_weights = powers.reciprocal()
     unit_variance = frame_weights.mean(1).reciprocal()
 

@@ -13,7 +13,7 @@ from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.mosaic import interpolated_colours, measures
 from rsvib_torch.numerics.fourier import extend_rows
 from rsvib_torch.options import ExactOptions
-from rsvib_torch.restoration.exact.exact import given_level, scene_period
+from rsvib_torch.restoration.exact.exact import MIN_LEVEL, scene_period
 from rsvib_torch.restoration.exact.filling import measured_values
 from rsvib_torch.restoration.exact.finer_scene import phase_spread
 from rsvib_torch.restoration.exact.priors import check_prior
@@ -22,12 +22,7 @@ from rsvib_torch.restoration.exact.similar_patches import similar_patches
 from rsvib_torch.restoration.frame_motion import FrameMotion, joint_groups
 from rsvib_torch.restoration.noise import noise_levels
 from rsvib_torch.restoration.restoration_warning import warn_of_restoration
-from rsvib_torch.restoration.scene_model.finer_grid import (
-    SCALE,
-    FinerObservation,
-    finer_kernels,
-    fit_polynomial_prior,
-)
+from rsvib_torch.restoration.scene_model.finer_grid import SCALE, FinerObservation, fit_polynomial_prior
 
 # Luminance, red - blue, and magenta - green. Orthonormal, so that white noise stays white; the three components of a
 # scene are nearly independent, those of the colours are not.
@@ -159,7 +154,7 @@ def restore_mosaic(
     check_prior(options.prior, scale=scale, mosaic=True)
     groups = joint_groups(frames.shape[1], options.joint)
     partition = Partition(options.chunk_frequencies, options.segments)
-    stated = None if options.noise == "auto" else given_level(options.noise)
+    stated = None if options.noise == "auto" else max(options.noise, MIN_LEVEL)
     # 2. The displacement of each row during its exposure, and the period that it requires.
     displacement, node_weights = motion.exposures
     length = scene_period(motion, width)
@@ -192,7 +187,7 @@ def restore_mosaic(
             )
             if len(members) == 1 or _same_colours(moved.detach(), node_weights):
                 part = part.demosaiced(mosaic[members], measures(colours[stack][:1])[0])
-            kernels = finer_kernels(moved, node_weights, frames.new_ones(len(members)), height)
+            kernels = FinerObservation.kernels_of_rows(moved, node_weights, frames.new_ones(len(members)), height)
             observation = FinerObservation(kernels, height, length, frames.dtype)
             images.append(part.restored(observation, shift[:, 0], stated is None, factor, partition, scale))
             advance()

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -53,7 +52,7 @@ class SampledRows:
     energy: float  # squared norm of the taper, times the number of channels; powers are divided by it
 
     @cached_property
-    def _selection(self) -> Any:
+    def _selection(self) -> csr_array:
         """Sparse matrix (G K, G M R) that adds up rows with the same first coefficient."""
         place = (self.base + self.count * np.arange(len(self.base))[:, None]).ravel()
         ones = np.ones(place.size, self.taps.real.dtype)

@@ -13,26 +13,23 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from math import pi
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from rsvib_torch.imaging.blur import row_taps
 from rsvib_torch.numerics.splines import bspline_weights
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.observation import (
-    MARGIN,
     Observation,
     RowKernels,
     SmoothBand,
-    about_middle,
+    cosine_series,
     interpolation_matrix,
     normal_matrices,
-    row_kernels,
 )
 from rsvib_torch.restoration.scene_model.scene_prior import observed_spectrum, smeared
 
@@ -45,6 +42,9 @@ class FinerKernels(RowKernels):
     """Kernels on the grid of half pixels: ``first`` and ``taps`` count unknowns 2 j + a."""
 
     symmetric = False
+    points = SCALE
+    interpolated = partial(bspline_weights, degree=_FINER_DEGREE)
+    before = _FINER_DEGREE // 2
 
     @property
     def blurred(self) -> bool:
@@ -66,17 +66,6 @@ class FinerKernels(RowKernels):
         return kernels
 
 
-def finer_kernels(displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int) -> FinerKernels:
-    """Kernels of rows with displacement (M, R, N, 2) px during the exposure, as ``row_kernels`` on the finer grid."""
-    rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
-    place = SCALE * (rows[:, None] - displacement[..., 1])
-    first, taps = row_taps(place, node_weights, partial(bspline_weights, degree=_FINER_DEGREE))
-    first, low, high = first - _FINER_DEGREE // 2, -SCALE * MARGIN - taps.shape[-2], SCALE * (num_rows + MARGIN)
-    weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
-    first, taps = SCALE * first.clamp(low, high), taps.repeat_interleave(SCALE, -2)
-    return FinerKernels(first, taps, *about_middle(displacement[..., 0]), weight)
-
-
 def _spline_transfer(frequencies: Tensor) -> Tensor:
     """Transfer function of the cubic B-spline on half pixels, at frequencies in cycles per px."""
     return torch.sinc(frequencies / SCALE) ** (_FINER_DEGREE + 1)
@@ -89,11 +78,9 @@ def _finer_scene_weights() -> tuple[float, ...]:
     The least-squares fit to ``_spline_transfer`` up to 0.9 cycles per px. Samples of the spline, weights 1/6, 4/6 and
     1/6, include its aliases: gratings across the rows have 1.14 times their contrast at 0.75 cycles per px.
     """
-    v = torch.linspace(0, 0.9, 181, dtype=torch.float64, device="cpu")
-    order = torch.arange(_FINER_SCENE_REACH + 1, dtype=torch.float64, device="cpu")
-    cosines = torch.cos(2 * torch.pi / SCALE * v[:, None] * order) * torch.where(order > 0, 2.0, 1.0)
-    half = torch.linalg.lstsq(cosines, _spline_transfer(v)[:, None]).solution[:, 0]
-    return tuple((torch.cat([half.flip(0), half[1:]]) / (half[0] + 2 * half[1:].sum())).tolist())
+    v = np.linspace(0, 0.9, 181)
+    half = cosine_series(2 * pi / SCALE * v, _spline_transfer(torch.from_numpy(v)).numpy(), _FINER_SCENE_REACH)
+    return tuple((np.concatenate([half[:0:-1], half]) / (half[0] + 2 * half[1:].sum())).tolist())
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +114,8 @@ def _laplacian_powers(count: int, order: int, device: torch.device) -> Tensor:
 
 class FinerObservation(Observation):
     """``Observation`` of one scene on the grid of half pixels; all values count unknowns 2 j + a."""
+
+    kernels_of_rows = FinerKernels.of_rows
 
     def normal(self, order: int) -> SmoothBand:
         """Normal matrices ``K^H W K``, with room for a polynomial of an order in the Laplacian across rows."""
@@ -270,8 +259,5 @@ def fit_polynomial_prior(
     return PolynomialPrior(rising.T @ coefficients, length)
 
 
-# Functions that make the kernels of rows and the operator, for the points of the scene per px
-GRIDS: dict[int, tuple[Callable[..., RowKernels], type[Observation]]] = {
-    1: (row_kernels, Observation),
-    SCALE: (finer_kernels, FinerObservation),
-}
+# Operators, for the points of the scene per px
+GRIDS: dict[int, type[Observation]] = {1: Observation, SCALE: FinerObservation}

@@ -11,13 +11,15 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
+from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -26,7 +28,7 @@ from rsvib_torch.imaging.blur import row_taps, row_transfer
 from rsvib_torch.numerics.banded_solver import from_both_ends
 from rsvib_torch.numerics.fourier import shift_phases
 from rsvib_torch.numerics.splines import correlated, gauss_legendre
-from rsvib_torch.numerics.tables import constant
+from rsvib_torch.numerics.tables import Array, constant
 
 KERNEL_REACH = 3  # rows on either side; support of the kernel
 TAPS = 2 * KERNEL_REACH
@@ -89,13 +91,22 @@ def scene_weights() -> tuple[float, ...]:
     interpolation without aliases: the least-squares fit of these weights to ``kernel_spectrum`` up to 0.46 cycles per
     row, for amplitude spectra like frequency^-1 behind Gaussian optics of sigma 0.6 px.
     """
-    v = torch.linspace(0, 0.46, 369, dtype=torch.float64, device="cpu")
-    spectrum = kernel_spectrum(v)
-    order = torch.arange(SCENE_REACH + 1, dtype=torch.float64, device="cpu")
-    cosines = torch.cos(2 * torch.pi * v[:, None] * order) * torch.where(order > 0, v.new_tensor(2.0), 1.0)
-    count = torch.exp(-0.5 * (2 * torch.pi * 0.6 * v).square()) / ((v + 0.02) * spectrum)
-    half = torch.linalg.lstsq(cosines * count[:, None], (spectrum * count)[:, None]).solution[:, 0]
-    return tuple(torch.cat([half.flip(0), half[1:]]).tolist())
+    v = np.linspace(0, 0.46, 369)
+    spectrum = kernel_spectrum(torch.from_numpy(v)).numpy()
+    counts = np.exp(-0.5 * np.square(2 * np.pi * 0.6 * v)) / ((v + 0.02) * spectrum)
+    half = cosine_series(2 * np.pi * v, spectrum, SCENE_REACH, counts)
+    return (*half[:0:-1].tolist(), *half.tolist())
+
+
+def cosine_series(angles: Array, values: Array, reach: int, counts: Array | float = 1.0) -> Array:
+    """Weights 0 ... ``reach`` of the symmetric filter whose transfer function at ``angles`` (rad) is nearest to values.
+
+    Squared differences times the squares of ``counts`` are least.
+    """
+    order = np.arange(reach + 1)
+    cosines = np.cos(angles[:, None] * order) * np.where(order > 0, 2.0, 1.0)
+    half: Array = np.linalg.lstsq(cosines * np.reshape(counts, (-1, 1)), values * counts)[0]
+    return half
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +124,28 @@ class RowKernels:
         """Largest distance along the row in px during an exposure from the middle of its range."""
         return float(self.along.detach().abs().amax())
 
-    symmetric = True  # kernels at -u are the conjugates of those at u
+    symmetric: ClassVar[bool] = True  # kernels at -u are the conjugates of those at u
+    points: ClassVar[int] = 1  # of the scene per px, and unknowns per point
+    interpolated: ClassVar[Callable[[Tensor], Tensor]] = kernel_weights  # weights of the points around a place
+    before: ClassVar[int] = KERNEL_REACH - 1  # of these points before the place
+
+    @classmethod
+    def of_rows(
+        cls, displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int = MARGIN
+    ) -> Self:
+        """Kernels of rows with displacement (M, R, N, 2) px during the exposure, in frames of a weight (M,).
+
+        Rows whose content lies more than ``margin`` px outside the ``num_rows`` rows of the frame have weight 0.
+        """
+        rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
+        place = cls.points * (rows[:, None] - displacement[..., 1])
+        first, taps = row_taps(place, node_weights, cls.interpolated)
+        first, low, high = first - cls.before, -cls.points * margin - taps.shape[-2], cls.points * (num_rows + margin)
+        weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
+        along = displacement[..., 0]
+        middle = torch.stack(along.detach().aminmax(dim=-1)).mean(0)
+        taps = taps.repeat_interleave(cls.points, -2)
+        return cls(cls.points * first.clamp(low, high), taps, middle, along - middle[..., None], weight)
 
     @property
     def blurred(self) -> bool:
@@ -123,10 +155,6 @@ class RowKernels:
     def needed(self, num_rows: int) -> tuple[int, int]:
         """First coefficient, and the one after the last, that the scene on the rows of a frame depends on."""
         return -SCENE_REACH, num_rows + SCENE_REACH
-
-    def of(self, frames: Tensor) -> "RowKernels":
-        """Kernels of some of the frames."""
-        return RowKernels(*(value[frames] for value in vars(self).values() if isinstance(value, Tensor)))
 
     def rows(self, top: int, count: int) -> "RowKernels":
         """Kernels of ``count`` rows from row ``top`` on, counted from there."""
@@ -140,27 +168,6 @@ class RowKernels:
     def at(self, frequencies: Tensor) -> Tensor:
         """Kernels (M, R, J, Q) without the phase of the middle."""
         return row_transfer(self.taps, self.along, frequencies)
-
-
-def row_kernels(
-    displacement: Tensor, node_weights: Tensor, weight: Tensor, num_rows: int, margin: int = MARGIN
-) -> RowKernels:
-    """Kernels of rows with displacement (M, R, N, 2) during the exposure.
-
-    Rows whose content lies more than ``margin`` px outside the ``num_rows`` rows of the frame have weight 0.
-    """
-    rows = torch.arange(displacement.shape[-3], dtype=displacement.dtype, device=displacement.device)
-    place = rows[:, None] - displacement[..., 1]
-    first, taps = row_taps(place, node_weights, kernel_weights)
-    first, low, high = first - (KERNEL_REACH - 1), -margin - taps.shape[-2], num_rows + margin
-    weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
-    return RowKernels(first.clamp(low, high), taps, *about_middle(displacement[..., 0]), weight)
-
-
-def about_middle(along: Tensor) -> tuple[Tensor, Tensor]:
-    """Middles (M, R) of the ranges of displacements (M, R, N), and the displacements relative to them."""
-    middle = torch.stack(along.detach().aminmax(dim=-1)).mean(0)
-    return middle, along - middle[..., None]
 
 
 def interpolation_matrix(
@@ -178,25 +185,18 @@ def interpolation_matrix(
         degree += 1
         bound *= 0.5 * half / degree if half else 0.0
     places = np.zeros(0) if u is None else u.numpy()
-    count = degree // 2 + 1 if symmetric else degree + 1
-    order = np.arange(count)
-    if symmetric:
-        angles = np.pi * (2 * order + 1) / (4 * count)
-        at = np.arccos((2 * places).clip(-1, 1))
-        matrix = np.zeros((2, count, len(places), 2))
-        for odd in (0, 1):
-            series = np.cos(angles[:, None] * (2 * order + odd)) * (2 / count)
-            if not odd:
-                series[:, 0] *= 0.5
-            matrix[odd, :, :, odd] = series @ np.cos((2 * order[:, None] + odd) * at)
-        nodes = 0.5 * np.cos(angles)
-    else:
-        angles = np.pi * (order + 0.5) / count
-        at = np.arccos((4 * places - 1).clip(-1, 1))
-        series = np.cos(angles[:, None] * order) * np.where(order > 0, 2.0, 1.0) / count
-        matrix = np.zeros((2, count, len(places), 2))
-        matrix[0, ..., 0] = matrix[1, ..., 1] = series @ np.cos(order[:, None] * at)
-        nodes = 0.25 * (1 + np.cos(angles))
+    if symmetric:  # polynomials of 2 u in -1 ... 1, of which nodes at u > 0 determine the even and the odd ones
+        count, orders, at = degree // 2 + 1, (slice(0, None, 2), slice(1, None, 2)), 2 * places
+    else:  # polynomials of 4 u - 1 in -1 ... 1
+        count, orders, at = degree + 1, (slice(None), slice(None)), 4 * places - 1
+    number = 2 * count if symmetric else count
+    nodes = np.cos(np.pi * (np.arange(count) + 0.5) / number)
+    of_nodes, of_places = chebvander(nodes, number - 1) * (2 / count), chebvander(at, number - 1)
+    of_nodes[:, 0] *= 0.5
+    matrix = np.zeros((2, count, len(places), 2))
+    for part, order in enumerate(orders):
+        matrix[part, :, :, part] = of_nodes[:, order] @ of_places[:, order].T
+    nodes = 0.5 * nodes if symmetric else 0.25 * (1 + nodes)
     return torch.from_numpy(nodes), torch.from_numpy(matrix.reshape(2 * count, 2 * len(places)))
 
 
@@ -341,6 +341,8 @@ class Observation:
         top: First scene row that is observed or needed to evaluate a scene, in frame coordinates.
         count: Number of such scene rows, K.
     """
+
+    kernels_of_rows = RowKernels.of_rows  # makes the kernels
 
     def __init__(
         self, kernels: RowKernels, num_rows: int, period: int, dtype: torch.dtype, num_scenes: int = 1

@@ -200,6 +200,12 @@ def cut_pieces(images: Tensor, tops: NDArray[np.int64], lefts: NDArray[np.int64]
     return images[..., rows[:, None, :, None], columns[None, :, None, :]]
 
 
+def power_transfer(displacement: Tensor, node_weights: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Squared transfer functions (..., U, V) of exposures with displacement (..., N, 2) px, at frequencies u and v."""
+    along = waves(displacement[..., 0], u) * node_weights[:, None]
+    return squared_modulus(along.mT @ waves(displacement[..., 1], v))
+
+
 @dataclass(frozen=True, eq=False)
 class ObservedSpectrum:
     """Power spectra of pieces of the frames of N stacks, whose rows were moved back by their displacement."""
@@ -214,8 +220,7 @@ class ObservedSpectrum:
 
     def blur(self, u: Tensor, v: Tensor) -> Tensor:
         """Squared transfer functions (N, T, pieces, U, V) of the exposures at frequencies u and v."""
-        along = waves(self.displacement[..., 0], u) * self.node_weights[:, None]
-        return squared_modulus(along.transpose(-2, -1) @ waves(self.displacement[..., 1], v))
+        return power_transfer(self.displacement, self.node_weights, u, v)
 
     def weighted(self, transfer: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Observed power (N, U, V), weights (N, T, pieces, U, V) of sum 1, and power (N, U, V) of the noise.

@@ -10,7 +10,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -33,6 +32,7 @@ from rsvib_torch.numerics.tables import Array, table, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion, frame_motion, joint_groups, motion_of_frames
 from rsvib_torch.restoration.noise import noise_deviation
 from rsvib_torch.restoration.verdict.pairs import (
+    ComparedFrames,
     FramePairs,
     Overlap,
     TooLittleInCommonError,
@@ -42,121 +42,23 @@ from rsvib_torch.restoration.verdict.pairs import (
     pairs_to_judge,
     shared_part,
 )
+from rsvib_torch.restoration.verdict.restoration_verdict import (
+    DISPLACEMENTS,
+    LEVELS,
+    OUTCOMES,
+    Outcome,
+    RestorationVerdict,
+)
 from rsvib_torch.restoration.verdict.trust import vibration_to_undo
-from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.text import measured_text, text_table, wrapped
-
-Outcome = Literal["helps", "unknown", "partly", "worse"]
-_OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
 
 # Thresholds of the two scores of the verdict, fitted on 720 restorations with known truth, see docs/ablation.md.
 _PARTLY_RESIDUAL = 0.35  # of the displacement between the raw frames; above, a part of the vibration was not undone
 _WORSE_RESIDUAL = 0.8  # of that displacement; above, the vibration was not undone
 _GAIN_ERROR = 2.0  # dB; error of the estimated gain, up to which its sign is not used
 
-# fields of a verdict that have one value, and those that have one for each axis
-_LEVELS = ("before", "after", "noise", "chi_square", "predicted_gain")
-_DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
-
 _STRIP = 160  # px, width of the strip of columns that is judged with roll or zoom: enough for the means of a pair
 _MIN_NOISE = 1e-5  # of full scale; noise level assumed at least, rounding of float32 images
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class RestorationVerdict(
-    JudgedResult,
-    units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
-    shapes={
-        **dict.fromkeys(("before", "after", "noise", "chi_square", "predicted_gain"), "P"),
-        **dict.fromkeys(("misfit_before", "misfit_after", "resolution"), "P 2"),
-    },
-):
-    """Verdict on a restoration from P pairs of frames of one scene.
-
-    Displacements and levels are root-mean-square values over the pixels that both frames contain.
-
-    Attributes:
-        before: (P,) difference of the raw frames, moved onto each other by whole pixels, full scale 1.
-        after: (P,) difference of the restored frames; NaN for one image restored jointly from all.
-        misfit_before: (P, 2) px, displacement between the raw frames, axes (x, y).
-        misfit_after: (P, 2) px, displacement between a raw frame and its prediction, which is the other frame
-            restored and blurred by the motion of the first.
-        resolution: (P, 2) px, misfits below this cannot be distinguished from zero.
-        noise: (P,) standard deviation of the noise of the raw frames.
-        chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
-            1 ... 2 where motion, blur and noise explain the frame.
-        predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
-            valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
-        outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
-            ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
-            frequency; frames without contrast; too many missing pixels).
-        findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import example_frames
-        >>> frames, timing, vibration = example_frames()
-        >>> restored = rsv.restore(frames, timing, vibration, check=False)
-        >>> verdict = rsv.judge_restoration(frames, restored, timing, vibration)
-        >>> verdict.outcome, bool(verdict.misfit_after.max() < 0.01)  # px
-        (('helps',), True)
-    """
-
-    before: Tensor
-    after: Tensor
-    misfit_before: Tensor
-    misfit_after: Tensor
-    resolution: Tensor
-    noise: Tensor
-    chi_square: Tensor
-    predicted_gain: Tensor
-    outcome: tuple[Outcome, ...]
-    findings: tuple[Any, ...]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("outcome", "findings"):
-            if len(getattr(self, name)) != len(self.before):
-                raise ValueError(f"{name} must have {len(self.before)} entries, one for each pair of frames")
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """For each pair, the texts of its ``findings``."""
-        return tuple("; ".join(reason.with_axis for reason in of_pair) for of_pair in self.findings)
-
-    @property
-    def helped(self) -> Tensor:
-        """(P,) whether the outcome of the pair is ``"helps"``."""
-        return torch.tensor([outcome == "helps" for outcome in self.outcome], device=self.before.device)
-
-    @property
-    def overall(self) -> Outcome:
-        """The outcome of greatest concern over all pairs."""
-        return max(self.outcome, key=_OUTCOMES.index)
-
-    def summary(self) -> str:
-        """The verdict in one line, and a table of the pairs of frames."""
-        rows = []
-        for pair, (outcome, gain) in enumerate(zip(self.outcome, self.predicted_gain.tolist(), strict=True)):
-            sizes = torch.stack([self.misfit_before[pair], self.misfit_after[pair]], -1).flatten()
-            rows.append([str(pair), outcome, *(measured_text(size, digits=2) for size in sizes), f"{gain:+.1f}"])
-        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "improvement (dB)")
-        return f"{wrapped(self.sentence)}\n{text_table(head, rows)}"
-
-    @property
-    def sentence(self) -> str:
-        """The verdict in one line."""
-        worst = self.outcome.index(self.overall)
-        gain = float(self.predicted_gain.nanmean())
-        counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
-        sentences = {
-            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated improvement {gain:+.1f} dB"),
-            "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
-            "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
-            "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
-        }
-        return sentences[self.overall]
 
 
 def outcome_of_pair(
@@ -216,7 +118,7 @@ def outcome_of_pair(
             outcomes.append(("helps", None))
     if not outcomes:
         return "unknown", (Reason("nothing_undone"),)
-    outcome = max((outcome for outcome, _ in outcomes), key=_OUTCOMES.index)
+    outcome = max((outcome for outcome, _ in outcomes), key=OUTCOMES.index)
     reasons = tuple(reason for kind, reason in outcomes if kind == outcome and reason is not None)
     if outcome in ("partly", "worse") or gain >= 0 or not motion_is_complete:
         return outcome, reasons
@@ -389,18 +291,15 @@ def _at_pixels(restored: Tensor, frames: PreparedFrames, count: int) -> Tensor:
     return restored[..., ::step, ::step]
 
 
-def _judged_strip(
-    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: FrameMotion
-) -> tuple[Tensor, Tensor, Tensor | None, FrameMotion]:
-    """The part of the frames by which their restoration is judged, and its motion.
+def _judged_strip(frames: ComparedFrames) -> ComparedFrames:
+    """The part of the frames by which their restoration is judged.
 
     With roll or zoom, this is a strip of columns: of those in the middle of both halves, the one with more detail.
-    Arguments and results are as in ``shared_part``.
     """
-    count, width = raw.shape[1], raw.shape[-1]
+    raw, motion, width = frames.raw, frames.motion, frames.raw.shape[-1]
     if motion.vibration.same_for_all_columns:
         motion.check_fits(width)
-        return raw, restored, ignore, motion
+        return frames
     strip = min(_STRIP, width // 2)
     halves = [slice(middle - strip // 2, middle - strip // 2 + strip) for middle in (width // 4, width - width // 4)]
     both = torch.cat([raw[..., half] for half in halves], -1)
@@ -409,9 +308,12 @@ def _judged_strip(
     columns = torch.tensor(middles, dtype=torch.float64, device=raw.device)
     starts, height = tuple(motion.frame_starts.tolist()), motion.num_rows
     of_strips = ColumnMotion(motion.vibration, columns, starts, motion.timing.row_time, height)
-    raw, restored = cut_columns(raw, parts), cut_columns(restored, parts)
-    ignore = None if ignore is None else cut_columns(ignore, parts)
-    return raw, restored, ignore, frame_motion(of_strips, motion.timing, count, height)
+    return ComparedFrames(
+        cut_columns(raw, parts),
+        cut_columns(frames.restored, parts),
+        None if frames.ignore is None else cut_columns(frames.ignore, parts),
+        frame_motion(of_strips, motion.timing, raw.shape[1], height),
+    )
 
 
 def judge_prepared(
@@ -453,18 +355,16 @@ def judge_stacks(
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
     raw, still = (images.to(dtype) for images in frames.compared(restored))
+    every = ComparedFrames(raw, still, frames.missing, motion)
     count = raw.shape[1]
     pairs = pairs_to_judge(count, joint, limit)
-    ignore = frames.missing
     # only the frames that are compared, if these are some of a long stack
-    compared = sorted({frame for pair in pairs for frame in pair})
-    if len(compared) < count:
-        raw, motion = raw[:, compared], motion.of(list(range(len(raw))), compared)
-        still = still if still.shape[1] == 1 else still[:, compared]
-        ignore = None if ignore is None else ignore[:, compared]
+    numbers = sorted({frame for pair in pairs for frame in pair})
+    if len(numbers) < count:
+        every = every.of(list(range(len(raw))), numbers)
     task = _Task(
-        [(compared.index(earlier), compared.index(later)) for earlier, later in pairs],
-        compared,
+        [(numbers.index(earlier), numbers.index(later)) for earlier, later in pairs],
+        numbers,
         len(joint_groups(count, joint)[0][0]),
         columns,
         frames.image_timing,
@@ -477,10 +377,8 @@ def judge_stacks(
     together = at_once(16 * pixels, raw.device, cpu_bytes=2**26)
     verdicts: list[RestorationVerdict | TooLittleInCommonError | None] = []
     for chosen in (list(moves)[part] for part in runs(len(moves), together)):
-        judged = raw, still, ignore, motion
-        if len(chosen) < len(raw):  # all are judged without a copy
-            judged = raw[chosen], still[chosen], None if ignore is None else ignore[chosen], motion.of(chosen)
-        verdicts += _judge_batch(*_judged_strip(*judged), [moves[stack] for stack in chosen], task)
+        some = every if len(chosen) == len(raw) else every.of(chosen)  # all are judged without a copy
+        verdicts += _judge_batch(_judged_strip(some), [moves[stack] for stack in chosen], task)
     return verdicts
 
 
@@ -498,35 +396,28 @@ class _Task:
 
 
 def _judge_batch(
-    raw: Tensor, restored: Tensor, ignore: Tensor | None, motion: FrameMotion, moves: list[list[bool]], task: _Task
+    frames: ComparedFrames, moves: list[list[bool]], task: _Task
 ) -> list[RestorationVerdict | TooLittleInCommonError | None]:
-    """Verdicts on all stacks of a batch, whose displacement depends on the row only, see ``shared_part``."""
+    """Verdicts on all stacks of a batch, whose displacement depends on the row only."""
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.
-    size = raw.shape[-2], raw.shape[-1]
-    displacement, node_weights = motion.exposures
-    moved = (displacement * node_weights[:, None]).sum(-2) - motion.shift[:, :, None]
-    common = overlaps(motion, moved, task.pairs)
-    errors = {stack: error for stack, of_stack in enumerate(common) if (error := _too_little(of_stack, task, size))}
+    stacks, size = range(len(frames.raw)), (frames.raw.shape[-2], frames.raw.shape[-1])
+    common = overlaps(frames, task.pairs)
+    errors = [_too_little(of_stack, task, size) for of_stack in common]
     shared = [Overlap.of_all([of_stack[pair] for of_stack in common]) for pair in range(len(task.pairs))]
-    if errors or not all(one.is_enough(size) for one in shared):
+    if any(errors) or not all(one.is_enough(size) for one in shared):
         results: list[RestorationVerdict | TooLittleInCommonError | None] = []
-        for stack in range(len(raw)):
-            if stack in errors:
-                results.append(errors[stack])
-                continue
-            alone = slice(stack, stack + 1)
-            missing = None if ignore is None else ignore[alone]
-            results += _judge_batch(raw[alone], restored[alone], missing, motion.of([stack]), moves[alone], task)
+        for stack, error in enumerate(errors):
+            results += [error] if error else _judge_batch(frames.of([stack]), [moves[stack]], task)
         return results
 
     # The verdict on each pair of frames, of all stacks.
     verdicts = []
     for number, pair in enumerate(task.pairs):
         of_stacks = [of_stack[number] for of_stack in common]
-        part = shared_part(raw, restored, ignore, motion, moved, pair, of_stacks, task.columns)
+        part = shared_part(frames, pair, of_stacks, task.columns)
         verdicts.append(_judge_pairs(part, moves, task.shared))
-    task.advance(len(raw))
+    task.advance(len(stacks))
 
     # One result for each stack, in image axes.
     levels = np.stack([verdict.levels for verdict in verdicts], -1)  # (5, B, P)
@@ -534,15 +425,15 @@ def _judge_batch(
     if task.timing.scan_axis == -1:
         displacements = displacements[..., ::-1].copy()
     levels_of, displacements_of = (
-        torch.from_numpy(values).to(raw.device).flatten(0, 1).unbind() for values in (levels, displacements)
+        torch.from_numpy(values).to(frames.raw.device).flatten(0, 1).unbind() for values in (levels, displacements)
     )
-    concerns = [max(_OUTCOMES.index(verdict.outcomes[stack]) for verdict in verdicts) for stack in range(len(raw))]
+    concerns = [max(OUTCOMES.index(verdict.outcomes[stack]) for verdict in verdicts) for stack in stacks]
     return [
         None
-        if concern < _OUTCOMES.index(task.least)
+        if concern < OUTCOMES.index(task.least)
         else RestorationVerdict(
-            **dict(zip(_LEVELS, levels_of[stack :: len(raw)], strict=True)),
-            **dict(zip(_DISPLACEMENTS, displacements_of[stack :: len(raw)], strict=True)),
+            **dict(zip(LEVELS, levels_of[stack :: len(stacks)], strict=True)),
+            **dict(zip(DISPLACEMENTS, displacements_of[stack :: len(stacks)], strict=True)),
             outcome=tuple(verdict.outcomes[stack] for verdict in verdicts),
             findings=tuple(reasons_from_row_order(verdict.reasons[stack], task.timing) for verdict in verdicts),
         )

@@ -7,6 +7,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -55,6 +56,32 @@ class Overlap:
 
 
 @dataclass(frozen=True, eq=False)
+class ComparedFrames:
+    """Frames of B stacks, raw and restored, in row order."""
+
+    raw: Tensor  # (B, T, C, H, W)
+    restored: Tensor  # likewise, or (B, 1, C, H, W) in the coordinates of the earlier frame of each pair
+    ignore: Tensor | None  # bool tensor shaped like the raw frames, pixels without data; None for none
+    motion: FrameMotion  # motion of the raw frames
+
+    def of(self, stacks: list[int], frames: list[int] | None = None) -> "ComparedFrames":
+        """Some of the stacks, and some of their frames; None for all."""
+        members = slice(None) if frames is None else frames
+        return ComparedFrames(
+            self.raw[stacks][:, members],
+            self.restored[stacks] if self.restored.shape[1] == 1 else self.restored[stacks][:, members],
+            None if self.ignore is None else self.ignore[stacks][:, members],
+            self.motion.of(stacks, frames),
+        )
+
+    @cached_property
+    def moved(self) -> Tensor:
+        """Mean displacement (B, T, R, 2) of the rows during their exposures, beyond the shift, in px."""
+        displacement, node_weights = self.motion.exposures
+        return (displacement * node_weights[:, None]).sum(-2) - self.motion.shift[:, :, None]
+
+
+@dataclass(frozen=True, eq=False)
 class FramePairs:
     """The common parts of two raw frames and of their restored frames, of each of B stacks, (B, C, h, w) each."""
 
@@ -82,13 +109,10 @@ def pairs_to_judge(count: int, joint: bool | int, most: int | None = None) -> li
     return [pairs[index] for index in chosen]
 
 
-def overlaps(motion: FrameMotion, moved: Tensor, pairs: list[tuple[int, int]]) -> list[list[Overlap]]:
-    """What the frames of each pair have in common, for each of B stacks.
-
-    ``moved`` (B, T, R, 2) is the mean displacement of their rows beyond the shift, in px.
-    """
+def overlaps(frames: ComparedFrames, pairs: list[tuple[int, int]]) -> list[list[Overlap]]:
+    """What the frames of each pair have in common, for each of B stacks."""
     # one transfer for all stacks and pairs
-    shifts, reaches = torch.stack([motion.shift, moved.abs().amax(-2)]).flip(-1).tolist()
+    shifts, reaches = torch.stack([frames.motion.shift, frames.moved.abs().amax(-2)]).flip(-1).tolist()
     found = []
     for shift, reach in zip(shifts, reaches, strict=True):
         of_stack = []
@@ -103,22 +127,15 @@ def overlaps(motion: FrameMotion, moved: Tensor, pairs: list[tuple[int, int]]) -
 
 
 def shared_part(
-    raw: Tensor,
-    restored: Tensor,
-    ignore: Tensor | None,
-    motion: FrameMotion,
-    moved: Tensor,
-    frames: tuple[int, int],
-    common: list[Overlap],
-    columns: int | None,
+    frames: ComparedFrames, pair: tuple[int, int], common: list[Overlap], columns: int | None
 ) -> FramePairs:
-    """Cut two ``frames`` (indices) of each stack to their common part; rows are those of the later one.
+    """Cut a ``pair`` of frames (indices) of each stack to their common part; rows are those of the later one.
 
-    ``raw`` is (B, T, C, H, W) in row order, ``restored`` likewise, or (B, 1, C, H, W) in the coordinates of the earlier
-    frame. ``moved`` is as in ``overlaps``, whose results are ``common``. Of the columns, those with the most detail are
-    kept; None for all.
+    What they have in ``common`` is from ``overlaps``. Of the columns, those with the most detail are kept; None for
+    all.
     """
-    earlier, later = frames
+    raw, restored, ignore, motion, moved = frames.raw, frames.restored, frames.ignore, frames.motion, frames.moved
+    earlier, later = pair
     # the largest displacement of all stacks determines the size of the part
     size = raw.shape[-2], raw.shape[-1]
     of_all = Overlap.of_all(common)

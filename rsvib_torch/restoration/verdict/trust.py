@@ -1,7 +1,6 @@
 """The part of a detected vibration that is accurate enough to be undone, from its standard deviations."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,13 +10,13 @@ from rsvib_torch.checks.values import check_whole_number, described
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
 
 
 def displacement_uncertainty(
-    vibration: Vibration, std: Any, timing: SensorTiming, num_frames: int, num_rows: int
+    vibration: Vibration, std: VibrationStd, timing: SensorTiming, num_frames: int, num_rows: int
 ) -> tuple[Tensor, Tensor]:
     """Root-mean-square error of the displacement of the rows by standard deviations, and the displacement itself.
 
@@ -46,8 +45,9 @@ def displacement_uncertainty(
     attenuation = 0.5 * torch.sinc(vibration.frequency * timing.exposure_time).square()
     variance = attenuation * (std.amplitude.to(amplitude).square() + amplitude.square() * angle)
     variance = torch.where(moving, variance.nan_to_num(nan=math.inf), 0.0)
-    known = getattr(std, "displacement", None)
-    error = variance.sum(-1).sqrt() if known is None else torch.where(moving.any(-1), known.to(amplitude), 0.0)
+    error = variance.sum(-1).sqrt()
+    if std.displacement is not None:
+        error = torch.where(moving.any(-1), std.displacement.to(amplitude), 0.0)
     return error, (attenuation * amplitude.square()).sum(-1).sqrt()
 
 

@@ -1,0 +1,112 @@
+"""Result of the verdict on a restoration: the outcome of every pair of frames, with what it was determined from."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rsvib_torch.results.presentation import JudgedResult
+from rsvib_torch.results.reason import Reason
+from rsvib_torch.text import measured_text, text_table, wrapped
+
+Outcome = Literal["helps", "unknown", "partly", "worse"]
+OUTCOMES: tuple[Outcome, ...] = ("helps", "unknown", "partly", "worse")  # in order of concern
+
+# fields of a verdict that have one value, and those that have one for each axis
+LEVELS = ("before", "after", "noise", "chi_square", "predicted_gain")
+DISPLACEMENTS = ("misfit_before", "misfit_after", "resolution")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RestorationVerdict(
+    JudgedResult,
+    units={"misfit_before": "px", "misfit_after": "px", "resolution": "px", "predicted_gain": "dB"},
+    shapes={**dict.fromkeys(LEVELS, "P"), **dict.fromkeys(DISPLACEMENTS, "P 2")},
+):
+    """Verdict on a restoration from P pairs of frames of one scene.
+
+    Displacements and levels are root-mean-square values over the pixels that both frames contain.
+
+    Attributes:
+        before: (P,) difference of the raw frames, moved onto each other by whole pixels, full scale 1.
+        after: (P,) difference of the restored frames; NaN for one image restored jointly from all.
+        misfit_before: (P, 2) px, displacement between the raw frames, axes (x, y).
+        misfit_after: (P, 2) px, displacement between a raw frame and its prediction, which is the other frame
+            restored and blurred by the motion of the first.
+        resolution: (P, 2) px, misfits below this cannot be distinguished from zero.
+        noise: (P,) standard deviation of the noise of the raw frames.
+        chi_square: (P,) mean square of that frame's difference from its prediction, over the variance of the noise:
+            1 ... 2 where motion, blur and noise explain the frame.
+        predicted_gain: (P,) dB, improvement: estimated PSNR of the restored frames minus that of the raw ones. It is
+            valid where the motion is right and complete, NaN where it is not and has the opposite sign of the outcome.
+        outcome: For each pair: ``"helps"``; ``"partly"``: the vibration explains only a part of the displacement;
+            ``"worse"``; ``"unknown"``: cannot be determined from this pair (vibration too small, or at a blind
+            frequency; frames without contrast; too many missing pixels).
+        findings: The ``Reason`` objects of each pair; none where restoration helps. ``reasons`` has their texts.
+
+    Example:
+        >>> import rsvib_torch as rsv
+        >>> from rsvib_torch.datasets import example_frames
+        >>> frames, timing, vibration = example_frames()
+        >>> restored = rsv.restore(frames, timing, vibration, check=False)
+        >>> verdict = rsv.judge_restoration(frames, restored, timing, vibration)
+        >>> verdict.outcome, bool(verdict.misfit_after.max() < 0.01)  # px
+        (('helps',), True)
+    """
+
+    before: Tensor
+    after: Tensor
+    misfit_before: Tensor
+    misfit_after: Tensor
+    resolution: Tensor
+    noise: Tensor
+    chi_square: Tensor
+    predicted_gain: Tensor
+    outcome: tuple[Outcome, ...]
+    findings: tuple[tuple[Reason, ...], ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("outcome", "findings"):
+            if len(getattr(self, name)) != len(self.before):
+                raise ValueError(f"{name} must have {len(self.before)} entries, one for each pair of frames")
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """For each pair, the texts of its ``findings``."""
+        return tuple("; ".join(reason.with_axis for reason in of_pair) for of_pair in self.findings)
+
+    @property
+    def helped(self) -> Tensor:
+        """(P,) whether the outcome of the pair is ``"helps"``."""
+        return torch.tensor([outcome == "helps" for outcome in self.outcome], device=self.before.device)
+
+    @property
+    def overall(self) -> Outcome:
+        """The outcome of greatest concern over all pairs."""
+        return max(self.outcome, key=OUTCOMES.index)
+
+    def summary(self) -> str:
+        """The verdict in one line, and a table of the pairs of frames."""
+        rows = []
+        for pair, (outcome, gain) in enumerate(zip(self.outcome, self.predicted_gain.tolist(), strict=True)):
+            sizes = torch.stack([self.misfit_before[pair], self.misfit_after[pair]], -1).flatten()
+            rows.append([str(pair), outcome, *(measured_text(size, digits=2) for size in sizes), f"{gain:+.1f}"])
+        head = ("pair", "outcome", "x before (px)", "x after (px)", "y before (px)", "y after (px)", "improvement (dB)")
+        return f"{wrapped(self.sentence)}\n{text_table(head, rows)}"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one line."""
+        worst = self.outcome.index(self.overall)
+        gain = float(self.predicted_gain.nanmean())
+        counted = f" ({self.outcome.count(self.overall)} of {len(self.outcome)} pairs)" if len(self.outcome) > 1 else ""
+        sentences = {
+            "helps": "restored frames agree" + ("" if math.isnan(gain) else f"; estimated improvement {gain:+.1f} dB"),
+            "unknown": f"cannot determine whether restoration helps{counted}: {self.reasons[worst]}",
+            "partly": f"restoration helps in part only{counted}: {self.reasons[worst]}",
+            "worse": f"restored is no better than raw{counted}: {self.reasons[worst]}",
+        }
+        return sentences[self.overall]
