@@ -144,7 +144,8 @@ class RowKernels:
         weight = weight[:, None].to(torch.float64) * ((first > low) & (first < high))
         along = displacement[..., 0]
         middle = torch.stack(along.detach().aminmax(dim=-1)).mean(0)
-        taps = taps.repeat_interleave(cls.points, -2)
+        if cls.points > 1:
+            taps = taps.repeat_interleave(cls.points, -2)
         return cls(cls.points * first.clamp(low, high), taps, middle, along - middle[..., None], weight)
 
     @property
