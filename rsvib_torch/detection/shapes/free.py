@@ -627,7 +627,7 @@ def _report(
     seen_and_unseen = _visible_and_common(fit, measured)
     value = motion.displacement(times)
     value = value - value.mean((0, 1))
-    # The power at other frequencies says nothing about a tone that displaces all frames nearly alike.
+    # The power at other frequencies does not determine a tone that displaces all frames nearly equally.
     blind = _blind_tone(table(value), table(times), seen_and_unseen[0])
     std = torch.hypot(std, tensor(blind))
     std_seen, unseen = tensor(seen_and_unseen[0]), tensor(np.hypot(seen_and_unseen[1], blind))
@@ -663,7 +663,7 @@ _LEFT_BY_BLIND = 0.05
 
 
 def _blind_tone(values: Array, times: Array, noise: Array) -> Array:
-    """(A,) px, rms displacement of all frames alike by a tone near a multiple of the frame rate, or 0.
+    """(A,) px, rms of the displacement common to all frames by a tone near a multiple of the frame rate, or 0.
 
     Of a tone at ``1 + e`` times the frame rate, the frames show ``2 pi e`` of its amplitude, and e only in the change
     of that from frame to frame. The rms displacement is the mean over all e of its posterior, where such a tone beside
