@@ -67,10 +67,10 @@ _UNKNOWN_ALIASING = 3.0, 1.2
 # deviations with the value of x and y
 _UNKNOWN_BLUR = 3e-5, 3e-5, 1e-3, 1e-3
 # Standard deviation of the errors of amplitudes that all rows have in common over the rms displacement of the rows that
-# nothing explains. Encoders predict blocks of a frame from others, with one displacement for all rows of a block. Without and with it, the
-# rms error of 34 to 26 amplitudes each over their standard deviation: H.264 of CRF 17, 20, 23, 28 in eight frames 2.3,
-# 2.6, 2.1, 2.1 and 1.1, 1.2, 0.9, 0.9 (of the frequency 2.0, 4.2, 1.6, 1.4 and 1.0, 1.5, 0.7, 0.6); four frames 1.8
-# and 1.1. The median standard deviation of frames without encoding stays
+# nothing explains. Encoders predict blocks of a frame from others, with one displacement for all rows of a block. The
+# rms error of 26 to 35 amplitudes over their standard deviation, without and with it: H.264 of CRF 17, 20, 23, 28 in
+# eight frames 2.3, 2.6, 2.1, 2.1 and 1.1, 1.2, 0.9, 0.9 (of the frequency 2.0, 4.2, 1.6, 1.4 and 1.0, 1.5, 0.7, 0.6);
+# four frames 1.8 and 1.1. The median standard deviation of frames without encoding is the same
 _UNEXPLAINED_IN_COMMON = 0.25
 # standard deviation of the quadratures of the further tone over the norm of the amplitudes; 95 to 96 % of the 95 %
 # intervals of 150 simulated recordings with random tones contain the truth, with 0.2 fewer
