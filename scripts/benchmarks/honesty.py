@@ -121,7 +121,7 @@ def effect_of(found: rsv.DetectionResult, taken: Recording, of: str, name: str, 
 
 def is_assumed(found: rsv.DetectionResult, taken: Recording, axis: int, tones: list[dict[str, float]]) -> bool:
     """Whether the sensitivity to a stated assumption gives at least a third of every wrong parameter's error."""
-    names = [name for name in taken.case.stated if any(text.startswith(name) for text in found.assumptions)]
+    names = [name for name in taken.case.stated if any(name in text for text in found.assumptions)]
     for tone in tones:
         for of in ("amplitude", "frequency"):
             if abs(tone[f"{of}_z"]) > MANY_STD and abs(tone[f"{of}_error"]) > WRONG_SHARE:
