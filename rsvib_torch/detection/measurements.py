@@ -317,6 +317,11 @@ class OtherMotion:
         """(..., 2) px, largest ``unexplained`` of a reliable axis: errors of interpolation and of unequal blur."""
         return np.maximum(0.006 * self.size, 0.05)
 
+    @property
+    def explained(self) -> Array:
+        """(...) bool, whether the rest of all axes is permitted; not where no row was measured."""
+        return np.all(self.unexplained <= self.permitted, -1)
+
     def __getitem__(self, index: int) -> "OtherMotion":
         """The part of one stack out of a batch."""
         return OtherMotion(*(getattr(self, field.name)[index] for field in fields(self)))

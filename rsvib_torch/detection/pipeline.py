@@ -264,12 +264,12 @@ def fit_directly(
     # Bands that move within their height contain twice the frequency of a tone, as a tone that is larger than the frame
     # if it is nearly blind (3 of 200 recordings in four and eight frames), or none (1 of 60 in two frames, with another
     # axis that was wrong): where the rows contradict the fit, one tone of each axis is tried.
-    contradicted = ~(refined.other_motion.unexplained <= refined.other_motion.permitted).all(-1) & ~refined.abandoned
+    contradicted = ~refined.other_motion.explained & ~refined.abandoned
     if options.tones is None and contradicted.any():
         index = np.flatnonzero(contradicted)
         single = _tones_of_bands(start, timing, replace(options, tones=1), accuracy=0.15)
         again = refine(frames.stacks(index), intervals, take_stacks([single], index), None, may_abandon=doubtful)
-        explained = np.flatnonzero((again.other_motion.unexplained <= again.other_motion.permitted).all(-1))
+        explained = np.flatnonzero(again.other_motion.explained)
         if len(explained):
             refined = with_better(refined, take_stacks([again], explained), index[explained])
     # Roll and zoom that were confirmed are fitted again in pairs, if the exposures blur the frames differently.
