@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from pydantic import Field, create_model, model_validator
 
+from rsvib_torch import imaging, motion
 from rsvib_torch.checks.validation import Count, Section, checked, validate
 from rsvib_torch.files.reading import read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
@@ -38,10 +39,6 @@ class Config:
 @functools.cache
 def simulation_section() -> Any:
     """Class of ``[simulation]``; it needs torch, which takes seconds to import."""
-    from rsvib_torch.imaging.sensor_model import SensorNoise  # noqa: PLC0415
-    from rsvib_torch.motion.camera import Camera  # noqa: PLC0415
-    from rsvib_torch.motion.vibration import Vibration  # noqa: PLC0415
-
     tones = list[float] | list[list[float]]
     axes = Field(default_factory=lambda: [0.0, 0.0])
 
@@ -67,9 +64,9 @@ def simulation_section() -> Any:
             checked(self.to_vibration)
             return self
 
-        def to_vibration(self) -> Vibration:
-            camera = None if self.camera is None else Camera(**dict(self.camera))
-            return Vibration(**{**dict(self), "camera": camera})
+        def to_vibration(self) -> motion.Vibration:
+            camera = None if self.camera is None else motion.Camera(**dict(self.camera))
+            return motion.Vibration(**{**dict(self), "camera": camera})
 
     class SimulationSection(Section):
         vibration: VibrationSection
@@ -77,7 +74,7 @@ def simulation_section() -> Any:
         """Number of frames."""
         frame_size: tuple[Count, Count] | None = Field(default=None, strict=False)
         """(height, width) of the frames in px; None for the largest size that the scene allows."""
-        noise: SensorNoise | None = None
+        noise: imaging.SensorNoise | None = None
         seed: int = Field(default=0, ge=0, le=2**63 - 1)
         """Seed of the noise."""
 

@@ -36,7 +36,8 @@ def named(error: Error, argument: str, problem: str) -> Error:
     return error
 
 
-def _refused(kind: type[Error], name: str, problem: str) -> Error:
+def refused(kind: type[Error], name: str, problem: str) -> Error:
+    """The error of an argument: its name and what is wrong with it, also as data."""
     return named(kind(f"{name} {problem}"), name, problem)
 
 
@@ -51,18 +52,18 @@ def check_number(
 ) -> float:
     """Return ``value`` as a finite float within its bounds; booleans are refused."""
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise _refused(TypeError, name, f"must be a number, got {described(value)}")
+        raise refused(TypeError, name, f"must be a number, got {described(value)}")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf if value == abs(value) else -math.inf  # a whole number beyond float64
     if not math.isfinite(number):
-        raise _refused(ValueError, name, f"must be finite, got {number}")
+        raise refused(ValueError, name, f"must be finite, got {number}")
     if number <= above:
-        raise _refused(ValueError, name, f"must be larger than {above:g}, got {number:g}")
+        raise refused(ValueError, name, f"must be larger than {above:g}, got {number:g}")
     if not at_least <= number <= at_most:
         bound = f"at least {at_least:g}" if number < at_least else f"at most {at_most:g}"
-        raise _refused(ValueError, name, f"must be {bound}, got {number:g}")
+        raise refused(ValueError, name, f"must be {bound}, got {number:g}")
     return number
 
 
@@ -70,16 +71,16 @@ def check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
     """Raise a ``ValueError`` that lists the choices unless ``value`` is one of them."""
     # only values of the same types are compared: a tensor has no truth value
     if not isinstance(value, tuple(type(choice) for choice in choices)) or value not in choices:
-        raise _refused(ValueError, name, f"must be one of {', '.join(map(repr, choices))}; got {described(value)}")
+        raise refused(ValueError, name, f"must be one of {', '.join(map(repr, choices))}; got {described(value)}")
 
 
 def check_whole_number(name: str, value: object, *, at_least: int, at_most: int = 2**63 - 1) -> int:
     """Return ``value`` as an int from ``at_least`` to ``at_most``, by default the largest index of an array."""
     if isinstance(value, bool) or not isinstance(value, int):
-        raise _refused(TypeError, name, f"must be a whole number, got {described(value)}")
+        raise refused(TypeError, name, f"must be a whole number, got {described(value)}")
     if not at_least <= value <= at_most:
         bound = f"at least {at_least}" if value < at_least else f"at most {at_most}"
-        raise _refused(ValueError, name, f"must be {bound}, got {described(value).removesuffix(' (int)')}")
+        raise refused(ValueError, name, f"must be {bound}, got {described(value).removesuffix(' (int)')}")
     return value
 
 

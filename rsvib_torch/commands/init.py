@@ -19,8 +19,7 @@ from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_exposure, stated_rate
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.files.atomic import check_writable, whole_file
-from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.atomic import check_outputs, check_writable, whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
@@ -157,9 +156,7 @@ def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -
             proposal = f" The file names its camera, {info.camera}: {error}."
     if info.is_integer and info.full_scale is None:
         # the largest count of the bit depth that the frame uses; multiples of 16 are 12 bits shifted by 4
-        import numpy as np  # noqa: PLC0415
-
-        step = max(int(np.gcd.reduce(first.ravel())), 1)
+        step = max(math.gcd(*set(first.ravel().tolist())), 1)
         likely["full_scale"] = float(((1 << max(int(first.max()) // step, 255).bit_length()) - 1) * step)
     elif info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import rsvib_torch
 from rsvib_torch import detection, gyroscope, io, row_time, stacks
+from rsvib_torch import motion as recordings
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
+from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
-from rsvib_torch.commands.answers import next_step, restoration_lines, verdicts, warn_of_restoration
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.init import sensor_toml
 from rsvib_torch.commands.stack_commands import load, print_notes
 from rsvib_torch.commands.terminal import Answer, note, warn, working
-from rsvib_torch.commands.written_results import note_lost, warn_of_failures
 from rsvib_torch.files.atomic import check_writable, whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, ProcessStackOptions, TimeUnit
@@ -49,9 +46,6 @@ def motion(given: MotionOptions) -> Answer:
 
     To restore frames with the CSV file: rsvib known --motion FILE --unit px --offset 0.
     """
-    import numpy as np  # noqa: PLC0415
-    import torch  # noqa: PLC0415
-
     out, frames = given.out, given.stack
     shared.check_new([out], given.overwrite, given.inputs)
     check_writable(out)
@@ -61,29 +55,18 @@ def motion(given: MotionOptions) -> Answer:
     with working("detecting the motion"):
         if given.model == "free":
             result = detection.detect_motion(stack.frames, stack.timing, **chosen)
-            last, knots = float(result.times.max()) + stack.timing.exposure_time, 0.5
         else:
             result = detection.detect_swept_tone(stack.frames, stack.timing, **chosen)
-            last, knots = result.motion.end, 1.0
-    # at equidistant times: twice per knot of a free motion, once per knot of a swept tone
-    curve = result.motion
-    end = max(curve.end, last)
-    times = np.linspace(curve.start, end, math.ceil((end - curve.start) / (knots * curve.spacing)) + 1)
-    moved = curve.displacement(torch.from_numpy(times).to(curve.device)).cpu().numpy()
-    columns = {"time": times, "x": moved[:, 0], "y": moved[:, 1]}
-    if isinstance(result, detection.MotionDetection):
-        rows, stds = result.times.flatten().cpu().numpy(), result.std.flatten(0, 1).cpu().numpy()
-        columns |= {f"std_{name}": np.interp(times, rows, stds[:, axis]) for axis, name in enumerate("xy")}
-    texts = {name: [f"{v:.{9 if name == 'time' else 5}f}" for v in values] for name, values in columns.items()}
-    reports.write_columns(out, texts)
+    columns = reports.motion_columns(result, stack.timing)
+    reports.write_columns(out, columns)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
     restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
     return Answer(
         {f"Motion in {frames.name}": [result.summary()]},
         {"motion": _without_curve(result), "columns": list(columns)},
         [out],
-        [next_step("restore the frames", *restore)] * bool(result.reliable.any()),
-        verdicts([result]),
+        [answers.next_step("restore the frames", *restore)] * bool(result.reliable.any()),
+        answers.verdicts([result]),
     )
 
 
@@ -160,7 +143,7 @@ def known(given: KnownOptions) -> Answer:
     recorded = _recorded(given)
     info, scale, options = given.planned_restoration()
     info, timing = replace(info, full_scale=scale), given.settings.timing
-    ignore = _ignored(given.ignore or (), (info.shape[-2], info.shape[-1]))
+    ignore = stacks.mask_of_regions(given.ignore or (), (info.shape[-2], info.shape[-1]))
     shape = shared.restored_shape(info, options)
     io.check_stack_target(given.restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     print_notes(info, given.settings)
@@ -212,14 +195,14 @@ def known(given: KnownOptions) -> Answer:
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
         run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=progress if counts else None)
-    note_lost(given.restored, run.not_kept)
+    answers.note_lost(given.restored, run.not_kept)
     stored, first = stacks.read_manifest(manifest), None if run.first is None else run.first.restoration
     if run.windows == 1 and first is not None:
-        warn_of_restoration(first)
-        results["Restoration"] = restoration_lines(first, info.shape[0])
+        answers.warn_of_restoration(first)
+        results["Restoration"] = answers.restoration_lines(first, info.shape[0])
         data["restoration"] = reports.restoration_data(first)
     else:
-        warn_of_failures(stored)
+        answers.warn_of_failures(stored)
         results["Restoration"] = [run.summary(), *stored.lines()[1][1:]]
         data["restoration"] = stored.totals()
     return Answer(results, data, [given.restored, manifest])
@@ -250,21 +233,6 @@ def _camera(given: KnownOptions, info: StackInfo) -> rsvib_torch.Camera | None:
     if given.lens_profile is not None:
         return rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
     return rsvib_torch.Camera(given.focal_length) if given.unit is None and given.focal_length is not None else None
-
-
-def _ignored(regions: Sequence[str], size: tuple[int, int]) -> torch.Tensor | None:
-    """Mask (H, W) of the regions of frames, as ``--ignore`` states them; None without regions."""
-    import torch  # noqa: PLC0415
-
-    mask = torch.zeros(size, dtype=torch.bool)
-    for region in regions:
-        if not re.fullmatch(r"\d*:\d*(,\d*:\d*)?", region):
-            raise ValueError(f"--ignore must be rows, or rows and columns, such as 400: or :60,500:, got {region!r}")
-        part = mask[tuple(slice(*(int(end) if end else None for end in ends.split(":"))) for ends in region.split(","))]
-        if part.numel() == 0:
-            raise ValueError(f"--ignore {region} has no pixel of frames of {size[0]} rows and {size[1]} columns")
-        part.fill_(True)
-    return mask if regions else None
 
 
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
@@ -334,13 +302,11 @@ def compare(given: CompareOptions) -> Answer:
     Frequency, ratio of the amplitudes and phase of each tone, and the offset of the clocks. The ratio is the size of a
     pixel on the object, which --pixel-size states for comparison.
     """
-    from rsvib_torch.motion.recorded import read_acceleration  # noqa: PLC0415
-
     if given.out is not None:
         shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
         check_writable(given.out)
     signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-    times, acceleration = read_acceleration(given.record, given.unit, given.time_unit, signs)
+    times, acceleration = recordings.read_acceleration(given.record, given.unit, given.time_unit, signs)
     found = detection.DetectionResult.load(given.vibration)
     with working("comparing"):
         result = gyroscope.compare_accelerometer(
@@ -403,8 +369,6 @@ def calibrate(given: CalibrateOptions) -> Answer:
     The readout direction is measured as well. With --by-motion, a row time that is not certain is refused with the
     reason.
     """
-    import torch  # noqa: PLC0415
-
     _check_given(given)
     paths = [given.part_of(path) for path in given.frames]
     if given.out is not None:
@@ -415,14 +379,10 @@ def calibrate(given: CalibrateOptions) -> Answer:
         note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; --frames selects others")
         paths = [path.with_name(f"{path.name}[0:{_CALIBRATED_FRAMES}]") for path in paths[:1]]
         infos = [io.read_stack_info(path) for path in paths]
-    for path, info in zip(paths, infos, strict=True):
-        for sentence in io.describe_stack(info, None):
-            note(sentence)
-        expected = infos[0].shape[1:]
-        if info.shape[1:] != expected:
-            raise ValueError(f"{path}: frames of shape {info.shape[1:]}, expected {expected} as in {paths[0]}")
+    for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):
+        note(sentence)
     with working("reading the frames"):
-        stack = torch.cat([io.read_stack(path, full_scale=given.full_scale) for path in paths])
+        stack = io.read_stack(paths, full_scale=given.full_scale)
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
     with working("measuring the motion" if given.by_motion else "measuring the flicker"):
         if given.by_motion:
@@ -461,7 +421,8 @@ def calibrate(given: CalibrateOptions) -> Answer:
     else:
         with whole_file(given.out) as file:
             file.write_text(table, encoding="utf-8")
-        steps.append(next_step("detect a vibration", "detect", "FRAMES", "--config", given.out, "--out", "FOLDER"))
+        command = ("detect", "FRAMES", "--config", given.out, "--out", "FOLDER")
+        steps.append(answers.next_step("detect a vibration", *command))
     return Answer(
         {"Camera": [result.summary(), f"{rows} rows are read in {readout} ms"], "Configuration": [table]},
         {"calibration": _without_curve(result)},

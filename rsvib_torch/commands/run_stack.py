@@ -10,7 +10,6 @@ from rsvib_torch import frames as preparation
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
-from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument
 from rsvib_torch.commands.shared_options import PixelSizeOptions, RestorationCommand, VerdictOptions
 from rsvib_torch.commands.stack_commands import print_notes, read_frame
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_RESULTS = (*written.OF_DETECTION, *written.OF_WINDOWS, "restoration.json", "before_after.png")
+_RESULTS = (*answers.OF_DETECTION, *answers.OF_WINDOWS, "restoration.json", "before_after.png")
 _PROCESSING = ("resume", "compression", "memory", "workers", "scheduler")
 
 
@@ -96,7 +95,7 @@ def run(given: RunOptions) -> Answer:
         output = f"restored{ending if ending in io.H264 else '.mkv'}"
     if Path(output).name != output or output in ("", ".", ".."):
         raise ValueError(f"--output must be a file name without a folder, got {output!r}")
-    written.check_folder(out, _RESULTS, given.overwrite or "resume" in given.processing, given.inputs, out / output)
+    answers.check_folder(out, _RESULTS, given.overwrite or "resume" in given.processing, given.inputs, out / output)
     info, scale, restoration = given.planned_restoration(given.restoration)
     print_notes(info, settings)
     chosen = WindowOptions(**{**settings.stack, **given.windows})
@@ -107,7 +106,7 @@ def run(given: RunOptions) -> Answer:
     else:
         answer = _run_windows(given, out / output, info, common, chosen)
     if given.overwrite:
-        written.remove_old(out, _RESULTS, [path.name for path in answer.files])
+        answers.remove_old(out, _RESULTS, [path.name for path in answer.files])
     return answer
 
 
@@ -126,26 +125,26 @@ def _run_windows(given: RunOptions, restored: Path, info: io.StackInfo, common: 
         first = next(iter(stacks.iterate_stack(frames, settings.timing, **common, **resources)))
     if result.bad_frames:
         warn(f"{number_of(result.bad_frames, 'frame')} could not be used: see manifest.json")
-    written.note_lost(restored, result.not_kept)
+    answers.note_lost(restored, result.not_kept)
     found, restoration = first.detection, first.restoration
     names, more, steps = [restored.name, "manifest.json"], ["--manifest", str(out / "manifest.json")], []
     with whole_folder(out) as folder:
         if len(first.frames):
             with working("drawing the frames"):
                 picture = folder / "before_after.png"
-                names = written.draw_safely(picture, lambda: _comparison(given, common, first)) + names
+                names = answers.draw_safely(picture, lambda: _comparison(given, common, first)) + names
         # one vibration of all frames, which was not followed
         if result.windows == 1 and restoration is not None and isinstance(found, detection.DetectionResult):
             target, chosen_options = folder / "restoration.json", common["restoration"]
             reports.write_restoration(target, restoration, chosen_options, result.not_kept)
             timing = io.timing_from_first_frame(settings.timing, info)
-            names += [*written.write_detection(folder, found, timing, given.pixel_size), "restoration.json"]
+            names += [*answers.write_detection(folder, found, timing, given.pixel_size), "restoration.json"]
             answers.warn_of_restoration(restoration)
             answer = answers.stack_answer(frames, found, given.pixel_size, restoration, info.shape[0])
             more, steps = [], answers.steps_after_detection(found, frames, settings)
         else:
             stored = stacks.read_manifest(out / "manifest.json")
-            names += written.write_windows(folder, stored, given.pixel_size)
+            names += answers.write_windows(folder, stored, given.pixel_size)
             answer = answers.windows_answer(f"Vibration in {frames.name}", stored, result, given.pixel_size)
     if result.restored:
         steps.insert(0, answers.page_step(frames, out / "report", settings, *more))
@@ -192,9 +191,9 @@ def _run_followed(given: RunOptions, restored: Path, common: Table) -> Answer:
         raw = raw if stored.margins is None else video.Margins(**stored.margins).cut(raw)
         return reports.comparison_figure(raw, read_frame(restored, index, None))
 
-    drawn = written.draw_safely(out / "before_after.png", comparison)
+    drawn = answers.draw_safely(out / "before_after.png", comparison)
     with whole_folder(out) as folder:
-        names = [restored.name, *drawn, "manifest.json", *written.write_windows(folder, stored, given.pixel_size)]
+        names = [restored.name, *drawn, "manifest.json", *answers.write_windows(folder, stored, given.pixel_size)]
     if result.bad_frames:
         bad = number_of(result.bad_frames, "frame")
         warn(f"{bad} could not be used and repeat the frame before: see manifest.json")

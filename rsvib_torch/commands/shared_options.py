@@ -15,11 +15,12 @@ import typer
 
 from rsvib_torch import frames as preparation
 from rsvib_torch import gyroscope, io
+from rsvib_torch import restoration as restore
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import note
 from rsvib_torch.config import Config, read_config
-from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.atomic import check_outputs
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.timing import SensorSection
 from rsvib_torch.options import RestorationOptions, method_options
@@ -342,9 +343,7 @@ def _restoration_options(
     if checked.mosaic is not None:
         preparation.check_mosaic(checked.mosaic, info.shape)
     if checked.optics is not None:
-        from rsvib_torch.restoration.restore import check_optics  # noqa: PLC0415
-
-        check_optics(checked.optics)
+        restore.check_optics(checked.optics)
     return options
 
 

@@ -16,7 +16,6 @@ from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
 from rsvib_torch.commands import shared_options as shared
-from rsvib_torch.commands import written_results as written
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.terminal import Answer, current_output, note, working
 from rsvib_torch.files.atomic import check_writable, whole_folder
@@ -173,7 +172,7 @@ def detect(given: DetectOptions) -> Answer:
     are followed from frame to frame. For other motion see rsvib motion.
     """
     settings, frames, out = given.settings, given.stack, given.out
-    written.check_folder(out, (*written.OF_DETECTION, *written.OF_WINDOWS), given.overwrite, given.inputs)
+    answers.check_folder(out, (*answers.OF_DETECTION, *answers.OF_WINDOWS), given.overwrite, given.inputs)
     windows = {name: value for name, value in settings.stack.items() if name in ("window", "follow")} | given.windows
     info = io.read_stack_info(frames)
     count = info.shape[0]
@@ -194,11 +193,11 @@ def detect(given: DetectOptions) -> Answer:
             else:
                 result = None
         if result is not None:
-            names = written.write_detection(folder, result, stack.timing, given.pixel_size)
+            names = answers.write_detection(folder, result, stack.timing, given.pixel_size)
             answer = answers.stack_answer(frames, result, given.pixel_size)
             answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
         else:
-            names = [*written.write_windows(folder, stored, given.pixel_size), "manifest.json"]
+            names = [*answers.write_windows(folder, stored, given.pixel_size), "manifest.json"]
             title = f"Vibration in {len(stored.windows)} windows of {frames.name}"
             answer = answers.windows_answer(title, stored, pixel_size=given.pixel_size)
             if any(record.followed is not None for record in stored.windows):
@@ -207,7 +206,7 @@ def detect(given: DetectOptions) -> Answer:
                 answer.next_steps.append(answers.next_step("restore the frames", *run, *follow))
             else:
                 answer.next_steps += answers.steps_after_detection(None, frames, settings, out / "manifest.json")
-    written.remove_old(out, (*written.OF_DETECTION, *written.OF_WINDOWS), names)
+    answers.remove_old(out, (*answers.OF_DETECTION, *answers.OF_WINDOWS), names)
     answer.files += [out / name for name in names]
     return answer
 
@@ -273,7 +272,7 @@ def restore_frames(given: RestoreOptions) -> Answer:
     with working(f"writing {restored.name}"):
         io.write_stack(restored, images, dtype=info.dtype, full_scale=scale, like=stack.info)
     not_kept = io.metadata_not_kept(stack.info, restored, tuple(images.shape))
-    written.note_lost(restored, not_kept)
+    answers.note_lost(restored, not_kept)
     if report is not None:
         reports.write_restoration(report, result, options, not_kept)
     return Answer(
@@ -286,11 +285,9 @@ def restore_frames(given: RestoreOptions) -> Answer:
 
 def _restore_windows(given: RestoreOptions) -> Answer:
     """Restore a stack with the detections of its windows."""
-    from rsvib_torch.results.result_files import decode  # noqa: PLC0415
-
     vibration, timing = given.vibration, given.settings.timing
     manifest = stacks.read_manifest(vibration)
-    stored = decode(rsvib_torch.SensorTiming, manifest.settings.get("sensor"), f"{vibration}: settings.sensor")
+    stored = manifest.timing
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
         timing = replace(timing, frame_start_times=stored.frame_start_times)
     reports.check_same_timing(str(vibration), stored, timing)
@@ -304,7 +301,7 @@ def _restore_windows(given: RestoreOptions) -> Answer:
     common["given"] = manifest.detections()
     with working(f"restoring {given.stack.name}", counts=True) as progress:
         result = stacks.process_stack(given.stack, given.restored, given.settings.timing, **common, progress=progress)
-    written.note_lost(given.restored, result.not_kept)
+    answers.note_lost(given.restored, result.not_kept)
     answer = answers.windows_answer("Vibration", stacks.read_manifest(result.manifest), result)
     answer.files += [given.restored, result.manifest]
     return answer
@@ -334,7 +331,7 @@ def report(given: ReportOptions) -> Answer:
     list(map(_edge_box, given.edge or ()))  # errors before anything is computed
     windows = None if given.manifest is None else stacks.read_manifest(given.manifest)
     inputs = [*given.inputs, *([] if given.manifest is None else [given.manifest])]
-    written.check_folder(out, ["report.html"], given.overwrite, inputs)
+    answers.check_folder(out, ["report.html"], given.overwrite, inputs)
     _, _, options = given.planned_restoration(given.restoration)
     if given.manifest is not None and windows is not None and windows.output is not None and windows.is_followed:
         made = given.manifest.with_name(windows.output["name"])

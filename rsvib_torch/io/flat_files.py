@@ -11,10 +11,10 @@ from pydantic import Field
 
 from rsvib_torch.checks.arrays import channels_appear_last
 from rsvib_torch.checks.validation import Section, read_json, validate
-from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
+from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes
 from rsvib_torch.numerics.tables import Array
 
 

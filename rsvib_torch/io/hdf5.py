@@ -12,11 +12,10 @@ import numpy as np
 
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.array_attributes import attributes_of, info_from_attributes
 from rsvib_torch.io.blocks import BlockReader, array_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
-from rsvib_torch.io.time_metadata import time_attributes, times_of_attributes
+from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes, time_attributes, times_of_attributes
 from rsvib_torch.numerics.tables import Array
 
 _DATASET = "frames"  # name of the dataset that is written

@@ -22,8 +22,8 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, FrameError, StackInfo, Tag, readable_stack
+from rsvib_torch.io.stated_metadata import exif_fields, merged_times
 from rsvib_torch.io.tiff import open_tiff, storage_of, write_tiff
-from rsvib_torch.io.time_metadata import exif_fields, merged_times
 from rsvib_torch.numerics.tables import Array
 
 _FULL_SCALE = "full_scale"  # keyword of the text in a PNG file

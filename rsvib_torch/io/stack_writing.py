@@ -11,8 +11,7 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.arrays import Channels, FramesLike, as_tensor, channel_axis
 from rsvib_torch.checks.values import check_choice
 from rsvib_torch.execution.progress import steps
-from rsvib_torch.files.atomic import check_target, check_tree, check_writable, whole
-from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.atomic import check_outputs, check_target, check_tree, check_writable, whole
 from rsvib_torch.io.formats import FORMATS, StackFormat, target_format
 from rsvib_torch.io.full_scale import check_dtype, frames_to_counts, known_full_scale, required_full_scale
 from rsvib_torch.io.stack_info import DIFFERENT, StackInfo, split_range

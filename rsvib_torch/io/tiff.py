@@ -11,12 +11,11 @@ import numpy as np
 import tifffile
 
 from rsvib_torch.files.reading import Table
-from rsvib_torch.io.array_attributes import attributes_of
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
 from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
+from rsvib_torch.io.stated_metadata import attributes_of, orientation_of, tiff_times
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
-from rsvib_torch.io.time_metadata import orientation_of, tiff_times
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)

@@ -20,7 +20,7 @@ import numpy as np
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.stack_info import H264, VIDEO, FrameError, StackInfo, readable_stack
-from rsvib_torch.io.time_metadata import camera_name
+from rsvib_torch.io.stated_metadata import camera_name
 from rsvib_torch.numerics.tables import Array
 
 CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written

@@ -3,7 +3,7 @@ from .frame_motion import visible_pixels
 from .noise import estimate_noise
 from .restoration_mtf import RestorationMtf, restoration_mtf
 from .restoration_warning import RestorationWarning
-from .restore import VibrationRestorer, restore
+from .restore import VibrationRestorer, check_optics, restore
 from .verdict.judge import judge_restoration
 from .verdict.pairs import TooLittleInCommonError
 from .verdict.restoration_verdict import RestorationVerdict
@@ -16,6 +16,7 @@ __all__ = [
     "RestorationWarning",
     "TooLittleInCommonError",
     "VibrationRestorer",
+    "check_optics",
     "displacement_uncertainty",
     "estimate_noise",
     "judge_restoration",

@@ -11,6 +11,7 @@ from .process import iterate_stack as iterate_stack
 from .process import process_stack as process_stack
 from .recorded_motion import align_stack as align_stack
 from .recorded_motion import check_stack_motion as check_stack_motion
+from .recorded_motion import mask_of_regions as mask_of_regions
 from .run_folder import StackReport as StackReport
 from .window_restoration import RestoredFrames as RestoredFrames
 from .window_restoration import may_change as may_change

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import torch
 
 from rsvib_torch.checks.values import needed_package
-from rsvib_torch.execution.prefetch import in_order, in_threads
+from rsvib_torch.execution.parallel import in_order, in_threads
 from rsvib_torch.files.reading import Table
 from rsvib_torch.stacks.heap import share_one_heap
 from rsvib_torch.stacks.job import StackJob, StoredWindow, WindowFrames, WindowResult, read_windows

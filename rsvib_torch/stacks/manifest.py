@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median, stdev
@@ -61,6 +62,12 @@ class StackManifest(Result, file_format="rsvib stack"):
             if record.window != number:
                 raise ValueError(f"windows[{number}].window: expected {number}, got {record.window}")
 
+    @cached_property
+    def timing(self) -> SensorTiming:
+        """The sensor."""
+        found: SensorTiming = decode(SensorTiming, self.settings.get("sensor"), "settings.sensor")
+        return found
+
     def summary(self) -> str:
         """Tones over the windows, what was restored, and what failed."""
         vibration, restoration = self.lines()
@@ -87,9 +94,8 @@ class StackManifest(Result, file_format="rsvib stack"):
         """Each detection with its window, its frame if it is that of a frame, and the middle of its frames in s."""
         starts, half_frame = None, 0.0
         if self.settings.get("sensor") is not None:
-            timing = decode(SensorTiming, self.settings["sensor"], "settings.sensor")
-            half_frame = timing.time_to_middle(self.input["shape"][timing.scan_axis])
-            starts = timing.frame_starts(self.windows[-1].last + 1).tolist()
+            half_frame = self.timing.time_to_middle(self.input["shape"][self.timing.scan_axis])
+            starts = self.timing.frame_starts(self.windows[-1].last + 1).tolist()
         for record in self.windows:
             found: list[tuple[int | None, DetectedVibration | None]] = [(None, record.detection)]
             if record.followed is not None and record.detection is not None:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsvib_torch.files.atomic import whole_file
-from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.atomic import check_outputs, whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike

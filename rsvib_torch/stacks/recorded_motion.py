@@ -1,7 +1,8 @@
 """Alignment of a recording with a stack of any length: some of its frames are read and compared."""
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.checks.values import refused
 from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.alignment import ClockAlignment, FittedClock, align_motion
 from rsvib_torch.gyroscope.clock_range import offset_range, outside
@@ -43,6 +45,22 @@ def compared_runs(count: int) -> list[slice]:
         return [slice(0, count)]
     firsts = np.linspace(0, count - _RUN_FRAMES, _RUNS).astype(int).tolist()
     return [slice(first, first + _RUN_FRAMES) for first in firsts]
+
+
+def mask_of_regions(regions: Sequence[str], size: tuple[int, int]) -> Tensor | None:
+    """Mask (H, W) of regions of frames, rows or rows and columns as ``400:`` or ``:60,500:``; None without regions."""
+    mask = torch.zeros(size, dtype=torch.bool, device="cpu")
+    for region in regions:
+        if not re.fullmatch(r"\d*:\d*(,\d*:\d*)?", region):
+            form = "rows, or rows and columns, such as 400: or :60,500:"
+            raise refused(ValueError, "ignore", f"must be {form}, got {region!r}")
+        part = mask[tuple(slice(*(int(end) if end else None for end in ends.split(":"))) for ends in region.split(","))]
+        if part.numel() == 0:
+            raise refused(
+                ValueError, "ignore", f"{region} has no pixel of frames of {size[0]} rows and {size[1]} columns"
+            )
+        part.fill_(True)
+    return mask if regions else None
 
 
 def part_of_stack(source: Path, info: StackInfo, timing: SensorTiming, part: slice) -> tuple[Tensor, SensorTiming]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.detection import DetectionResult
-from rsvib_torch.execution.prefetch import prefetched
+from rsvib_torch.execution.parallel import prefetched
 from rsvib_torch.tracking import TrackedFrame, VibrationTracker
 from rsvib_torch.video import VideoBorder
 from rsvib_torch.video.frame_outputs import FrameOutput

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
-from rsvib_torch.execution.prefetch import prefetched
+from rsvib_torch.execution.parallel import prefetched
 from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates

@@ -9,7 +9,7 @@ import torch
 from small_stack import TIMING, process_small, write_small
 
 import rsvib_torch as rsv
-from rsvib_torch.files.outputs import check_outputs
+from rsvib_torch.files.atomic import check_outputs
 from rsvib_torch.stacks.process import detect_stack
 
 
