@@ -43,7 +43,7 @@ class Section:
 
 
 SECTIONS: dict[str, Section] = {  # in the order of the page
-    "cost": Section("Time of detection"),
+    "cost": Section("Time of difficult inputs"),
     "finer": Section("Finer grid"),
     "mosaic": Section("Colour mosaics"),
     "pipeline": Section("Detection and restoration"),
@@ -67,7 +67,7 @@ def module_of(name: str) -> Any:
     return import_module(f"benchmarks.{name}")
 
 
-def measured_text(result: harness.StoredResult) -> str:
+def measured_text(result: argparse.Namespace) -> str:
     """Origin and tables of one result."""
     commit = "" if result.commit is None else f", commit {result.commit}"
     origin = (

@@ -40,13 +40,8 @@ RESULTS = Path(__file__).parent / "benchmarks" / "results"
 HUGE_PAGES = "THP_MEM_ALLOC_ENABLE"
 KEPT = {"MALLOC_MMAP_THRESHOLD_": str(1 << 40), "MALLOC_TRIM_THRESHOLD_": str(1 << 40), "MALLOC_TOP_PAD_": str(1 << 26)}
 ENVIRONMENT = {HUGE_PAGES: "1", **KEPT}
-_LIBRARIES = {
-    "OpenCV": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
-    "SciPy": ("scipy",),
-    "scikit-image": ("scikit-image",),
-    "Kornia": ("kornia",),
-    "NumPy": ("numpy",),
-}
+_LIBRARIES = {"OpenCV": "opencv-python-headless", "SciPy": "scipy", "scikit-image": "scikit-image", "Kornia": "kornia"}
+_LIBRARIES |= {"NumPy": "numpy"}
 BEGIN, END = "<!-- begin of the generated table -->", "<!-- end of the generated table -->"
 _NOT_FINITE = ("nan", "inf", "-inf")  # JSON has no such numbers, they are stored as text
 
@@ -216,7 +211,7 @@ def machine() -> dict[str, Any]:
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "libraries": {name: version for name in _LIBRARIES if (version := _version(name)) is not None},
+        "libraries": {name: _version(library) for name, library in _LIBRARIES.items()},
     }
 
 
@@ -243,30 +238,14 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def _version(library: str) -> str | None:
-    for distribution in _LIBRARIES[library]:
-        try:
-            return metadata.version(distribution)
-        except metadata.PackageNotFoundError:
-            continue
-    return None
+def _version(library: str) -> str:
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        return "missing"
 
 
 # Stored results
-
-
-@dataclass(frozen=True)
-class StoredResult:
-    """Result of one section."""
-
-    section: str  # name of the section
-    version: str  # version of rsvib_torch
-    commit: str | None  # commit of the working tree, with "+" if it had changes; None outside a repository
-    date: str  # date of the run, YYYY-MM-DD
-    seconds: float  # duration of the run
-    machine: dict[str, Any]  # processor, cores, threads and libraries, see ``machine``
-    options: argparse.Namespace  # options of the run
-    rows: Rows  # measured figures
 
 
 def plain(value: Any) -> Any:
@@ -289,7 +268,7 @@ def _restored(value: Any) -> Any:
 
 
 def _commit() -> str | None:
-    """Short hash of the commit of this working tree, with "+" if files of it have changed."""
+    """Short hash of the commit of this working tree, with "+" if files have changed; None outside a repository."""
 
     def git(*arguments: str) -> str:
         command = ["git", *arguments]
@@ -309,13 +288,12 @@ def today() -> str:
 _NOT_STORED = ("out", "only", "store")  # options of the run that do not concern its figures
 
 
-def _without_folder(value: Any) -> Any:
-    """The name of a file that an option states by an absolute path; other values as they are."""
-    return Path(value).name if isinstance(value, str) and Path(value).is_absolute() else value
-
-
 def write_result(section: str, rows: Rows, options: argparse.Namespace, seconds: float, folder: Path = RESULTS) -> Path:
-    """Store the figures of a section with options, version, date and machine as ``section.json`` in a folder."""
+    """Store the figures of a section with options, version, commit, date and machine as ``section.json`` in a folder.
+
+    Of files that options state, the name is stored.
+    """
+    stated = {name: value for name, value in vars(options).items() if name not in _NOT_STORED}
     content = {
         "section": section,
         "version": rsv.__version__,
@@ -323,7 +301,9 @@ def write_result(section: str, rows: Rows, options: argparse.Namespace, seconds:
         "date": today(),
         "seconds": round(seconds, 1),
         "machine": machine(),
-        "options": {name: _without_folder(value) for name, value in vars(options).items() if name not in _NOT_STORED},
+        "options": {
+            name: value.rpartition("/")[2] if isinstance(value, str) else value for name, value in stated.items()
+        },
         "rows": rows,
     }
     folder.mkdir(parents=True, exist_ok=True)
@@ -332,8 +312,7 @@ def write_result(section: str, rows: Rows, options: argparse.Namespace, seconds:
     return path
 
 
-def read_result(path: Path) -> StoredResult:
-    """Read a file that ``write_result`` wrote."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    rows, options = _restored(content["rows"]), argparse.Namespace(**_restored(content["options"]))
-    return StoredResult(**{**content, "rows": rows, "options": options})
+def read_result(path: Path) -> argparse.Namespace:
+    """Read a file that ``write_result`` wrote: its keys as attributes, and the options as those of a run."""
+    content = _restored(json.loads(path.read_text(encoding="utf-8")))
+    return argparse.Namespace(**{**content, "options": argparse.Namespace(**content["options"])})

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, get_args
 
 import griffe
+import harness
 import typer
 from architecture import table_of_packages
-from harness import with_generated_part
 
 import rsvib_torch as rsv
 from rsvib_torch.checks.validation import expected_text, fields_of
@@ -68,9 +68,10 @@ def documented(thing: object) -> dict[str, str]:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
-    cells = [[" ".join(cell.replace("``", "`").split()).replace("|", "\\|") for cell in row] for row in rows]
-    return [*(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *cells)), ""]
+    """A Markdown table of texts of docstrings."""
+    return harness.table(
+        heads, ([" ".join(cell.replace("``", "`").split()).replace("|", "\\|") for cell in row] for row in rows)
+    )
 
 
 def value_text(value: object) -> str:
@@ -175,7 +176,7 @@ def pages() -> dict[Path, str]:
         docs / "configuration.md": configuration_page(),
         docs / "commands.md": command_page(),
         docs / "reasons.md": reasons_page(),
-        architecture: with_generated_part(architecture.read_text(encoding="utf-8"), table_of_packages()),
+        architecture: harness.with_generated_part(architecture.read_text(encoding="utf-8"), table_of_packages()),
     }
 
 

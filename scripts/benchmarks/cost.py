@@ -1,22 +1,21 @@
-"""Time of detection, in seconds and FFT round trips, and of difficult inputs over that of a plain vibration.
+"""Time of difficult inputs over that of a plain vibration in as many frames of the same size.
 
-A round trip is rfft2 and irfft2 of one frame. The difficult recordings are those of ``honesty_cases`` and some of
-other shapes and numbers of frames. An input and its plain counterpart alternate, and the shortest times are compared,
-because other load on the machine can only increase them.
+The difficult recordings are those of ``honesty_cases`` and some of other shapes and numbers of frames. An input and its
+plain counterpart alternate, and the shortest times are compared, because other load on the machine can only increase
+them.
 """
 
 import argparse
 import itertools
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.honesty_cases import BLANKING, FRAME_PERIOD, of_tones, plain, record, recording, tones_of
-from harness import Rows, in_turns, named, seconds_of, shown_seconds, table_of
+from benchmarks import honesty_cases as cases
+from harness import Rows, in_turns, table_of
 
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields
@@ -28,7 +27,7 @@ OPTIONS = {
 QUICK = {"cost_size": 128, "cost_inputs": 2}
 SEED, NOISE = 5, 0.005
 CITY = partial(city_and_fields, seed=SEED)
-PLAIN_SEED, MARGIN = 11, 40  # of the plain vibration whose time is measured in round trips; px
+Recorded = tuple[torch.Tensor, rsv.SensorTiming]  # frames (T, H, W), and the stated timing
 BOUND = 3.0  # times the time of the plain recording
 OF_CLASSES = {  # recordings (class, number) of honesty_cases
     "wrong timing": (
@@ -57,31 +56,19 @@ OF_CLASSES = {  # recordings (class, number) of honesty_cases
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Input:
-    """Frames with the stated timing, and a plain recording of as many pixels."""
-
-    frames: torch.Tensor  # (T, H, W)
-    timing: rsv.SensorTiming  # the stated timing
-    plain_frames: torch.Tensor  # of the same number of pixels
-    plain_timing: rsv.SensorTiming  # their timing
+def _of(taken: cases.Recording) -> Recorded:
+    return torch.from_numpy(taken.frames).float(), taken.timing
 
 
-def _frames(values: Any) -> torch.Tensor:
-    return torch.as_tensor(np.asarray(values), dtype=torch.float32)
-
-
-def _plain(size: int, count: int) -> tuple[torch.Tensor, rsv.SensorTiming]:
-    """A plain vibration in frames of the city."""
+def _recorded(size: int, build: Callable[[np.random.Generator], cases.Case]) -> Recorded:
+    """Frames of a case."""
     generator = np.random.default_rng(SEED)
-    taken = record(plain(generator, num_frames=count, scene="city"), generator, size)
-    return _frames(taken.frames), taken.timing
+    return _of(cases.record(build(generator), generator, size))
 
 
-def _of_class(size: int, name: str, number: int) -> Input:
-    """A recording of a class, with a plain one of as many frames."""
-    taken = recording(name, number, size)
-    return Input(_frames(taken.frames), taken.timing, *_plain(size, len(taken.frames)))
+def _plain(size: int, count: int, scene: str = "city") -> Recorded:
+    """A plain vibration."""
+    return _recorded(size, partial(cases.plain, num_frames=count, scene=scene))
 
 
 def _simulated(
@@ -91,10 +78,11 @@ def _simulated(
     draw: Callable[[int, int], torch.Tensor] = CITY,
     exposure: float = 20.0,
     amplitude: tuple[float, ...] = (1.5, 1.2),
-) -> Input:
-    """A vibration of two or, with roll, three components in four frames, with a square recording of as many pixels."""
+) -> Recorded:
+    """A vibration of two or, with roll, three components in four frames."""
     height, width, count = height or size, width or size, len(amplitude)
-    timing = rsv.SensorTiming(FRAME_PERIOD / (BLANKING * height), exposure * height / 2048, BLANKING * height)
+    frame_rows = cases.BLANKING * height
+    timing = rsv.SensorTiming(cases.FRAME_PERIOD / frame_rows, exposure * height / 2048, frame_rows)
     vibration = rsv.Vibration(list(amplitude), [53.0, 65.0, 41.0][:count], [0.4, 1.3, 0.2][:count])
     frames = rsv.simulate_frames(
         draw(height + 64, width + 64),
@@ -105,7 +93,7 @@ def _simulated(
         noise=rsv.SensorNoise(read_noise=NOISE),
         generator=torch.Generator().manual_seed(SEED),
     )
-    return Input(frames, timing, *_plain(size, 4))
+    return frames, timing
 
 
 def _two_waves(height: int, width: int) -> torch.Tensor:
@@ -115,140 +103,80 @@ def _two_waves(height: int, width: int) -> torch.Tensor:
     return 0.5 + 0.25 * along + 0.2 * across[:, None]
 
 
-def _of_number(size: int, count: int, build: Callable[..., Any]) -> Input:
-    """A case in some number of frames."""
-    generator = np.random.default_rng(SEED)
-    case = build(generator)
-    taken = record(case, generator, size)
-    return Input(_frames(taken.frames), taken.timing, *_plain(size, count))
-
-
-def _many_tones(generator: np.random.Generator) -> Any:
+def _many_tones(generator: np.random.Generator) -> cases.Case:
     """Six tones along each axis in eight frames."""
     axes = [
-        tones_of(generator, generator.uniform(0.3, 2.0, 6).tolist(), generator.uniform(10.0, 250.0, 6).tolist())
+        cases.tones_of(generator, generator.uniform(0.3, 2.0, 6).tolist(), generator.uniform(10.0, 250.0, 6).tolist())
         for _ in range(2)
     ]
-    return of_tones(*axes, num_frames=8)
+    return cases.of_tones(*axes, num_frames=8)
 
 
-def _still(size: int, *, uniform: bool) -> Input:
+def _still(size: int, *, uniform: bool) -> Recorded:
     """Frames of a camera at rest, of the city or of a uniform surface."""
     frames, timing = _plain(size, 4)
     noise = NOISE * torch.randn(frames.shape, generator=torch.Generator().manual_seed(SEED))
-    scene = torch.full_like(frames[:1], 0.5) if uniform else frames[:1]
-    return Input(scene + noise, timing, frames, timing)
+    return (torch.full_like(frames[:1], 0.5) if uniform else frames[:1]) + noise, timing
 
 
-def inputs() -> dict[str, Callable[[int], Input]]:
-    """Functions of the size, by name."""
-    built: dict[str, Callable[[int], Input]] = {
-        f"{kind}: {name} {number}": partial(_of_class, name=name, number=number)
-        for kind, classes in OF_CLASSES.items()
-        for name, number in classes
-    }
-    built["no vibration"] = partial(_still, uniform=False)
-    built["uniform image"] = partial(_still, uniform=True)
-    built["six tones, 8 frames"] = partial(_of_number, count=8, build=_many_tones)
-    built["30 frames"] = partial(_of_number, count=30, build=partial(plain, num_frames=30, scene="texture"))
-    built["periodic scene"] = partial(_simulated, draw=_two_waves)
-    built["exposure 200, 3 and 5 px"] = partial(_simulated, exposure=200.0, amplitude=(3.1, 5.2))
-    built["roll, exposure 200"] = lambda size: _simulated(size, exposure=200.0, amplitude=(1.5, 1.2, 1 / size))
-    built["long frames"] = lambda size: _simulated(size, 4 * size, size // 4)
-    built["wide frames"] = lambda size: _simulated(size, max(96, size // 4), size * size // max(96, size // 4))
-    return built
+# functions of the size, by name
+INPUTS: dict[str, Callable[[int], Recorded]] = {
+    f"{kind}: {name} {number}": lambda size, name=name, number=number: _of(cases.recording(name, number, size))
+    for kind, classes in OF_CLASSES.items()
+    for name, number in classes
+} | {
+    "no vibration": partial(_still, uniform=False),
+    "uniform image": partial(_still, uniform=True),
+    "six tones, 8 frames": partial(_recorded, build=_many_tones),
+    "30 frames": partial(_plain, count=30, scene="texture"),
+    "periodic scene": partial(_simulated, draw=_two_waves),
+    "exposure 200, 3 and 5 px": partial(_simulated, exposure=200.0, amplitude=(3.1, 5.2)),
+    "roll, exposure 200": lambda size: _simulated(size, exposure=200.0, amplitude=(1.5, 1.2, 1 / size)),
+    "long frames": lambda size: _simulated(size, 4 * size, size // 4),
+    "wide frames": lambda size: _simulated(size, max(96, size // 4), size * size // max(96, size // 4)),
+}
 
 
-def _timed(frames: torch.Tensor, timing: rsv.SensorTiming) -> tuple[float, float | None, str]:
-    """Seconds of detection and of restoration with its result, and the first reason against it."""
-    found: list[rsv.DetectionResult] = []
-    try:
-        detection = seconds_of(lambda: found.append(rsv.detect_vibration(frames, timing)))
-    except ValueError as error:
-        return 0.0, None, f"error: {error}"
-    restoration = seconds_of(lambda: rsv.restore(frames, timing, found[0]))
-    codes = [reason.code for of_axis in found[0].findings for reason in of_axis]
-    return detection, restoration, codes[0] if codes else ""
-
-
-def measure(task: Input, runs: int) -> dict[str, Any]:
-    """Ratios of the shortest times, and the outcome."""
-    seconds: list[tuple[float, ...]] = []
-    reason = ""
+def measure(difficult: Recorded, simple: Recorded, runs: int) -> dict[str, Any]:
+    """Shortest times of both recordings and their ratios, and the first reason against the difficult one."""
+    works: dict[str, Callable[[], Any]] = {}
+    for kind, recorded in (("plain_", simple), ("", difficult)):
+        found = rsv.detect_vibration(*recorded)
+        works[f"{kind}detection"] = partial(rsv.detect_vibration, *recorded)
+        works[f"{kind}restoration"] = partial(rsv.restore, *recorded, found)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rsv.RestorationWarning)
-        for _ in range(max(1, runs)):
-            own = _timed(task.frames, task.timing)
-            reason = own[2]
-            normal = _timed(task.plain_frames, task.plain_timing)
-            seconds.append((own[0], own[1] or 0.0, normal[0], normal[1] or 0.0))
-    detection, restoration, plain_detection, plain_restoration = (min(values) for values in zip(*seconds, strict=True))
-    return {
-        "shape": list(task.frames.shape),
-        "detection": detection,
-        "plain_detection": plain_detection,
-        "restoration": restoration,
-        "plain_restoration": plain_restoration,
-        "detection_ratio": detection / plain_detection,
-        "restoration_ratio": restoration / plain_restoration,
-        "reason": reason,
-    }
-
-
-def plain_rows(options: argparse.Namespace) -> Rows:
-    """Time of each method for two and four frames of a plain vibration, alternating with the round trip."""
-    timing = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=options.size)
-    vibration = rsv.Vibration([3.1, 5.2], [50.0, 30.0], [0.7, 2.1])
-    scene = city_and_fields(options.size + 2 * MARGIN, options.size + 2 * MARGIN, seed=PLAIN_SEED)
-    frames = rsv.simulate_frames(scene, timing, vibration, 4, frame_size=(options.size, options.size))
-    frames = frames + NOISE * torch.randn(frames.shape, generator=torch.Generator().manual_seed(PLAIN_SEED))
-    results = []
-    for device in options.device:
-        taken = frames.to(device)
-        tasks = {"round trip": lambda f=taken: torch.fft.irfft2(torch.fft.rfft2(f[0]))}
-        for method, count in itertools.product(("bands", "direct"), (2, 4)):
-            tasks[f"{method}, {count} frames"] = partial(rsv.detect_vibration, taken[:count], timing, method=method)
-        done = in_turns(tasks, options.runs)
-        unit = done["round trip"].seconds
-        results += [
-            {"name": named(name, device), **timed.figures(), "round_trips": timed.seconds / unit}
-            for name, timed in done.items()
-        ]
-    return results
+        least = {name: min(timed.runs) for name, timed in in_turns(works, runs).items()}
+    ratios = {f"{step}_ratio": least[step] / least[f"plain_{step}"] for step in ("detection", "restoration")}
+    codes = [reason.code for of_axis in found.findings for reason in of_axis]
+    return {"shape": list(difficult[0].shape), **least, **ratios, "reason": codes[0] if codes else ""}
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    """Time of a plain vibration, then of all difficult inputs."""
-    return plain_rows(options) + [
-        {"part": "bounded", "name": name, **measure(build(options.cost_size), options.runs)}
-        for name, build in itertools.islice(inputs().items(), options.cost_inputs)
-    ]
+    """Times of all difficult inputs."""
+    size, results = options.cost_size, []
+    for name, build in itertools.islice(INPUTS.items(), options.cost_inputs):
+        difficult = build(size)
+        results.append({"name": name, **measure(difficult, _plain(size, len(difficult[0])), options.runs)})
+    return results
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """Both tables in Markdown; the difficult inputs with the slowest first."""
-    plain_cases = [row for row in results if row.get("part") != "bounded"]
-    difficult = [row for row in results if row.get("part") == "bounded"]
+    """The table in Markdown, with the slowest first."""
     both = {
         row["name"]: (row["detection"] + row["restoration"]) / (row["plain_detection"] + row["plain_restoration"])
-        for row in difficult
+        for row in results
     }
-    of_parts = [[row[f"{of}_ratio"] for row in difficult] for of in ("detection", "restoration")]
+    of_parts = [[row[f"{of}_ratio"] for row in results] for of in ("detection", "restoration")]
     beyond = [sum(ratio > BOUND for ratio in ratios) for ratios in (list(both.values()), *of_parts)]
     return [
-        *table_of(
-            plain_cases,
-            (f"detection, {options.size}^2", "{name}"),
-            ("seconds", shown_seconds),
-            ("FFT round trips", "{round_trips:.1f}"),
-        ),
-        f"{len(difficult)} difficult inputs of {options.cost_size} x {options.cost_size} px, or as many pixels; times "
+        f"{len(results)} difficult inputs of {options.cost_size} x {options.cost_size} px, or as many pixels; times "
         "over those of a plain vibration of the same size, the shortest of alternating runs. Restoration uses the "
         f"result of detection. More than {BOUND:g} times as long: both together of {beyond[0]} inputs, detection of "
         f"{beyond[1]}, restoration of {beyond[2]}.",
         "",
         *table_of(
-            sorted(difficult, key=lambda row: -both[row["name"]]),
+            sorted(results, key=lambda row: -both[row["name"]]),
             ("input", "{name}"),
             ("frames", "{shape[0]} of {shape[1]} x {shape[2]}"),
             ("detection (s)", "{detection:.2f}"),
