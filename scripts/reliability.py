@@ -47,7 +47,7 @@ ATTACKS: dict[str, Attack] = {
     "links": Attack("links and foreign files as work folders", 110),
     "inputs": Attack("outputs that are or contain inputs", 250),
     "concurrent": Attack("several runs with one output", 45),
-    "disks": Attack("full and read-only disks", 69),
+    "disks": Attack("full and read-only disks", 66),
     "live_sessions": Attack("recordings of a camera", 204),
     "memory": Attack("`--memory` in different layouts", 15),
     "crafted": Attack("crafted files", 200),

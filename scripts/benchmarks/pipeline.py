@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
+from benchmarks import library_chain as libraries
 from benchmarks.independent_camera import Shake, closed, take_frames
-from benchmarks.library_chain import detect_by_libraries
-from benchmarks.restoration_peers import remap_lanczos, sampled_rows, slabs_and_kernels, wiener_loop, wiener_rows
 from harness import Rows, Timed, in_turns, named, shown_seconds, table, table_of
 from torch import Tensor
 
@@ -128,12 +127,12 @@ def quality(restored: Tensor, still: Tensor) -> float:
 
 def compare_chains(frames: Tensor, still: Tensor, timing: rsv.SensorTiming) -> Rows:
     """Errors of the vibration, and the PSNR of the worse of the two frames, of every chain."""
-    array, lib = frames.numpy(), detect_by_libraries(frames.numpy(), timing)
+    array, lib = frames.numpy(), libraries.detect_by_libraries(frames.numpy(), timing)
     try:
-        by_rows = min(wiener_rows(array[i], timing, lib, still, RIM, i) for i in range(2))
+        by_rows = min(libraries.wiener_rows(array[i], timing, lib, still, RIM, i) for i in range(2))
     except ValueError:  # kernels of a row loop are larger than its slabs, because the detection failed
         by_rows = math.nan
-    remapped = min(quality(remap_lanczos(array[i], timing, lib, i), still) for i in range(2))
+    remapped = min(quality(libraries.remap_lanczos(array[i], timing, lib, i), still) for i in range(2))
     results = [
         {"chain": PAPER, **errors_of(lib), "psnr_db": by_rows, "reliable": None},
         {"chain": FASTEST, **errors_of(lib), "psnr_db": remapped, "reliable": None},
@@ -187,13 +186,14 @@ def speed(options: argparse.Namespace) -> Rows:
             },
         }
         if device == "cpu":
-            array, rows_ = frames.numpy(), sampled_rows(size, RIM)
-            lib = detect_by_libraries(array, timing)
-            works["libraries"] = lambda a=array: detect_by_libraries(a, timing)
+            array, rows_ = frames.numpy(), libraries.sampled_rows(size, RIM)
+            lib = libraries.detect_by_libraries(array, timing)
+            works["libraries"] = lambda a=array: libraries.detect_by_libraries(a, timing)
             works["wiener"] = lambda a=array, r=rows_, v=lib: [
-                wiener_loop(slabs_and_kernels(a[i], r, timing, v, i), TIMED_BALANCE) for i in range(2)
+                libraries.wiener_loop(libraries.slabs_and_kernels(a[i], r, timing, v, i), TIMED_BALANCE)
+                for i in range(2)
             ]
-            works["remap"] = lambda a=array, v=lib: [remap_lanczos(a[i], timing, v, i) for i in range(2)]
+            works["remap"] = lambda a=array, v=lib: [libraries.remap_lanczos(a[i], timing, v, i) for i in range(2)]
             chains = {PAPER: ("libraries", "wiener"), FASTEST: ("libraries", "remap"), **chains}
         done = in_turns(works, options.runs)
         if "wiener" in done:
