@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
@@ -24,11 +24,9 @@ import rsvib_torch as rsv
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
 from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.files.atomic import whole_folder
-from rsvib_torch.options import DetectionMethod
 from rsvib_torch.report import Report, write_report_page
 from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
 from rsvib_torch.report.results import write_offsets, write_vibration
-from rsvib_torch.restoration.restore import METHODS
 from rsvib_torch.text import text_table
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -104,7 +102,6 @@ def before_after(frame: Tensor, restored: Tensor, still: Tensor) -> Figure:
 def run(name: str, options: argparse.Namespace, arguments: Sequence[str], console: Console) -> None:
     """Simulate, detect, restore and evaluate one scene, and write all results to a folder of its name."""
     size, out = (2048, 320 if options.quick else 2048), options.out / name
-    chosen = {"method": options.restoration} if options.restoration else {}
     generator = torch.Generator().manual_seed(options.seed)
     phase = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1) * math.pi
     truth = rsv.Vibration(AMPLITUDE, FREQUENCY, phase)
@@ -113,9 +110,9 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
         noise = rsv.SensorNoise(read_noise=NOISE, bits=12)
         frames = rsv.simulate_frames(scene, TIMING, truth, 2, frame_size=size, noise=noise, generator=generator)
     with working(f"{name}: detecting the vibration"):
-        detection = rsv.detect_vibration(frames, TIMING, method=options.detection)
+        detection = rsv.detect_vibration(frames, TIMING)
     with working(f"{name}: restoring both frames"):
-        restored = rsv.restore(frames, TIMING, detection.vibration, **chosen)
+        restored = rsv.restore(frames, TIMING, detection.vibration)
         verdict = rsv.judge_restoration(frames, restored, TIMING, detection.vibration)
     still = scene[MARGIN:-MARGIN, MARGIN:-MARGIN]
     quality = {
@@ -142,8 +139,6 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
             timing=TIMING,
             detection=detection,
             verdict=verdict,
-            left_alone=(),
-            options=chosen,
             version=rsv.__version__,
             command=shlex.join(["python", "scripts/demo.py", *arguments]),
         )
@@ -159,8 +154,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder to write to (default: out/demo)")
     parser.add_argument("--seed", type=int, default=2023, help="seed of scene, phases and noise (default: 2023)")
     parser.add_argument("--quick", action="store_true", help="narrow frames: 2048 rows of 320 px")
-    parser.add_argument("--detection", choices=get_args(DetectionMethod), default="direct", help="default: direct")
-    parser.add_argument("--restoration", choices=tuple(METHODS), help="method of restoration")
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(arguments)
     console = Console(highlight=False, width=None if sys.stdout.isatty() else 100)

@@ -35,7 +35,7 @@ SECTIONS = {
     "Method": "method conventions verdicts reasons bound accuracy benchmarks",
     "Development": "architecture ablation CONTRIBUTING SECURITY CHANGELOG",
 }
-DOCUMENTATION = ROOT / "scripts" / "documentation"  # extensions of the builder, and files of the site
+DOCUMENTATION = ROOT / "scripts" / "documentation"  # settings and extensions of the builder, and files of the site
 STYLE, SEARCH_SHIM = "site.css", "iframe-worker.js"
 BUILDERS = ("mkdocs", "mkdocstrings", "material", "nbconvert", "latex2mathml", "ziamath")
 OUTSIDE_DOCS = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")  # pages that lie at the top level of the project
@@ -118,63 +118,6 @@ def write_sources(folder: Path) -> list[object]:
     return navigation
 
 
-def settings(sources: Path, navigation: list[object], site: Path) -> dict[str, object]:
-    """Configuration of MkDocs."""
-    options = {
-        "docstring_style": "google",
-        "extensions": [str(DOCUMENTATION / "examples.py")],
-        "show_source": False,
-        "show_root_heading": True,
-        "show_root_full_path": False,
-        "show_root_toc_entry": True,
-        "merge_init_into_class": True,
-        "members_order": "source",
-        "filters": ["!^_"],
-        "separate_signature": True,
-        "show_overloads": False,  # the implementation lists all options
-        "show_signature_annotations": True,
-    }
-    return {
-        "site_name": "rsvib_torch",
-        "docs_dir": str(sources),
-        "site_dir": str(site),
-        "nav": navigation,
-        "validation": {"unrecognized_links": "warn", "anchors": "warn", "absolute_links": "warn"},
-        "theme": {
-            "name": "material",
-            "font": False,  # fonts of the system; others are loaded from the network
-            "features": ["navigation.tabs", "navigation.footer", "toc.follow", "content.code.copy", "search.highlight"],
-            "icon": {"logo": "material/sine-wave"},
-            "palette": [
-                {
-                    "media": f"(prefers-color-scheme: {scheme})",
-                    "scheme": name,
-                    "primary": "indigo",
-                    "toggle": {"icon": f"material/weather-{icon}", "name": f"Change to {other} colours"},
-                }
-                for scheme, name, icon, other in (
-                    ("light", "default", "sunny", "dark"),
-                    ("dark", "slate", "night", "light"),
-                )
-            ],
-        },
-        "extra": {"generator": False, "polyfills": [SEARCH_SHIM]},
-        "extra_css": [STYLE],
-        "markdown_extensions": [
-            "tables",
-            "formulas",
-            "pymdownx.superfences",
-            {"pymdownx.highlight": {"guess_lang": False}},
-            {"toc": {"permalink": True}},
-        ],
-        "plugins": [
-            "search",
-            "offline",
-            {"mkdocstrings": {"handlers": {"python": {"paths": [str(ROOT)], "options": options}}}},
-        ],
-    }
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
@@ -186,10 +129,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sources = Path(folder) / "sources"
         navigation = write_sources(sources)
         config = Path(folder) / "mkdocs.yml"
-        # JSON is YAML
-        config.write_text(json.dumps(settings(sources, navigation, site)), encoding="utf-8")
+        folders = {"docs_dir": str(sources), "site_dir": str(site)}
+        settings = {"INHERIT": str(DOCUMENTATION / "mkdocs.yml"), **folders, "nav": navigation}
+        config.write_text(json.dumps(settings), encoding="utf-8")  # JSON is YAML
         command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--clean", "-f", str(config)]
-        paths = [str(DOCUMENTATION), *filter(None, [os.environ.get("PYTHONPATH")])]
+        paths = [str(DOCUMENTATION), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
         # the theme prints an advertisement of another builder without NO_MKDOCS_2_WARNING
         variables = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "NO_MKDOCS_2_WARNING": "1"}
         code = subprocess.run(command, check=False, env=variables).returncode

@@ -146,14 +146,12 @@ DRAWINGS: dict[str, Callable[[], Figure]] = {
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "drawings", help="folder (default: docs/drawings)")
-    parser.add_argument("--format", choices=("svg", "png"), default="svg")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     mpl.rcParams["svg.hashsalt"] = "rsvib_torch"  # identifiers that do not change from run to run
     mpl.rcParams["svg.fonttype"] = "none"  # text stays text: smaller files that can be searched
     for name, draw in DRAWINGS.items():
-        metadata = {"Date": None} if options.format == "svg" else None
-        draw().savefig(options.out / f"{name}.{options.format}", metadata=metadata, dpi=110)
+        draw().savefig(options.out / f"{name}.svg", metadata={"Date": None})
     print(f"{len(DRAWINGS)} drawings are in {options.out}")
 
 

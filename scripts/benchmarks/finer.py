@@ -1,19 +1,20 @@
 """Joint restoration on a grid of half pixels, compared with still frames, other software and the grid of pixels.
 
-Frames come from cameras that alias and are made without the package, see ``independent_camera``, and for roll
-``honesty_camera``. The vibration is detected in the frames of the first table, and given in those of the second.
+Other software is drizzle, and shift-and-add: both put every pixel where it was on the scene, the mean displacement of
+its row, with the best of several parameters. Frames come from cameras that alias and are made without the package, see
+``independent_camera``, and for roll ``honesty_camera``. The vibration is detected in the frames of the first table, and
+given in those of the second.
 """
 
 import argparse
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from benchmarks import honesty_camera
-from benchmarks.finer_peers import drizzled, shift_and_add
 from benchmarks.independent_camera import (
     ALIASING,
     POINTS_PER_PX,
@@ -30,6 +31,11 @@ from scipy import ndimage
 
 import rsvib_torch as rsv
 
+try:
+    from drizzle.resample import Drizzle
+except ImportError:  # extra ``compare``
+    Drizzle = None
+
 OPTIONS = {
     "scenes": (tuple(SCENES), "drawn scenes to compare on", SCENES),
     "finer_size": (256, "finer: rows and columns of the frames"),
@@ -40,6 +46,8 @@ ROW_TIME, EXPOSURE_ROWS, MARGIN, FADE, RIM, SEED = 20.52e-6, 20, 32, 60, 24, 1
 OPTICS = (0.3, 0.5)
 FRAMES = (2, 4, 8)
 SHAKE = Shake(np.array([[3.1], [5.2]]), np.array([[90.0], [61.0]]), np.array([[0.4], [1.3]]), np.zeros(2))
+WIDTHS = (0.3, 0.5, 0.7, 1.0)  # of the Gaussian of shift-and-add, points of the half-pixel grid
+FRACTIONS = (0.4, 0.6, 0.8, 1.0)  # sizes of the drops of drizzle
 
 
 def decibel(image: Array, truth: Array, rim: int = RIM) -> float:
@@ -120,6 +128,57 @@ def rolling(fine: Array, size: int, roll: float) -> Recording:
             standing = honesty_camera.standing(-0.5 * right, -0.5 * down)
             half[down::2, right::2] = honesty_camera.take_frames(layers, standing, starts[:1], 1e-9, size)[0]
     return Recording(frames, half, timing, rsv.Vibration(amplitude, frequency, phase))
+
+
+def places(frames: torch.Tensor, timing: rsv.SensorTiming, vibration: rsv.Vibration) -> tuple[Array, Array]:
+    """Columns and rows (T, H, W) of all pixels on the half-pixel grid of the scene."""
+    count, height, width = frames.shape
+    starts = np.arange(count)[:, None] * timing.frame_period + np.arange(height) * timing.row_time
+    moved = vibration.mean_displacement(torch.from_numpy(starts), timing.exposure_time).numpy()
+    columns = np.arange(width) - moved[..., 0, None]
+    rows = np.broadcast_to((np.arange(height) - moved[..., 1])[..., None], columns.shape)
+    return 2 * columns, 2 * rows
+
+
+def _filled(total: Array, weight: Array, sigma: float) -> Array:
+    """Weighted mean with a Gaussian; points without data from their neighbourhood."""
+    image, known = np.zeros_like(total), np.zeros(total.shape, dtype=bool)
+    for width in (sigma, 1.0, 2.0, 4.0, 8.0):
+        smooth = ndimage.gaussian_filter(weight, width)
+        found = ~known & (smooth > 1e-3)
+        image[found] = ndimage.gaussian_filter(total, width)[found] / smooth[found]
+        known |= found
+    return image
+
+
+def shift_and_add(frames: torch.Tensor, timing: rsv.SensorTiming, vibration: rsv.Vibration) -> Iterator[Array]:
+    """Images of several widths: bilinear shares of all pixels, added and divided by their sum."""
+    columns, rows = places(frames, timing, vibration)
+    shape = 2 * frames.shape[-2], 2 * frames.shape[-1]
+    total, weight, values = np.zeros(shape), np.zeros(shape), frames.double().numpy()
+    for down in (0, 1):
+        for right in (0, 1):
+            i, j = np.floor(rows).astype(int) + down, np.floor(columns).astype(int) + right
+            share = (1 - np.abs(rows - i)) * (1 - np.abs(columns - j))
+            inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1])
+            np.add.at(total, (i[inside], j[inside]), (share * values)[inside])
+            np.add.at(weight, (i[inside], j[inside]), share[inside])
+    for width in WIDTHS:
+        yield _filled(total, weight, width)
+
+
+def drizzled(frames: torch.Tensor, timing: rsv.SensorTiming, vibration: rsv.Vibration) -> Iterator[Array]:
+    """Images of drizzle for several sizes of the drops; none if it is not installed."""
+    if Drizzle is None:
+        return
+    columns, rows = places(frames, timing, vibration)
+    shape = 2 * frames.shape[-2], 2 * frames.shape[-1]
+    for fraction in FRACTIONS:
+        drops = Drizzle(kernel="square", out_shape=shape, fillval="0")
+        for frame, column, row in zip(frames.numpy(), columns, rows, strict=True):
+            drops.add_image(frame.astype(np.float32), exptime=1.0, pixmap=np.stack([column, row], -1), pixfrac=fraction)
+        image, weight = np.asarray(drops.out_img, float), np.asarray(drops.out_wht, float)
+        yield np.where(weight > 0, image, _filled(image * weight, weight, 1.0))
 
 
 def cases(name: str, options: argparse.Namespace, sigma: float) -> Rows:

@@ -15,11 +15,10 @@ The loss is the PSNR of the first two frames restored with the correct timing le
 """
 
 import argparse
-import multiprocessing
+import itertools
 import warnings
 import zlib
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,9 +35,8 @@ OPTIONS = {
     "mistake_vibrations": (3, "timing: vibrations of each scene"),
     "mistake_scenes": (("city", "chart", "text"), "timing: scenes"),
     "mistake_names": ((), "timing: mistakes, all if none are named", str),
-    "mistake_processes": (2, "timing: processes"),
 }
-QUICK = {"mistake_size": 128, "mistake_vibrations": 1, "mistake_scenes": ("city",), "mistake_processes": 1}
+QUICK = {"mistake_size": 128, "mistake_vibrations": 1, "mistake_scenes": ("city",)}
 QUICK |= {"mistake_names": ("none", "frame_rows = image height")}
 NUM_FRAMES = (2, 4, 8, 12)
 EXPOSURE = 100.0  # rows of a frame of 2048 rows, so that twice and half of it differ in their blur
@@ -76,11 +74,6 @@ def wrong_row_time(factor: float) -> Mistake:
     return scaled("frame_rows", "other_frame_rows", **factors)
 
 
-def wrong_times(factor: float) -> Mistake:
-    """Another row time, with the correct ratios: all times are wrong by the same factor."""
-    return scaled("row_time", "other_row_time", row_time=factor)
-
-
 MISTAKES: dict[str, Mistake] = {
     "none": Mistake(lambda timing: timing, "none", ""),
     **{
@@ -96,7 +89,7 @@ MISTAKES: dict[str, Mistake] = {
     "scan axis exchanged": Mistake(lambda timing: replace(timing, scan_axis="x"), "scan axis", "other_scan_axis"),
     "frame_rows = image height": wrong_frame_rows(1 / BLANKING),
     # all times are wrong by one factor; every other factor gives the same result, with frequencies over this factor
-    "row_time = 1 / (frame rate x height)": wrong_times(BLANKING),
+    "row_time = 1 / (frame rate x height)": scaled("row_time", "other_row_time", row_time=BLANKING),
     "both of these": wrong_row_time(BLANKING),
 }
 
@@ -143,32 +136,20 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
         codes = [reason.code for reason in found.findings[axis]]
         case["named"].append(outcome == "detected" and mistake.code in codes)
         case["reasons"].append(reasons)
-    case["warnings"], case["assumptions"] = warned, list(found.assumptions)
     case["restored_db"] = psnr(restored.double().numpy(), first, stills)
     return case
 
 
-def judge_recording(scene: str, number: int, size: int, names: tuple[str, ...]) -> Rows:
-    """Outcomes of all mistakes with a recording."""
-    with one_thread():
-        taken = take(scene, number, size)
-        return [
-            {"scene": scene, "number": number} | judge_mistake(taken, name, count)
-            for count in NUM_FRAMES
-            for name in names or MISTAKES
-        ]
-
-
 def rows(options: argparse.Namespace) -> Rows:
     """All mistakes with all recordings."""
-    recordings = [
-        (scene, number, options.mistake_size, tuple(options.mistake_names))
-        for scene in options.mistake_scenes
-        for number in range(options.mistake_vibrations)
-    ]
-    with ProcessPoolExecutor(options.mistake_processes, multiprocessing.get_context("spawn")) as pool:
-        done = list(pool.map(judge_recording, *zip(*recordings, strict=True)))
-    return [case for cases in done for case in cases]
+    with one_thread():
+        return [
+            {"scene": scene, "number": number, **judge_mistake(taken, name, count)}
+            for scene, number in itertools.product(options.mistake_scenes, range(options.mistake_vibrations))
+            for taken in [take(scene, number, options.mistake_size)]
+            for count in NUM_FRAMES
+            for name in options.mistake_names or MISTAKES
+        ]
 
 
 def share(cases: Rows, outcome: str) -> float:
