@@ -173,7 +173,7 @@ def colour_mosaic() -> Figure:
 
 
 def tracking() -> Figure:
-    """A tone that sweeps and grows, as the tracker follows it, and its spectrogram."""
+    """Errors of a tone that sweeps and grows, as the tracker follows it, and its spectrogram."""
     size, count, motion = 256, 90, live.Changing(sweep=2.0, doublings=0.5)
     timing = live.timing_of(size)
     middle = 0.5 * (size - 1 + live.EXPOSURE_ROWS) * timing.row_time
@@ -188,47 +188,30 @@ def tracking() -> Figure:
         times.append(tracked.time + middle)
         values.append([found.vibration.frequency[:, 0].tolist(), found.vibration.amplitude[:, 0].tolist()])
         stds.append([found.std.frequency[:, 0].tolist(), found.std.amplitude[:, 0].tolist()])
-    when, found_values, found_stds = np.array(times), np.array(values), np.array(stds)
-    truth = motion.frequency(when), motion.amplitude(when)
-    figure = Figure(figsize=(13, 5.6), layout="constrained")
-    panels = figure.subplots(2, 3, sharex="col", width_ratios=(1, 1, 1.15))
-    for place, unit in enumerate(("frequency (Hz)", "amplitude (px)")):
-        for axis, name in enumerate("xy"):
-            start = truth[place][axis, 0]
-            panels[place, 0].plot(when, truth[place][axis] - start, color="#8a8a8a", linewidth=3, alpha=0.6)
-            panels[place, 0].plot(when, found_values[:, place, axis] - start, color=COLOURS[axis], label=name)
-            error = found_values[:, place, axis] - truth[place][axis]
-            panels[place, 1].plot(when, error, color=COLOURS[axis])
-            deviation = 2 * found_stds[:, place, axis]
-            panels[place, 1].fill_between(when, -deviation, deviation, color=COLOURS[axis], alpha=0.15, linewidth=0)
-        panels[place, 0].set_ylabel(f"change of the {unit}")
-        panels[place, 1].set_ylabel(f"error of the {unit}")
-    limit = 3 * float(np.quantile(np.abs(found_values[:, 0, 0] - truth[0][0]), 0.8))
-    panels[0, 1].set_ylim(-limit, limit)
-    panels[1, 1].set_ylim(-0.12, 0.12)
-    panels[0, 0].legend(frameon=False)
-    columns, frequencies, amplitude = spectrogram.result()
-    for panel, picture, name in zip(panels[:, 2], amplitude, "xy", strict=True):
-        step = columns[1] - columns[0]
-        image = panel.pcolormesh(
-            np.append(columns, columns[-1] + step),
-            np.append(frequencies, 2 * frequencies[-1] - frequencies[-2]),
-            picture.T,
-            vmin=0,
-            cmap="viridis",
-            rasterized=True,
-        )
-        panel.set_ylabel(f"frequency along {name} (Hz)")
-        figure.colorbar(image, ax=panel, label="amplitude (px)")
-    for panel in panels[:, :2].flat:
+    when, truth = np.array(times), (motion.frequency(np.array(times)), motion.amplitude(np.array(times)))
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    panels = figure.subplots(2, 2, sharex="col")
+    for place, (quantity, limit) in enumerate((("frequency (Hz)", 0.25), ("amplitude (px)", 0.12))):
+        panel = panels[place, 0]
+        for axis, (name, colour) in enumerate(zip("xy", COLOURS, strict=True)):
+            error = np.array(values)[:, place, axis] - truth[place][axis]
+            deviation = 2 * np.array(stds)[:, place, axis]
+            panel.plot(when, error, color=colour, label=name)
+            panel.fill_between(when, -deviation, deviation, color=colour, alpha=0.15, linewidth=0)
+        panel.set(ylabel=f"error of the {quantity}", ylim=(-limit, limit))
         panel.axvline(live.BEFORE, color="#d9d9d9", linewidth=1, zorder=0)
         panel.spines[["top", "right"]].set_visible(False)
+    panels[0, 0].legend(frameon=False)
+    columns, frequencies, amplitude = spectrogram.result()
+    for panel, picture, name in zip(panels[:, 1], amplitude, "xy", strict=True):
+        image = panel.pcolormesh(columns, frequencies, picture.T, shading="nearest", vmin=0, rasterized=True)
+        panel.set_ylabel(f"frequency along {name} (Hz)")
+        figure.colorbar(image, ax=panel, label="amplitude (px)")
     for panel in panels[1]:
         panel.set_xlabel("time (s)")
     figure.suptitle(
         f"{live.FREQUENCY[0]:.0f} Hz along x, swept by {motion.sweep:g} Hz/s and grown by "
-        f"{100 * (2**motion.doublings - 1):.0f} % per second from {live.BEFORE} s on; {live.RATE} frames/s "
-        "(grey: truth)",
+        f"{100 * (2**motion.doublings - 1):.0f} % per second from {live.BEFORE} s on; {live.RATE} frames/s",
         fontsize=10,
     )
     return figure

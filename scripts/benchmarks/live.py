@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -99,14 +100,14 @@ class Repeated:
 
 @dataclass
 class Output:
-    """An output that keeps some of the frames."""
+    """An output that keeps the frames or not."""
 
-    kept: slice = field(default_factory=lambda: slice(0))
+    keeps: bool = False
     frames: list[NDArray[np.uint8]] = field(default_factory=list)
 
     def write(self, frame: NDArray[np.uint8], index: int) -> None:
         """Take a frame."""
-        if self.kept.start is not None and self.kept.start <= index < self.kept.stop:
+        if self.keeps:
             self.frames.append(frame)
 
     def close(self) -> None:
@@ -183,14 +184,9 @@ def change(name: str, size: int, motion: Changing) -> dict[str, Any]:
         if tracked.detection is not None:
             error = errors(tracked.detection, motion.amplitude(when), motion.frequency(when))
             found.append([abs(error[0, 0]) / motion.amplitude(when)[0], abs(error[1, 0])])
-    return {
-        "name": name,
-        "size": size,
-        "amplitude": np.sqrt(np.mean(np.square(found), 0))[0],
-        "frequency": np.sqrt(np.mean(np.square(found), 0))[1],
-        "lost": lost,
-        "detections": detections,
-    }
+    amplitude, frequency = np.sqrt(np.mean(np.square(found), 0)).tolist()
+    errors_of = {"amplitude": amplitude, "frequency": frequency}
+    return {"name": name, "size": size, **errors_of, "lost": lost, "detections": detections}
 
 
 def residual(frames: NDArray[np.uint8], size: int) -> tuple[float, float]:
@@ -203,16 +199,13 @@ def residual(frames: NDArray[np.uint8], size: int) -> tuple[float, float]:
 
 def phase_correlated(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Frames moved back by the whole-frame offset of OpenCV's phase correlation."""
-    first, place, results = pixels[0].astype(np.float32), np.zeros(2), [pixels[0]]
-    height, width = first.shape
-    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
-    before = first
-    for frame in pixels[1:]:
-        now = frame.astype(np.float32)
-        place = place + cv2.phaseCorrelate(before.copy(), now.copy(), window)[0]
+    place, results = np.zeros(2), [pixels[0]]
+    size = pixels.shape[:0:-1]  # width, height
+    window = cv2.createHanningWindow(size, cv2.CV_32F)
+    for before, frame in pairwise(pixels):
+        place = place + cv2.phaseCorrelate(before.astype(np.float32), frame.astype(np.float32), window)[0]
         matrix = np.array([[1.0, 0.0, -place[0]], [0.0, 1.0, -place[1]]])
-        results.append(cv2.warpAffine(frame, matrix, (width, height), borderMode=cv2.BORDER_REFLECT_101))
-        before = now
+        results.append(cv2.warpAffine(frame, matrix, size, borderMode=cv2.BORDER_REFLECT_101))
     return np.stack(results)
 
 
@@ -220,7 +213,7 @@ def tracked_frames(pixels: NDArray[np.uint8], size: int, method: str) -> Callabl
     """Function that tracks and restores the frames as fast as possible."""
 
     def run() -> NDArray[np.uint8]:
-        output = Output(slice(0, len(pixels)))
+        output = Output(keeps=True)
         tracker = rsv.VibrationTracker(timing_of(size), method=method)
         run_live(Repeated(pixels, len(pixels), paced=False), tracker, [output], drops=False)
         return np.stack(output.frames)
@@ -248,52 +241,37 @@ def rows(options: argparse.Namespace) -> Rows:
         restored = work()
         seconds, used = time.perf_counter() - begin, time.process_time() - cpu
         moving, whole = residual(restored[-RATE + 2 :], size)
-        timed = name != "as taken"
-        results.append(
-            {
-                "name": name,
-                "rate": len(clip) / seconds if timed else math.nan,
-                "cpu": 1e3 * used / len(clip) if timed else math.nan,
-                "rows": moving,
-                "whole": whole,
-            }
-        )
+        speed = {"rate": len(clip) / seconds, "cpu": 1e3 * used / len(clip)}
+        speed = dict.fromkeys(speed, math.nan) if name == "as taken" else speed
+        results.append({"name": name, **speed, "rows": moving, "whole": whole})
     return results
+
+
+QUANTITIES = {  # of the session
+    "frames, dropped": "{frames}, {dropped}",
+    "delay of the written frames in frame periods: median, 99 %": "{delay_median}, {delay_99}",
+    "frames with a delay of at most 2 frame periods": "{within_two:.1%}",
+    "processor time per frame": "{cpu:.0f} ms",
+    "largest resident memory, change between the halves": "{memory:.0f} MiB, {drift:+.1%}",
+    "frames with known motion, late ones that were predicted, detections": "{tracked:.1%}, {predicted}, {detections}",
+}
 
 
 def lines(rows: Rows, options: argparse.Namespace) -> list[str]:
     """The tables in Markdown."""
     one, errors_of, *others = rows
-    size = options.live_size
-    accuracies = []
+    cells = [(name, text.format(**one)) for name, text in QUANTITIES.items()]
     for place, (quantity, unit) in enumerate((("amplitude", "px"), ("frequency", "Hz"))):
         ours, batch = (math.hypot(*errors_of[name][place]) / math.sqrt(2) for name in ("errors", "batch_errors"))
         values = f"{ours:.5f} {unit}, {batch:.5f} {unit}, {ours / batch:.2f}"
-        accuracies.append((f"error of the {quantity}: tracker, batch, ratio", values))
+        cells.append((f"error of the {quantity}: tracker, batch, ratio", values))
     changes = [row for row in others if "lost" in row]
-    timed = [row for row in others if "rows" in row]
     return [
-        f"One session of {one['frames'] / RATE / 60:.2g} minutes, {size} x {size} at {RATE} frames/s, restored with "
-        f"dewarp. Errors are rms over both axes; the batch is `detect_vibration` on {WINDOW} of the same frames.",
+        f"One session of {one['frames'] / RATE / 60:.2g} minutes, {options.live_size} x {options.live_size} at {RATE} "
+        "frames/s, restored with dewarp. Errors are rms over both axes; the batch is `detect_vibration` on "
+        f"{WINDOW} of the same frames.",
         "",
-        *table(
-            ("quantity", "value"),
-            [
-                ("frames, dropped", f"{one['frames']}, {one['dropped']}"),
-                (
-                    "delay of the written frames in frame periods: median, 99 %",
-                    "{delay_median}, {delay_99}".format(**one),
-                ),
-                ("frames with a delay of at most 2 frame periods", f"{one['within_two']:.1%}"),
-                ("processor time per frame", f"{one['cpu']:.0f} ms"),
-                ("largest resident memory, change between the halves", "{memory:.0f} MiB, {drift:+.1%}".format(**one)),
-                (
-                    "frames with known motion, late ones that were predicted, detections",
-                    "{tracked:.1%}, {predicted}, {detections}".format(**one),
-                ),
-                *accuracies,
-            ],
-        ),
+        *table(("quantity", "value"), cells),
         f"Changes along x, {changes[0]['size']} x {changes[0]['size']}, rms errors from the beginning of the change:",
         "",
         *table_of(
@@ -307,7 +285,7 @@ def lines(rows: Rows, options: argparse.Namespace) -> list[str]:
         "The same clip as fast as possible, with the motion between consecutive frames of the result:",
         "",
         *table_of(
-            timed,
+            (row for row in others if "rows" in row),
             ("method", "{name}"),
             ("frames/s", lambda row: "" if math.isnan(row["rate"]) else f"{row['rate']:.1f}"),
             ("processor ms per frame", lambda row: "" if math.isnan(row["cpu"]) else f"{row['cpu']:.0f}"),
