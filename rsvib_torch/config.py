@@ -11,10 +11,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, model_validator
 
 from rsvib_torch import imaging, motion
-from rsvib_torch.checks.validation import Count, Section, checked, validate
+from rsvib_torch.checks.validation import Count, checked, options, validate
 from rsvib_torch.files.reading import read_toml
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
 from rsvib_torch.options import RestorationOptions, ToneOptions, WindowOptions
@@ -42,13 +42,15 @@ def simulation_section() -> Any:
     tones = list[float] | list[list[float]]
     axes = Field(default_factory=lambda: [0.0, 0.0])
 
-    class CameraSection(Section):
+    @options
+    class CameraSection:
         focal_length: float
         principal_point: list[float] = Field(default_factory=lambda: [0.0] * 2, min_length=2, max_length=2)
         distortion: list[float] = Field(default_factory=lambda: [0.0] * 5, min_length=4, max_length=5)
         fisheye: bool = False
 
-    class VibrationSection(Section):
+    @options
+    class VibrationSection:
         """Fields of ``Vibration``, which checks their values; an axis is one number (one tone) or a list of tones."""
 
         amplitude: tones
@@ -65,10 +67,11 @@ def simulation_section() -> Any:
             return self
 
         def to_vibration(self) -> motion.Vibration:
-            camera = None if self.camera is None else motion.Camera(**dict(self.camera))
-            return motion.Vibration(**{**dict(self), "camera": camera})
+            camera = None if self.camera is None else motion.Camera(**vars(self.camera))
+            return motion.Vibration(**{**vars(self), "camera": camera})
 
-    class SimulationSection(Section):
+    @options
+    class SimulationSection:
         vibration: VibrationSection
         num_frames: Count = 2
         """Number of frames."""
@@ -81,7 +84,8 @@ def simulation_section() -> Any:
     return SimulationSection
 
 
-class ConfigFile(Section):
+@options
+class ConfigFile:
     """All tables of a file; the keys of ``[simulation]`` are those of ``simulation_section``."""
 
     sensor: SensorSection
@@ -138,8 +142,8 @@ def read_config(path: str | os.PathLike[str] | None, *, sensor: Mapping[str, Any
     content = validate(ConfigFile, data, source)
     simulation = None
     if content.simulation is not None:
-        part: Any = create_model("_Part", __base__=Section, simulation=(simulation_section(), ...))
-        simulation = validate(part, {"simulation": content.simulation}, source).simulation
+        part: type[object] = options(type("_Part", (), {"__annotations__": {"simulation": simulation_section()}}))
+        simulation = vars(validate(part, {"simulation": content.simulation}, source))["simulation"]
     return Config(
         source=source,
         timing=content.sensor.to_timing(),

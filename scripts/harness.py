@@ -76,13 +76,6 @@ def devices() -> list[str]:
     return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 
-def defaults(section: Any, *, quick: bool = True, **chosen: Any) -> argparse.Namespace:
-    """Options of a section with their defaults, or with ``QUICK`` values, for use without a command line."""
-    usual = {"size": 256, "runs": 1, "device": ["cpu"], "quick": quick}
-    usual |= {name: default for name, (default, *_) in section.OPTIONS.items()}
-    return argparse.Namespace(**usual | (section.QUICK if quick else {}) | chosen)
-
-
 # Timed runs
 
 

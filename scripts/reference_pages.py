@@ -96,8 +96,8 @@ def key_table(group: Any, keys: Iterable[str] = (), meaning: Mapping[str, str] |
 def configuration_page() -> str:
     """Markdown of the reference of the configuration file."""
     simulation = simulation_section()
-    plain = [key for key in simulation.model_fields if key not in ("vibration", "noise")]
-    vibration = simulation.model_fields["vibration"].annotation
+    plain = [key for key in fields_of(simulation) if key not in ("vibration", "noise")]
+    vibration = fields_of(simulation)["vibration"].annotation
     lines = [CONFIGURATION, "## [sensor]", "", SENSOR, ""]
     lines += key_table(SensorSection)
     lines += ["## [detection]", "", "Options of `detect_vibration`.", "", *key_table(ToneOptions)]

@@ -8,8 +8,9 @@ import benchmark
 import pytest
 import torch
 from benchmark import SECTIONS, module_of
+from benchmark_options import defaults
 from benchmarks import gpu, pipeline, video
-from harness import Timed, defaults, in_turns, read_result, shown_seconds, write_result
+from harness import Timed, in_turns, read_result, shown_seconds, write_result
 
 import rsvib_torch as rsv
 

@@ -6,6 +6,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+from shown_output import differing_lines
 
 import rsvib_torch as rsv
 
@@ -66,7 +67,7 @@ def test_page_on_tables_runs_and_prints_what_it_shows(tmp_path):
     pages = runpy.run_path(str(ROOT / "scripts" / "run_pages.py"))
     page = ROOT / "docs" / "tables.md"
     text, names = pages["run_page"](page, tmp_path)
-    assert not pages["differing_lines"](page.read_text(encoding="utf-8"), text), "out of date: make pages"
+    assert not differing_lines(page.read_text(encoding="utf-8"), text), "out of date: make pages"
     assert names["tones"].frequency_Hz.tolist() == pytest.approx([137.0, 411.0, 90.5], abs=0.05)
     assert names["tones"].amplitude_um.tolist() == pytest.approx([15.0, 5.0, 8.75], rel=0.02)
     written = {path.name for path in (tmp_path / "found").iterdir()}

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from benchmark_options import defaults
 from benchmarks import reproduction
 from benchmarks.reproduction import (
     AMPLITUDE,
@@ -16,7 +17,6 @@ from benchmarks.reproduction import (
     straight_edge_mtf,
 )
 from edge_truth import draw_edge, gaussian, through_pixels
-from harness import defaults
 
 import rsvib_torch as rsv
 

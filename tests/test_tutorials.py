@@ -9,6 +9,7 @@ from pathlib import Path
 import nbformat
 import pytest
 import torch
+from shown_output import differing_lines, notebook_text
 
 import rsvib_torch as rsv
 
@@ -30,7 +31,7 @@ def run(pages, name, folder):
     # fits of a wrong model, and of a vibration that frames do not show, are not reproducible to the last tone
     block = r"(--out (?:wrong|blind)\n```\n\n```text\n).*?```"
     shown = [re.sub(block, r"\1```", t, flags=re.DOTALL) for t in (expected, text)]
-    assert not pages["differing_lines"](*shown), "out of date: make pages"
+    assert not differing_lines(*shown), "out of date: make pages"
     assert all((folder / picture).exists() and (TUTORIALS / picture).exists() for picture in pages["pictures"](text))
     return names
 
@@ -71,8 +72,7 @@ def test_training(pages, tmp_path):
 def test_notebook(pages, notebook):
     """Its stored text is that of a run; two figures are the offset plot, and the images before and after."""
     stored = nbformat.read(notebook, as_version=4)
-    text = pages["notebook_text"]
-    assert not pages["differing_lines"](text(stored), text(pages["run_notebook"](notebook)))
+    assert not differing_lines(notebook_text(stored), notebook_text(pages["run_notebook"](notebook)))
     outputs = str([cell.get("outputs") for cell in stored.cells])
     assert outputs.count("image/png") + outputs.count("data:image/png") >= 3
     assert "Error" not in outputs
@@ -89,14 +89,14 @@ def test_notebook(pages, notebook):
     ],
 )
 def test_output_is_compared_but_for_last_digits(pages, found, number):
-    assert len(pages["differing_lines"]("x 2.10 ± 0.02 px\nreliable\n", found)) == number
+    assert len(differing_lines("x 2.10 ± 0.02 px\nreliable\n", found)) == number
 
 
 def test_a_wrong_output_and_a_failing_command_are_found(pages, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("```python\nprint(6 * 7)\n```\n\n```text\n99\n```\n\n```bash\nls missing  # exit code 2\n```\n")
     text, _ = pages["run_page"](page, tmp_path)
-    assert pages["differing_lines"](page.read_text(), text) == ["99\n42"]
+    assert differing_lines(page.read_text(), text) == ["99\n42"]
     page.write_text("```bash\nls missing\n```\n")
     with pytest.raises(RuntimeError, match=r"ls missing.*exit code 2"):
         pages["run_page"](page, tmp_path)

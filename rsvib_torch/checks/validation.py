@@ -1,4 +1,4 @@
-"""Groups of options and tables from files: their checks, and one line for each mistake.
+"""Groups of options, also those of files: their checks, and one line for each mistake.
 
 The class of a group is the only place that states an option: its type, bounds and default, and its description in the
 text below the field. ``options`` makes a class such a group. Python arguments, keys of TOML files and options of the
@@ -17,7 +17,7 @@ from textwrap import fill
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin
 
 import pydantic
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError, core_schema
 
 from rsvib_torch.checks.values import MAX_NUMBER, Error, described, named
@@ -69,16 +69,6 @@ class MistakesError(ValueError):
 _CONFIG = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, use_attribute_docstrings=True)
 
 
-class Section(BaseModel):
-    """Table with a fixed set of keys and strict types."""
-
-    model_config = ConfigDict(**_CONFIG, frozen=True)
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **_: object) -> None:
-        _describe(cls)
-
-
 class Extensible:
     """Mark of a choice whose names are keys of a table that users extend.
 
@@ -103,8 +93,11 @@ def options(group: type[_Group]) -> type[_Group]:
     """Make a class a group of options: a frozen dataclass whose values are checked."""
 
     def accept_tables(_: type, source: object, handler: Callable[[object], Table]) -> Table:
-        schema = handler(source)  # the group can be a table, whose values are not converted nevertheless
-        return schema | {"strict": False} if schema["type"] == "dataclass" else schema
+        schema = handler(source)
+        fields = schema["schema"] if schema["type"] == "function-after" else schema  # with a validator or without
+        if fields["type"] == "dataclass":  # it can be a table, whose values are not converted nevertheless
+            fields["strict"] = False
+        return schema
 
     group.__get_pydantic_core_schema__ = classmethod(accept_tables)  # type: ignore[attr-defined]
     made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(group)
@@ -139,7 +132,7 @@ def _plain(value: Any) -> Any:
 
 
 def fields_of(group: type) -> Table:
-    """Fields of a group of options or of a section, by name: annotation, default and description."""
+    """Fields of a group of options, by name: annotation, default and description."""
     return dict(vars(group)["__pydantic_fields__"])
 
 
@@ -200,7 +193,7 @@ def checked(build: Callable[..., _Result], *args: object, **kwargs: object) -> _
 
 
 def validate(model: type[_Result], data: Mapping[str, object], source: str) -> _Result:
-    """Parsed TOML or JSON as a ``Section`` or group of options; an error has a line for each mistake in ``source``."""
+    """Parsed TOML or JSON as a group of options; an error has a line for each mistake in ``source``."""
     try:
         return TypeAdapter(model).validate_python(data, context={"file": source})
     except ValidationError as error:

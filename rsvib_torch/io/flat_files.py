@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from rsvib_torch.checks.arrays import channels_appear_last
-from rsvib_torch.checks.validation import Section, read_json, validate
+from rsvib_torch.checks.validation import options, read_json, validate
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype
 from rsvib_torch.io.stack_info import StackInfo, readable_stack
@@ -58,7 +58,8 @@ def check_npy(path: Path, info: StackInfo) -> None:
         raise ValueError(f"{path}: array of shape {info.shape} would be read as one with channels last; write .tif")
 
 
-class _Sidecar(Section):
+@options
+class _Sidecar:
     """Content of the sidecar."""
 
     format: Literal["rsvib raw"]
@@ -81,7 +82,8 @@ def open_raw(path: Path) -> BlockReader:
     if not beside.exists():
         raise FileNotFoundError(f"{path}: raw frames need the sidecar {beside.name}, which does not exist")
     sidecar = validate(_Sidecar, read_json(beside, "sidecar of raw frames"), str(beside))
-    attributes = sidecar.model_dump(include={"axes", "full_scale", "frame_times", "frame_rate", "orientation"})
+    names = ("axes", "full_scale", "frame_times", "frame_rate", "orientation")
+    attributes = {name: getattr(sidecar, name) for name in names}
     if sidecar.resolution is not None:
         attributes |= {"resolution": sidecar.resolution[:2], "resolution_unit": sidecar.resolution[2]}
     dtype = np.dtype(sidecar.dtype)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import model_validator
 
-from rsvib_torch.checks.validation import Section, checked, validate
+from rsvib_torch.checks.validation import checked, options, validate
 from rsvib_torch.checks.values import check_choice, check_number, check_whole_number, described
 from rsvib_torch.files.reading import read_toml
 
@@ -307,7 +307,8 @@ class SensorTiming:
         )
 
 
-class SensorSection(Section):
+@options
+class SensorSection:
     """``[sensor]``: the timing, and the full scale of integer frames.
 
     Exposure and frame period are in seconds (``exposure_time``, ``frame_rate``) or in row times (``exposure_rows``,
@@ -378,7 +379,8 @@ def _in_rows(name: str, value: float | None, converted: float | None, rows_name:
     return rows
 
 
-class _SensorFile(Section):
+@options
+class _SensorFile:
     sensor: SensorSection
 
 

@@ -86,16 +86,6 @@ def other_row(name: str, seeds: int) -> dict[str, Any]:
     return {"part": "other", "optics": name, "mtf_error": error, "mtf50_percent": clean, "noisy_percent": rms}
 
 
-def eight_bits(noise: float, seeds: int) -> dict[str, Any]:
-    """Mean error of MTF50 for 8-bit counts."""
-    truth, counts = through_pixels(gaussian(0.5), 5.0), 255 * draw_edge(5.0, 0.5)
-    measured = []
-    for seed in range(seeds):
-        image = counts + noise * np.random.default_rng(seed).standard_normal(counts.shape)
-        measured.append(errors(image.round().astype(np.uint8), truth, 0.1)[1])
-    return {"part": "8 bits", "noise": noise, "mtf50_percent": float(np.mean(measured))}
-
-
 def rows(options: argparse.Namespace) -> Rows:
     """Errors of the MTF and of MTF50 for all optics."""
     fewer = max(options.seeds // 5, 1)
@@ -103,15 +93,12 @@ def rows(options: argparse.Namespace) -> Rows:
         return [
             *(gaussian_row(sigma, options.seeds) for sigma in SIGMAS),
             *(other_row(name, fewer) for name in OPTICS),
-            eight_bits(0.0, 1),
-            eight_bits(1.0, fewer),
         ]
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as Markdown tables."""
-    of_part = {part: [row for row in results if row["part"] == part] for part in ("gaussian", "other", "8 bits")}
-    rounding = (f"{row['mtf50_percent']:+.2f} % at noise {row['noise']:g}" for row in of_part["8 bits"])
+    of_part = {part: [row for row in results if row["part"] == part] for part in ("gaussian", "other")}
     noisy = ("MTF50 rms, noise 1 %", "{noisy_percent:.2f} %")
     return [
         *table_of(
@@ -129,5 +116,4 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
             ("MTF50, no noise", "{mtf50_percent:+.4f} %"),
             noisy,
         ),
-        f"8 bits, sigma = 0.5 px, contrast 204 counts, mean error of MTF50: {', '.join(rounding)}.",
     ]
