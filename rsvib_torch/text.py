@@ -14,9 +14,6 @@ if TYPE_CHECKING:
 
 AXES = ("x", "y", "roll", "zoom")  # components of a motion
 
-# Marks that change the direction of the text after them, and separators of lines.
-_INVISIBLE = frozenset("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-
 
 def printable(text: str, *, lines: bool = False) -> str:
     r"""Text with escapes instead of control characters, direction marks and bytes that are not UTF-8.
@@ -29,18 +26,13 @@ def printable(text: str, *, lines: bool = False) -> str:
     """
 
     def shown(character: str) -> str:
-        code = ord(character)
-        if 0xDC80 <= code <= 0xDCFF:  # byte that is not UTF-8, as ``os.fsdecode`` represents it
-            return f"\\x{code - 0xDC00:02x}"
-        if code < 32 or 127 <= code < 160 or character in _INVISIBLE or 0xD800 <= code < 0xE000:
-            return (
-                character
-                if lines and character == "\n"
-                else character.encode("unicode_escape", "surrogatepass").decode()
-            )
-        return character
+        if character.isprintable() or (lines and character == "\n"):
+            return character
+        if 0xDC80 <= ord(character) <= 0xDCFF:  # byte that is not UTF-8, as ``os.fsdecode`` represents it
+            return f"\\x{ord(character) - 0xDC00:02x}"
+        return character.encode("unicode_escape", "surrogatepass").decode()
 
-    return text if text.isascii() and text.isprintable() else "".join(map(shown, text))
+    return text if text.isprintable() else "".join(map(shown, text))
 
 
 def measured_text(
