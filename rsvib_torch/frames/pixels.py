@@ -8,28 +8,29 @@ from torch.nn import functional
 
 
 def fill_with_means(frames: Tensor, missing: Tensor) -> Tensor:
-    """Replace missing pixels (..., H, W) by the mean of the measured pixels of a square around them.
+    """Replace missing pixels (..., H, W) by local means of the measured pixels.
 
-    The square grows from 3 px until it contains a measured pixel. Values of missing pixels are not used.
+    A pixel without a measured neighbour is interpolated between means of squares of 2, 4, 8, ... px, the smallest that
+    contain measured pixels (pull-push algorithm, Gortler et al. 1996). Values of missing pixels are not used.
 
     Example:
         >>> frames = torch.tensor([[[1.0, 9.0, 3.0]]])
         >>> fill_with_means(frames, torch.tensor([[[False, True, False]]])).tolist()
         [[[1.0, 2.0, 3.0]]]
     """
+
+    def filled(sums: Tensor, weights: Tensor) -> Tensor:
+        around = (functional.avg_pool2d(values, 3, 1, 1) for values in (sums, weights))
+        sums, weights = (torch.where(weights > 0, *pair) for pair in zip((sums, weights), around, strict=True))
+        known, means = weights > 0, sums / weights.clamp(min=1e-30)
+        if max(sums.shape[-2:]) == 1 or bool(known.all()):
+            return means
+        coarse = filled(*(functional.avg_pool2d(values, 2, ceil_mode=True) for values in (sums, weights)))
+        return torch.where(known, means, functional.interpolate(coarse, sums.shape[-2:], mode="bilinear"))
+
     images, holes = frames.flatten(0, -3)[:, None], missing.flatten(0, -3)[:, None]
-    measured = (~holes).to(frames.dtype)
-    images = torch.where(holes, torch.zeros_like(images), images)
-    filled = images
-    for size in (3, 9, 33, 129, 513, 2 * max(frames.shape[-2:]) + 1):
-        weight = _box_sum(measured, size)
-        mean = _box_sum(images, size) / weight.clamp(min=1e-9)
-        filled = torch.where(holes & (weight > 0.5), mean, filled)
-        holes = holes & (weight <= 0.5)
-        if not bool(holes.any()):
-            break
-    result: Tensor = filled[:, 0].unflatten(0, frames.shape[:-2])
-    return result
+    result = filled(images.masked_fill(holes, 0.0), (~holes).to(frames.dtype))
+    return torch.where(missing, result[:, 0].unflatten(0, frames.shape[:-2]), frames)
 
 
 def enlarged(images: Tensor, scale: int) -> Tensor:
@@ -65,19 +66,6 @@ def smoothed(images: Tensor, weights: Sequence[float]) -> Tensor:
         for shifted, weight in zip(others, weights[1:], strict=True):
             result.add_(shifted, alpha=weight)
     return result.view(images.shape)
-
-
-def _box_sum(images: Tensor, size: int) -> Tensor:
-    """Sums over squares of ``size`` px, clipped at the edges, from running sums."""
-    half = size // 2
-    for dim in (-2, -1):
-        total = functional.pad(images.cumsum(dim), (1, 0) if dim == -1 else (0, 0, 1, 0))
-        length = images.shape[dim]
-        index = torch.arange(length, device=images.device)
-        images = total.index_select(dim, (index + half + 1).clamp(max=length)) - total.index_select(
-            dim, (index - half).clamp(min=0)
-        )
-    return images
 
 
 def detailed_parts(images: Tensor, count: int) -> list[slice]:
