@@ -13,7 +13,7 @@ import av
 import numpy as np
 from benchmarks.independent_camera import Array, Shake, closed, take_frames
 from benchmarks.live import AMPLITUDE, FREQUENCY, PHASE, RATE, timing_of
-from harness import Rows, table, write_h264
+from harness import Rows, table_of, write_h264
 from numpy.typing import NDArray
 
 import rsvib_torch as rsv
@@ -26,10 +26,6 @@ MARGIN, SEED, NOISE = 32, 3, 0.004
 EXPOSURE_ROWS = 15
 CRF = "12"  # of the clip
 METHODS = ("exact", "dewarp")
-GOALS = {"exact": 0.6, "dewarp": 0.16}  # s of a processor per frame: 3 and 12 frames/s on two cores
-# s of a processor per frame of 1920 x 1080 px in colour, before videos were followed: `rsvib run --video`, 24 frames of
-# a photograph, 2026-11-25
-BEFORE = {"exact": 3.68, "dewarp": 0.98}
 
 
 def planes_of(rows: int, count: int) -> tuple[list[NDArray[np.uint8]], list[Array]]:
@@ -83,37 +79,27 @@ def rows(options: argparse.Namespace) -> Rows:
             timing = timing_of(options.video_rows, EXPOSURE_ROWS)
             process_video(clip, target, timing, restoration={"method": method})
             used, seconds = time.process_time() - cpu, time.perf_counter() - begin
-            results.append(
-                {
-                    "name": method,
-                    "rate": count / seconds,
-                    "cpu": used / count,
-                    "psnr": psnr_of(target, still),
-                    "size": target.stat().st_size,
-                }
-            )
+            speed = {"rate": count / seconds, "cpu": used / count}
+            size = target.stat().st_size
+            results.append({"name": method, **speed, "psnr": psnr_of(target, still), "size": size})
     return results
 
 
 def lines(results: Rows, options: argparse.Namespace) -> list[str]:
-    """The tables in Markdown."""
-    taken, *methods = results
+    """The table in Markdown."""
     height, count = options.video_rows, options.video_frames
     text = [
         f"{count} frames of {16 * height // 9} x {height} px in colour, H.264 (crf {CRF}), by `process_video` (`rsvib "
         "run --video` without figures and the start of the program). Frames per second depend on other programs of the "
-        "machine, processor time much less. The figures before are those of windows of eight frames, on 24 frames of a "
-        "photograph of 1920 x 1080 px.",
+        "machine, processor time much less.",
         "",
     ]
-    lines_of_methods = []
-    for row in [taken, *methods]:
-        timed = [""] * 4
-        if "cpu" in row:
-            goal = GOALS[row["name"]]
-            met = "met" if row["cpu"] <= goal else "**missed**"
-            timed = [f"{row['cpu']:.3f}", f"{goal} ({met})", f"{BEFORE[row['name']]:.2f}", f"{row['rate']:.1f}"]
-        rate = row["size"] / 1e6 / count * RATE
-        lines_of_methods.append((row["name"], *timed, *(f"{value:.1f}" for value in row["psnr"]), f"{rate:.1f}"))
-    heads = ("method", "processor s per frame", "goal", "before", "frames/s", "PSNR of Y (dB)", "PSNR of U, V (dB)")
-    return text + table((*heads, "MB per s"), lines_of_methods)
+    return text + table_of(
+        results,
+        ("method", "{name}"),
+        ("processor s per frame", lambda row: f"{row['cpu']:.3f}" if "cpu" in row else ""),
+        ("frames/s", lambda row: f"{row['rate']:.1f}" if "rate" in row else ""),
+        ("PSNR of Y (dB)", "{psnr[0]:.1f}"),
+        ("PSNR of U, V (dB)", "{psnr[1]:.1f}"),
+        ("MB per s", lambda row: f"{row['size'] / 1e6 / count * RATE:.1f}"),
+    )
