@@ -47,15 +47,10 @@ def compare(truth: rsv.Vibration, detected: rsv.Vibration) -> list[dict[str, Any
     for axis, name in enumerate("xy"):
         for quantity, unit, scale in (("period", "ms", 1e3), ("amplitude", "px", 1.0), ("phase", "π", 1 / math.pi)):
             true, found = (scale * float(getattr(v, quantity)[axis, 0]) for v in (truth, detected))
-            if quantity == "phase":
-                error = f"{math.remainder(found - true, 2):+.4f} π"
-            else:
-                error = f"{100 * (found / true - 1):+.4f} %"
-            value = float(error.split()[0])
-            lines.append(
-                {"axis": name, "quantity": quantity, "unit": unit, "true": true, "detected": found}
-                | {"error": value, "error_unit": error.split()[1]}
-            )
+            is_phase = quantity == "phase"
+            error = math.remainder(found - true, 2) if is_phase else 100 * (found / true - 1)
+            line = {"axis": name, "quantity": quantity, "unit": unit, "true": true, "detected": found}
+            lines.append(line | {"error": round(error, 4), "error_unit": "π" if is_phase else "%"})
     return lines
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,13 @@ def memory_limit(memory: str | float | None) -> int:
 
 
 def memory_needed(
-    info: StackInfo, window: int, restoration: Mapping[str, Any] | None, count: int = 1, *, on_gpu: bool = False
+    info: StackInfo,
+    window: int,
+    restoration: Mapping[str, Any] | None,
+    count: int = 1,
+    *,
+    on_gpu: bool = False,
+    margin: int = 0,
 ) -> int:
     """Memory of the process in bytes while ``count`` windows are processed; arguments as in ``windows_at_once``."""
     if on_gpu:
@@ -52,11 +59,14 @@ def memory_needed(
     mosaic = restoration is not None and restoration.get("mosaic") is not None and not on_gpu
     if mosaic or (restoration is not None and restoration.get("scale", 1) != 1):  # mosaics are solved on the finer grid
         pixel_bytes *= _FINER
-    pixels = min(window, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
-    queued = 2 * pixels * np.dtype(info.dtype).itemsize  # frames read ahead, and frames to be written
+    frame, stored = int(np.prod(info.shape[1:], dtype=object)), np.dtype(info.dtype).itemsize
+    pixels = min(window, info.shape[0]) * frame
+    queued = 2 * pixels * stored  # frames read ahead, and frames to be written
+    # frames around a window, as stored and as float32; less than a window takes otherwise
+    around = 2 * min(margin, info.shape[0]) * frame * (stored + 4)
     more = _MOSAIC_BYTES + _MOSAIC_FRAME_BYTES * info.shape[-2] * info.shape[-1] if mosaic else 0
     once = _PROCESS_BYTES + info.decoding_bytes + queued
-    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + more)
+    return once + count * (_WINDOW_BYTES + pixels * pixel_bytes + queued + around + more)
 
 
 def windows_at_once(
@@ -76,15 +86,8 @@ def windows_at_once(
     The error about too little memory states the required size and the largest window that fits.
     """
     limit = memory_limit(memory)
-
-    # frames around a window, as stored and as float32; less than a window takes otherwise
-    pixels = 2 * min(margin, info.shape[0]) * int(np.prod(info.shape[1:], dtype=object))
-    around = pixels * (np.dtype(info.dtype).itemsize + 4)
-
-    def needed(frames: int, count: int = 1) -> int:
-        return memory_needed(info, frames, restoration, count, on_gpu=on_gpu) + count * around
-
-    process, one = needed(window, 0), needed(window)
+    needed = partial(memory_needed, info, restoration=restoration, on_gpu=on_gpu, margin=margin)
+    process, one = needed(window, count=0), needed(window)
     count = (limit - process) // (one - process)
     if count < 1:
         origin = "" if memory is not None else " (three quarters of the memory that is free or used by this process)"

@@ -2,9 +2,10 @@
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -103,11 +104,10 @@ def align_stack(
         fit_focal_length = camera is None or fit_gain
         more: Table = {"offsets": offsets, "fit_focal_length": fit_focal_length, "fit_row_time": fit_row_time}
         return align_rates(tracks, of_pairs, size, timing, recorded, camera, **more)
-    runs = compared_runs(info.shape[0])
+    runs, align = compared_runs(info.shape[0]), partial(align_motion, fit_gain=fit_gain, ignore=ignore)
     if len(runs) == 1:
-        frames, of_run = part_of_stack(source, info, timing, runs[0])
-        return align_motion(frames, of_run, recorded, offsets=offsets, fit_gain=fit_gain, ignore=ignore)
-    return _aligned_runs(source, info, timing, recorded, runs, offsets, fit_gain, ignore)
+        return align(*part_of_stack(source, info, timing, runs[0]), recorded, offsets=offsets)
+    return _aligned_runs(source, info, timing, recorded, runs, offsets, align)
 
 
 def check_stack_motion(
@@ -142,8 +142,7 @@ def _aligned_runs(
     recorded: FreeMotion,
     runs: list[slice],
     offsets: tuple[float, float] | None,
-    fit_gain: bool,
-    ignore: Tensor | None,
+    align: Callable[..., ClockAlignment],
 ) -> ClockAlignment:
     """The clock by the runs of a long stack, each of which determines its reading at one time."""
     # 1. The run in the middle, at all offsets; then the others, near its clock.
@@ -160,19 +159,18 @@ def _aligned_runs(
         if found:
             error = _CLOCK_ERROR * abs(middles[-1] - middles[0]) + 4 * found[0].offset_std
             near = max(limits[0], found[0].offset - error), min(limits[1], found[0].offset + error)
-        one = align_motion(frames, of_run, recorded, offsets=near, fit_gain=fit_gain, fit_scale=False, ignore=ignore)
+        one = align(frames, of_run, recorded, offsets=near, fit_scale=False)
         found.append(one)
         if not one.reliable:  # the others cannot make it reliable
             return one
     # 2. A straight line through the readings.
     times, readings = np.array(middles), np.array([one.offset for one in found])  # s; less the times of the frames
     weights = 1 / np.array([one.offset_std for one in found])
-    design = np.stack([np.ones_like(times), times - times.mean()], -1)
-    solution, *_ = np.linalg.lstsq(design * weights[:, None], readings * weights, rcond=None)
-    rest = float(np.square((readings - design @ solution) * weights).sum())  # of one degree of freedom
-    covariance = np.linalg.inv(design.T @ (design * np.square(weights)[:, None])) * max(1.0, rest)
-    scale, gradient = 1.0 + float(solution[1]), np.array([1.0, -times.mean()])
-    offset, offset_std = float(gradient @ solution), math.sqrt(gradient @ covariance @ gradient)
+    line, covariance = np.polyfit(times - times.mean(), readings, 1, w=weights, cov="unscaled")
+    rest = float(np.square((readings - np.polyval(line, times - times.mean())) * weights).sum())  # 1 degree of freedom
+    covariance *= max(1.0, rest)
+    scale, gradient = 1.0 + float(line[0]), np.array([-times.mean(), 1.0])
+    offset, offset_std = float(gradient @ line), math.sqrt(gradient @ covariance @ gradient)
     # 3. The motion with the mean gain and drift.
     gain_x, gain_y = np.mean([one.gain for one in found], 0).tolist()
     drift = torch.stack([one.drift for one in found]).mean(0)
@@ -184,7 +182,7 @@ def _aligned_runs(
         offset=offset,
         offset_std=offset_std,
         scale=scale,
-        scale_std=math.sqrt(covariance[1, 1]),
+        scale_std=math.sqrt(covariance[0, 0]),
         gain=(gain_x, gain_y),
         drift=drift,
         unexplained=torch.stack([one.unexplained for one in found]).square().mean(0).sqrt(),
