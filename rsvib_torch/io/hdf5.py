@@ -1,12 +1,14 @@
 """Stacks in HDF5 files: one dataset of frames with attributes."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +20,9 @@ from rsvib_torch.io.stack_info import StackInfo, readable_stack
 from rsvib_torch.io.stated_metadata import attributes_of, info_from_attributes, time_attributes, times_of_attributes
 from rsvib_torch.numerics.tables import Array
 
+if TYPE_CHECKING:
+    import h5py
+
 _DATASET = "frames"  # name of the dataset that is written
 _MAX_MEMBERS = 10_000  # groups and datasets; each takes about 0.1 ms
 
@@ -26,7 +31,7 @@ def _h5py() -> Any:
     return needed_package("h5py", "reading and writing HDF5", "formats")
 
 
-def _find_dataset(file: Any) -> Any:
+def _find_dataset(file: h5py.File) -> h5py.Dataset:
     """The only dataset of frames, or the one called ``frames``; links and external data are not followed."""
     h5py = _h5py()
     found: list[Any] = []
@@ -51,12 +56,12 @@ def _find_dataset(file: Any) -> Any:
     return stacks[0]
 
 
-def _is_outside(dataset: Any) -> bool:
+def _is_outside(dataset: h5py.Dataset) -> bool:
     """Whether the values of a dataset lie in other files or datasets."""
     return bool(dataset.external or dataset.is_virtual)
 
 
-def _check_sizes(dataset: Any, file_size: int) -> int:
+def _check_sizes(dataset: h5py.Dataset, file_size: int) -> int:
     """Size of a chunk in bytes; a ``ValueError`` if the pixels cannot be in the file, before memory is allocated."""
     stored = dataset.id.get_storage_size()
     needed = int(np.prod(dataset.shape, dtype=object)) * dataset.dtype.itemsize
@@ -70,7 +75,7 @@ def _check_sizes(dataset: Any, file_size: int) -> int:
     return chunk
 
 
-def _times_beside(file: Any, dataset: Any, count: int) -> Table:
+def _times_beside(file: h5py.File, dataset: h5py.Dataset, count: int) -> Table:
     """Times and frame rate in datasets beside the frames, or in attributes of their group or of the file."""
     h5py = _h5py()
     found: Table = {}

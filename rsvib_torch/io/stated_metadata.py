@@ -4,13 +4,15 @@ Functions for other programs return the fields of ``StackInfo`` that the metadat
 or damaged, since frames can be read without them.
 """
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,6 +23,9 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.full_scale import known_full_scale
 from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.text import one_line
+
+if TYPE_CHECKING:
+    import tifffile
 
 _SOFTWARE_CLOCK_ERROR = 5e-3  # s; times that acquisition software writes have jitter of milliseconds
 
@@ -179,7 +184,7 @@ def exif_fields(data: bytes) -> Table:
     return fields | _time_fields([changed if taken is None else taken], 1, _SOFTWARE_CLOCK_ERROR, "EXIF times")
 
 
-def merged_times(infos: Iterable[Any]) -> Table:
+def merged_times(infos: Iterable[StackInfo | None]) -> Table:
     """Times of a folder from the times of its files: the ``StackInfo`` of each, None for those that are damaged."""
     infos = list(infos)
     times = [info.frame_times[0] if info is not None and info.frame_times else None for info in infos]
@@ -214,7 +219,7 @@ def _ome_fields(text: str, count: int) -> Table:
     return fields
 
 
-def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> Table:
+def tiff_times(tif: tifffile.TiffFile, count: int, metadata: Mapping[str, Any]) -> Table:
     """Times of ``count`` frames or frame rate of a TIFF file.
 
     They are stated by the ``metadata`` that this package writes, OME-XML, ImageJ (``finterval``), or on every page by a
@@ -229,22 +234,23 @@ def tiff_times(tif: Any, count: int, metadata: Mapping[str, Any]) -> Table:
     return {}
 
 
-def _times_of_other_programs(tif: Any, count: int) -> Table:
+def _times_of_other_programs(tif: tifffile.TiffFile, count: int) -> Table:
     if tif.ome_metadata:
         return _ome_fields(tif.ome_metadata, count)
-    interval = (tif.imagej_metadata or {}).get("finterval")
+    imagej = tif.imagej_metadata or {}
+    interval = imagej.get("finterval")
     if isinstance(interval, int | float) and interval > 0:
-        unit = _SECONDS.get(str(tif.imagej_metadata.get("tunit", "s")).lower())
+        unit = _SECONDS.get(str(imagej.get("tunit", "s")).lower())
         return {"frame_rate": 1.0 / (unit * interval), "time_source": "ImageJ finterval"} if unit else {}
-    first = _page_times(tif.pages[0])
+    first = _page_times(tif.pages.first)
     if len(tif.pages) != count or not first:
         return {}
-    pages = (_page_times(tif.pages.get(number, aspage=True)) for number in range(count))
+    pages = (_page_times(cast("tifffile.TiffPage", tif.pages.get(number, aspage=True))) for number in range(count))
     source = next(iter(first))
     return _time_fields((page.get(source) for page in pages), count, _SOFTWARE_CLOCK_ERROR, source)
 
 
-def _page_times(page: Any) -> dict[str, float]:
+def _page_times(page: tifffile.TiffPage) -> dict[str, float]:
     """The time of a page by each source that states it."""
     tags = page.tags
     exif = tags.valueof("ExifTag", {})

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import tifffile
@@ -18,7 +18,7 @@ from rsvib_torch.io.stated_metadata import attributes_of, orientation_of, tiff_t
 from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.numerics.tables import Array
 
-_PHOTOMETRIC = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
+_PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
 _LOSSLESS = {1, 5, 8, 32946, 32773, 34925, 50000}  # none, LZW, Deflate (two codes), PackBits, LZMA, Zstandard
 _LARGEST_RATIO = 5000  # of pixels to the size of the file; deflate reaches 1032
 
@@ -33,11 +33,11 @@ class _Page(NamedTuple):
     secondary: bool  # whether it is a thumbnail or a mask of another page
 
 
-def _name(photometric: Any) -> str:
+def _name(photometric: object) -> str:
     return getattr(photometric, "name", str(photometric))
 
 
-def _pages(tif: Any) -> list[_Page]:
+def _pages(tif: tifffile.TiffFile) -> list[_Page]:
     """What the headers of all pages state, in a chain that must not leave the file or be circular.
 
     tifffile interprets one in 0.05 ms, and ends such a chain without an error.
@@ -47,7 +47,7 @@ def _pages(tif: Any) -> list[_Page]:
     file, kinds = tif.filehandle, {}
     while True:
         try:
-            page = tif.pages[len(pages)]
+            page = cast(tifffile.TiffPage, tif.pages[len(pages)])
         except IndexError:
             break
         if page.offset in visited:
@@ -61,13 +61,13 @@ def _pages(tif: Any) -> list[_Page]:
             kinds[key] = f"{' x '.join(map(str, shape[-2:]))} px{channels} {page.dtype}{meaning}"
         complete = _is_complete(page, file.size)
         pages.append(_Page(len(pages), kinds[key], int(page.nbytes), complete, bool(page.subfiletype & 0b101)))
-    file.seek(tif.pages.next_page_offset)
+    file.seek(tif.pages.next_page_offset or 0)
     if not pages or file.read(tif.tiff.offsetsize) != bytes(tif.tiff.offsetsize):
         raise ValueError(f"truncated: the header of page {len(pages)} lies beyond the end of the file")
     return pages
 
 
-def _is_complete(page: Any, size: int) -> bool:
+def _is_complete(page: tifffile.TiffPage | tifffile.TiffFrame | None, size: int) -> bool:
     """Whether the stored pixels of a page lie within a file of ``size`` bytes."""
     ends = [] if page is None else map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))
     return max(ends, default=size + 1) <= size
@@ -86,7 +86,7 @@ def _check_complete(complete: Sequence[bool], nbytes: int, size: int) -> None:
         raise ValueError(f"truncated: pixels of page {complete.index(False)} lie beyond the end of the file")
 
 
-def _resolution(tif: Any) -> tuple[float, float, str] | None:
+def _resolution(tif: tifffile.TiffFile) -> tuple[float, float, str] | None:
     """Pixels per unit, if the unit is one of length."""
     tags = tif.pages.first.tags
     unit = {2: "inch", 3: "centimeter"}.get(int(tags.valueof("ResolutionUnit", 0)))
@@ -94,7 +94,9 @@ def _resolution(tif: Any) -> tuple[float, float, str] | None:
     return (x / per_x, y / per_y, unit) if unit is not None and min(x, per_x, y, per_y) > 0 else None
 
 
-def _info(tif: Any, shape: tuple[int, ...], dtype: np.dtype, photometric: Any, *, channels_last: bool) -> StackInfo:
+def _info(
+    tif: tifffile.TiffFile, shape: tuple[int, ...], dtype: np.dtype, photometric: object, *, channels_last: bool
+) -> StackInfo:
     """A stack of that shape, with what the first page states."""
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
@@ -115,14 +117,14 @@ def _info(tif: Any, shape: tuple[int, ...], dtype: np.dtype, photometric: Any, *
     return replace(info, metadata=read_metadata(tif, info))
 
 
-def _axes_of(series: Any) -> tuple[str, tuple[int, ...]]:
+def _axes_of(series: tifffile.TiffPageSeries) -> tuple[str, tuple[int, ...]]:
     """Axes of a series and their sizes, those of length 1 included."""
     if hasattr(series, "get_axes"):  # before tifffile 2026.5.2
         return series.get_axes(squeeze=False), series.get_shape(squeeze=False)
     return series.axes, series.shape
 
 
-def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
+def _series_info(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> tuple[StackInfo, tuple[int, ...]]:
     """The stack in a series of pages, and the permutation of the stored axes into (ones, T, C, H, W)."""
     axes, shape = _axes_of(series)
     rows, columns = axes.index("Y"), axes.index("X")
@@ -141,7 +143,7 @@ def _series_info(tif: Any, series: Any) -> tuple[StackInfo, tuple[int, ...]]:
 def _page_reader(
     path: Path,
     info: StackInfo,
-    pages: Sequence[Any],
+    pages: Sequence[tifffile.TiffPage | tifffile.TiffFrame | None],
     of_frames: Sequence[Sequence[int]],
     shape: tuple[int, ...],
     order: tuple[int, ...],
@@ -158,17 +160,17 @@ def _page_reader(
         of_frame = [pages[number] for number in of_frames[first]]
         if not all(_is_complete(page, size) for page in of_frame):
             raise FrameError(f"{path}: truncated: pixels of frame {first} lie beyond the end of the file")
-        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame]).reshape(shape)
+        stored = np.stack([page.asarray(maxworkers=1) for page in of_frame if page is not None]).reshape(shape)
         return stored.transpose(order).reshape(1, *info.shape[1:])
 
     return BlockReader(path, info, read, close=close)
 
 
-def _open_pages(path: Path, tif: Any, pages: Sequence[_Page]) -> BlockReader:
+def _open_pages(path: Path, tif: tifffile.TiffFile, pages: Sequence[_Page]) -> BlockReader:
     """Reader of a file in which every page is a frame, thumbnails and masks excepted."""
     frames = [page for page in pages if not page.secondary] or pages
-    first = tif.pages[frames[0].number]
-    if first.axes not in ("YX", "YXS", "SYX"):
+    first = cast(tifffile.TiffPage, tif.pages[frames[0].number])
+    if first.dtype is None or first.axes not in ("YX", "YXS", "SYX"):
         raise ValueError(f"page {first.index} has shape {first.shape} (axes {first.axes}); expected an image")
     for page in frames:
         if page.kind != frames[0].kind:
@@ -183,7 +185,7 @@ def _open_pages(path: Path, tif: Any, pages: Sequence[_Page]) -> BlockReader:
     return _page_reader(path, info, tif.pages, [[page.number] for page in frames], first.shape, order, tif.close)
 
 
-def _open_series(path: Path, tif: Any) -> BlockReader:
+def _open_series(path: Path, tif: tifffile.TiffFile) -> BlockReader:
     """Reader of a file whose pages are arranged as one array."""
     # with axes of length 1, which is an option from tifffile 2026.5.2 on
     series = (tif.series(squeeze=False) if callable(tif.series) else tif.series)[0]
@@ -221,7 +223,7 @@ _PROGRAMS = (
 )
 
 
-def _are_arranged(tif: Any, count: int) -> bool:
+def _are_arranged(tif: tifffile.TiffFile, count: int) -> bool:
     """Whether the ``count`` pages of a file are arranged as one array; otherwise every page is a frame."""
     metadata = json_description(tif)
     if "shape" in metadata:  # series of pages that were written one by one would take quadratic time
@@ -283,7 +285,7 @@ def storage_of(path: Path) -> Table:
 
 
 def write_tiff(
-    path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None, storage: Mapping[str, Any] = {}
+    path: Path, info: StackInfo, frames: Iterator[Array], compression: str | None, storage: Mapping[str, object] = {}
 ) -> None:
     """Write a TIFF file frame by frame; arguments as in ``StackFormat.write``, and from ``storage_of``."""
     stored, options = _layout(info)

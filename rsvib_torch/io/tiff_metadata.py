@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, cast
 
 import tifffile
 
@@ -41,7 +41,7 @@ _STORAGE = {32995, 32996, 32997, 32998, _IMAGEJ_COUNTS, _IMAGEJ}
 _SUBIFDS = 330
 
 
-def json_description(tif: Any) -> Table:
+def json_description(tif: tifffile.TiffFile) -> Table:
     """What tifffile or this package states in the description of the first page; empty if there is nothing."""
     page = tif.pages.first
     lines = [line for line in page.description.splitlines() if line.startswith(_IMAGEJ_KEY)]
@@ -55,13 +55,13 @@ def _parsed(text: str) -> Table:
     return {}
 
 
-def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
+def read_metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
     """Metadata of a TIFF file by name; None for those that cannot be copied to the file that this package writes.
 
     Descriptions of the arrangement of its pages (OME, ImageJ) are copied only if those of the output will be the same.
     """
     numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
-    others = [tif.pages.get(number) for number in numbers if 0 < number < len(tif.pages)]
+    others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
     found: dict[str, Tag | None] = {}
     for tag in tif.pages.first.tags:
         private = tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE
@@ -83,16 +83,16 @@ def read_metadata(tif: Any, info: StackInfo) -> dict[str, Tag | None]:
     return found | _descriptions(tif, others, info.shape[0] if same_pages else -1)
 
 
-def _value(tag: Any) -> Any:
+def _value(tag: tifffile.TiffTag | None) -> Any:
     """The value of a tag, None if it is missing, damaged or a structure of its own."""
     value = None
     with suppress(Exception):  # any type, from a damaged file
-        value = tag.value
+        value = None if tag is None else tag.value
     parts = value if isinstance(value, tuple) else (value,)
     return value if all(isinstance(part, (int, float, str, bytes)) for part in parts) else None
 
 
-def _descriptions(tif: Any, others: Sequence[Any], frames: int) -> dict[str, Tag | None]:
+def _descriptions(tif: tifffile.TiffFile, others: Sequence[tifffile.TiffPage], frames: int) -> dict[str, Tag | None]:
     """Descriptions of the first page; ``frames`` of the file that will be written as the same pages."""
     first = tif.pages.first
     found: dict[str, Tag | None] = {}
@@ -120,7 +120,7 @@ def _descriptions(tif: Any, others: Sequence[Any], frames: int) -> dict[str, Tag
     return found
 
 
-def _free_text(page: Any) -> str:
+def _free_text(page: tifffile.TiffPage) -> str:
     """The description of a page that is not that of tifffile."""
     texts = (page.description, page.description1)
     return next((text for text in texts if text and text != page.shaped_description), "")
@@ -130,9 +130,9 @@ def _text(text: str, scope: Scope) -> Tag:
     return Tag(_DESCRIPTION, 2, 0, text, True, scope)
 
 
-def writer_options(info: StackInfo, description: Mapping[str, Any]) -> Table:
+def writer_options(info: StackInfo, description: Mapping[str, object]) -> Table:
     """Options of ``tifffile.imwrite`` that store the metadata of a stack, and a description as JSON."""
-    extratags: list[tuple[Any, ...]] = []
+    extratags: list[tuple[object, ...]] = []
     options: Table = {"metadata": dict(description), "extratags": extratags}
     for name, tag in info.metadata.items():
         if tag is None:

@@ -4,6 +4,8 @@ Frames are returned as stored, because these are the rows that the sensor has re
 applied; the videos that are written state it.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -13,7 +15,7 @@ from functools import lru_cache
 from io import BytesIO
 from itertools import chain, count, pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -22,6 +24,9 @@ from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.io.stack_info import H264, VIDEO, FrameError, StackInfo, readable_stack
 from rsvib_torch.io.stated_metadata import camera_name
 from rsvib_torch.numerics.tables import Array
+
+if TYPE_CHECKING:
+    import av
 
 CONTAINERS = {".mkv": "matroska", ".mp4": "mp4", ".mov": "mov", ".m4v": "mp4"}  # of the videos that are written
 _H264_OPTIONS = {"crf": "12"}  # constant rate factor, 0 (no loss) to 51; differences of less than 18 are hardly visible
@@ -71,7 +76,7 @@ def _conversion() -> Any:
     return flags.BILINEAR | flags.FULL_CHR_H_INT | flags.ACCURATE_RND
 
 
-def _decoded_as(layout: Any) -> tuple[str, float]:
+def _decoded_as(layout: av.VideoFormat) -> tuple[str, float]:
     """Pixel format to which frames are converted, and its full scale; grey and RGB keep their depth."""
     bits = max(component.bits for component in layout.components)
     if layout.name.startswith(("gray", "gbrp")) and "f" not in layout.name:
@@ -79,7 +84,7 @@ def _decoded_as(layout: Any) -> tuple[str, float]:
     return ("rgb24", 255.0) if bits <= 8 else ("rgb48le", 65535.0)
 
 
-def _pixels(frame: Any) -> Array:
+def _pixels(frame: av.VideoFrame) -> Array:
     """Pixels (H, W) or (3, H, W) of a decoded frame."""
     unspecified, untagged_height = 2, 576  # players assume the colours of HDTV for taller videos without a tag
     matrix = "ITU709" if frame.colorspace == unspecified and frame.height > untagged_height else None
@@ -87,7 +92,7 @@ def _pixels(frame: Any) -> Array:
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else np.moveaxis(pixels, -1, 0))
 
 
-def _frames(container: Any) -> Generator[Any, None, None]:
+def _frames(container: Any) -> Generator[av.VideoFrame, None, None]:
     """Decode the frames of the main video stream in the order of presentation; damaged packets are skipped."""
     av, stream, packet = _av(), container.streams.best("video"), None
     stream.thread_type = "AUTO"
@@ -206,7 +211,7 @@ class VideoReader:
         self._path = path
         self.info, self._times, self.picture = scanned(path)
         self._container: Any = None
-        self._early: Any = None  # a decoded frame, if those before it cannot be decoded
+        self._early: av.VideoFrame | None = None  # a decoded frame, if those before it cannot be decoded
         self._restart()
 
     def _restart(self) -> None:
@@ -223,7 +228,7 @@ class VideoReader:
         planes: Array = self._decoded(index).to_ndarray()
         return planes
 
-    def _decoded(self, index: int) -> Any:
+    def _decoded(self, index: int) -> av.VideoFrame:
         if index < self._next:
             self._restart()
         frame = None
@@ -238,7 +243,7 @@ class VideoReader:
             raise FrameError(f"{self._path}: frames of different size: frame {index} is {frame.height, frame.width}")
         return frame
 
-    def _decode(self, expected: Fraction | None) -> Any:
+    def _decode(self, expected: Fraction | None) -> av.VideoFrame | None:
         """The frame of an expected presentation time in s; None if it cannot be decoded."""
         while True:
             frame, self._early = self._early or next(self._decoding, None), None
