@@ -21,12 +21,12 @@ from rich.console import Console
 from torch import Tensor
 
 import rsvib_torch as rsv
+from rsvib_torch.commands.answers import write_detection
 from rsvib_torch.commands.terminal import warnings_in_one_line, working
 from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.report import Report, write_report_page
-from rsvib_torch.report.plots import detailed_places, offset_figure, save_figure
-from rsvib_torch.report.results import write_offsets, write_vibration
+from rsvib_torch.report.plots import detailed_places, save_figure
 from rsvib_torch.text import text_table
 
 TIMING = rsv.SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
@@ -120,9 +120,7 @@ def run(name: str, options: argparse.Namespace, arguments: Sequence[str], consol
     with working(f"{name}: writing files and figures"), whole_folder(out) as folder:
         rsv.write_stack(folder / "frames.tif", frames, dtype="uint16", full_scale=FULL_SCALE)
         rsv.write_stack(folder / "restored.tif", restored, dtype="uint16", full_scale=FULL_SCALE)
-        write_vibration(folder / "vibration.json", detection, TIMING)
-        write_offsets(folder / "offsets.csv", detection)
-        save_figure(offset_figure(detection), folder / "offsets.png")
+        write_detection(folder, detection, TIMING)
         save_figure(before_after(frames[0], restored[0], still), folder / "before_after.png", dpi=80)
         (folder / "report").mkdir()
         report = Report(

@@ -16,6 +16,7 @@ They are not part of this project. FOLDER holds those that are used:
 
 import argparse
 import csv
+import itertools
 import statistics
 import sys
 from collections.abc import Callable
@@ -48,15 +49,6 @@ WINDOW, WINDOWS = 10, 6  # frames of a row time, and row times of a recording
 # Row time from light
 
 
-def tallest_band(brightness: torch.Tensor) -> int:
-    """Rows of the tallest band that is brighter than 10 of 255."""
-    tallest = current = 0
-    for lit in (brightness >= 10 / 255).tolist():
-        current = current + 1 if lit else 0
-        tallest = max(tallest, current)
-    return tallest
-
-
 def light(folder: Path) -> None:
     """Row time from an LED and from a strobe, compared with the published values."""
     frame = rsv.read_stack(folder / "gyroflow_rollingshutter" / "frame_example.png")
@@ -73,7 +65,8 @@ def light(folder: Path) -> None:
         found = rsv.calibrate_row_time_by_exposure(strobe, [1 / 1000, 1 / 4000], gamma=gamma)
         result = f"{1e6 * found.row_time:.2f} +- {1e6 * found.row_time_std:.2f} us per row"
         print(f"strobe, with gamma {gamma:g}: {result} (published: 15.7 to 18.3 us)")
-    heights = [tallest_band(brightness) for brightness in strobe.mean((1, 3))]
+    lit = (strobe.mean((1, 3)) >= 10 / 255).tolist()
+    heights = [max(sum(rows) for _, rows in itertools.groupby(of_frame)) for of_frame in lit]  # of the tallest bands
     by_height = 1e6 * (1 / 1000 - 1 / 4000) / (heights[0] - heights[1])
     print(f"        by the heights of bands, {heights[0]} and {heights[1]} rows: {by_height:.2f} us")
 

@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import nbclient
 import nbformat
@@ -49,10 +50,8 @@ def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     names: dict[str, Any] = {"__name__": "page"}
     text = page.read_text(encoding="utf-8")
     parts, end, output = [], 0, None
-    columns = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100"
     terminal.LOG_AFTER = 3600.0  # s; pages show no progress
-    try:
+    with mock.patch.dict(os.environ, COLUMNS="100"):
         for block in BLOCK.finditer(text):
             between, (language, code) = text[end : block.start()], block.groups()
             if language == "text":
@@ -70,10 +69,6 @@ def run_page(page: Path, folder: Path) -> tuple[str, dict[str, Any]]:
                 output = written.getvalue()
             parts += [between, f"```{language}\n{code}```\n"]
             end = block.end()
-    finally:
-        os.environ.pop("COLUMNS")
-        if columns is not None:
-            os.environ["COLUMNS"] = columns
     return "".join([*parts, text[end:]]), names
 
 

@@ -199,7 +199,7 @@ def check_fields(value: Any) -> None:
 
 
 @cache
-def hints_of(owner: Any) -> dict[str, Any]:
+def hints_of(owner: Any) -> dict[str, object]:
     """Annotations of the arguments of a function, or of the fields of a class."""
     given = {name: kind for name, kind in owner.__annotations__.items() if name != "return"}
     if isinstance(owner, type):

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -118,7 +118,7 @@ def cameras(given: CamerasOptions) -> Answer:
     return Answer({"Cameras": [text_table(head, rows, most=len(rows))]}, {"cameras": data})
 
 
-def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> tuple[dict[str, float], str]:
+def _row_time_of(camera: str, info: "StackInfo", values: Table) -> tuple[dict[str, float], str]:
     """Row time in s of a camera model in the mode of the frames, with its std, and where it comes from."""
     if "frame_rate" not in values:
         raise ValueError(f"the mode of {camera} depends on the frame rate: give --frame-rate")
@@ -129,7 +129,7 @@ def _row_time_of(camera: str, info: "StackInfo", values: Mapping[str, Any]) -> t
     return found, f"row time {time} us, from gyroflow/lens_profiles: {mode}"
 
 
-def _describe_camera(path: Path, given: Mapping[str, Any], camera: str | None) -> str:
+def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     """Text of the configuration file: values of the command line, of the file, and of the answers to questions."""
     with working(f"reading {path}"), closing(io.open_stack(path)) as reader:
         info, first = reader.info, reader.frame(0)
@@ -230,7 +230,7 @@ def _check_timing(timing: SensorTiming, rows: int) -> None:
         warn(f"the readout takes only {100 * used:.2g} % of the frame period: check the unit of the row time")
 
 
-def sensor_toml(values: Mapping[str, object], head: list[str]) -> str:
+def sensor_toml(values: Table, head: list[str]) -> str:
     """Text of a configuration file with the table ``[sensor]``; the key of an unknown value (None) is a comment."""
 
     def comment(text: str) -> list[str]:

@@ -12,7 +12,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
@@ -133,7 +132,7 @@ def warnings_in_one_line() -> Iterator[None]:
     """Show Python's warnings without file name and source line, each once."""
     shown: set[str] = set()
 
-    def show(message: Any, *_: Any, **__: Any) -> None:
+    def show(message: object, *_: object, **__: object) -> None:
         line = " ".join(str(message).split())
         if line not in shown:
             shown.add(line)

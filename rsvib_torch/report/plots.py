@@ -105,7 +105,7 @@ def _panels(width: float, height: float, rows: int = 1, columns: int = 1, **grid
 
 
 def _axes_figure(
-    times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]], labels: Sequence[str], **style: Any
+    times: Tensor, curves: Sequence[tuple[Sequence[str], Tensor, str | None]], labels: Sequence[str], **style: object
 ) -> Figure:
     """A panel for x and y each with curves over times in s, and labels of x, of y, and before the name of the axis.
 

@@ -8,7 +8,7 @@ import html
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -70,7 +70,7 @@ def verdict_table(
     return [text_table([*head, "verdict"], [[*row, text] for row, text in zip(rows, verdicts, strict=True)])]
 
 
-def verdict_lines(reliable: Any, reasons: Sequence[Sequence[str]]) -> list[str]:
+def verdict_lines(reliable: Iterable[object], reasons: Sequence[Sequence[str]]) -> list[str]:
     """Whether each axis (x, y, roll, zoom) is reliable, with the reasons."""
     lines = []
     for name, good, why in zip(AXIS_NAMES, reliable, reasons, strict=False):

@@ -1,13 +1,13 @@
 """Detection and restoration as one module of a network."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor, nn
 
 from rsvib_torch.detection import DetectionResult, VibrationDetector
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
+from rsvib_torch.options import OptionTable
 from rsvib_torch.restoration import VibrationRestorer
 
 
@@ -50,8 +50,8 @@ class VibrationCorrector(nn.Module):
         self,
         timing: SensorTiming,
         *,
-        detection: Mapping[str, Any] | None = None,
-        restoration: Mapping[str, Any] | None = None,
+        detection: OptionTable = None,
+        restoration: OptionTable = None,
     ) -> None:
         super().__init__()
         self.detector = VibrationDetector(timing, **(detection or {}))

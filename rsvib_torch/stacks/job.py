@@ -102,7 +102,7 @@ class StackJob:
     full_scale: float | None  # count that corresponds to 1.0; None for floats
     detection: Mapping[str, Any] = field(default_factory=dict)  # options of ``detect_vibration``
     # options of ``restore``, for frames whose full scale is 1; None for detection only
-    restoration: Mapping[str, Any] | None = field(default_factory=dict)
+    restoration: OptionTable = field(default_factory=dict)
     # detections to use instead, by number of the window; None where a window has none
     given: Mapping[int, DetectedVibration | None] | None = None
     motion: FreeMotion | None = None  # motion of all frames to use instead, from the start of the first one
@@ -412,8 +412,8 @@ def restore_block(
     frames: Array,
     timing: SensorTiming,
     *,
-    detection: Mapping[str, Any] | None = None,
-    restoration: Mapping[str, Any] | None = None,
+    detection: OptionTable = None,
+    restoration: OptionTable = None,
     full_scale: float | None = None,
     channels: Channels = None,
     force: bool = False,

@@ -1,15 +1,14 @@
 """Memory planning: how many windows can be processed at once in the available memory."""
 
 import re
-from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 import psutil
 
 from rsvib_torch.files.free_memory import check_fits, free_memory, size_text
 from rsvib_torch.io.stack_info import StackInfo
+from rsvib_torch.options import OptionTable
 from rsvib_torch.restoration.exact.priors import PRIORS
 from rsvib_torch.text import quoted
 
@@ -42,7 +41,7 @@ def memory_limit(memory: str | float | None) -> int:
 def memory_needed(
     info: StackInfo,
     window: int,
-    restoration: Mapping[str, Any] | None,
+    restoration: OptionTable,
     count: int = 1,
     *,
     on_gpu: bool = False,
@@ -75,7 +74,7 @@ def windows_at_once(
     *,
     memory: str | float | None,
     most: int,
-    restoration: Mapping[str, Any] | None,
+    restoration: OptionTable,
     on_gpu: bool = False,
     margin: int = 0,
 ) -> int:
@@ -106,7 +105,7 @@ def windows_at_once(
     return int(min(most, count))
 
 
-def check_stack_fits(info: StackInfo, restoration: Mapping[str, Any] | None = None, *, on_gpu: bool = False) -> None:
+def check_stack_fits(info: StackInfo, restoration: OptionTable = None, *, on_gpu: bool = False) -> None:
     """Raise a ``ValueError`` if a stack that is processed as a whole does not fit into the free memory."""
     what = f"{info.path or 'the frames'}: {info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px"
     needed = memory_needed(info, info.shape[0], restoration, on_gpu=on_gpu) - psutil.Process().memory_info().rss

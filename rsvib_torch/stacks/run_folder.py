@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from functools import partial
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def work_folder(sink: Path) -> Path:
     return sink.with_name(f".{sink.name}.rsvib")
 
 
-def _difference(old: Any, new: Any, path: str = "") -> str | None:
+def _difference(old: object, new: object, path: str = "") -> str | None:
     """The first key in which two tables differ, with both values; None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*new, *old]):
@@ -79,7 +79,7 @@ class RunFolder:
     or in which another run writes, is refused.
     """
 
-    def __init__(self, sink: Path, header: Mapping[str, Any], *, resume: bool) -> None:
+    def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
         self._windows: dict[int, tuple[int, int, int]] = {}  # finished: place and size of the line; frames
         self._digest = b""  # of the last line of the journal
@@ -192,7 +192,7 @@ class RunFolder:
         entry: Table = json.loads(os.pread(self._journal, size, place).partition(b" ")[2])
         return entry
 
-    def _append(self, entry: Mapping[str, Any]) -> tuple[int, int]:
+    def _append(self, entry: Mapping[str, object]) -> tuple[int, int]:
         """Write a line of the journal, which is on the disk when the function returns; its place and size."""
         body = json.dumps(entry).encode()
         self._digest = _keyed(body, self._digest)
@@ -219,7 +219,7 @@ class RunFolder:
         """A file of the folder for reading."""
         return os.fdopen(os.open(name, os.O_RDONLY | _SAFELY, dir_fd=self._folder), "rb")
 
-    def add(self, record: Mapping[str, Any], names: Sequence[str] = (), array: Array | None = None) -> None:
+    def add(self, record: Table, names: Sequence[str] = (), array: Array | None = None) -> None:
         """Enter the ``WindowRecord`` of a window with its closed files, and an array, which becomes the last of them.
 
         It is on the disk when the function returns.
@@ -371,7 +371,7 @@ def run_to_file(
     manifest = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
     check_outputs([*stack_files(sink), work_folder(sink), manifest], inputs)
 
-    def report(windows_done: Iterable[Mapping[str, Any]], resumed: int, lost: Sequence[str]) -> StackReport:
+    def report(windows_done: Iterable[Table], resumed: int, lost: Sequence[str]) -> StackReport:
         records = list(windows_done)
         return StackReport(
             frames=sum(record["written"] for record in records),

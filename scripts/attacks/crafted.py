@@ -269,16 +269,6 @@ def _hdf5(folder: Path, write: Callable[[h5py.File], None]) -> Path:
     return path
 
 
-def _links_to_root(file: h5py.File, count: int) -> None:
-    for index in range(count):
-        file[f"link{index}"] = file["/"]
-
-
-def _groups(file: h5py.File, count: int) -> None:
-    for index in range(count):
-        file.create_group(f"g{index}")
-
-
 def _zeros(file: h5py.File, shape: tuple[int, ...], **options: object) -> h5py.Dataset:
     return file.create_dataset("frames", shape=shape, dtype="u2", **options)
 
@@ -299,9 +289,9 @@ def _times(file: h5py.File) -> None:
 
 
 for _name, _write in {
-    "25 groups linked to the root": partial(_links_to_root, count=25),
+    "25 groups linked to the root": lambda file: file.update({f"link{n}": file["/"] for n in range(25)}),
     "2000 groups in each other": lambda file: file.create_group("/".join("a" * 2000)),
-    "20000 groups": partial(_groups, count=20_000),
+    "20000 groups": lambda file: list(map(file.create_group, map(str, range(20_000)))),
     "no pixels stored, 2^60 bytes": partial(_zeros, shape=(2**25, 2**17, 2**17)),
     "chunk of 4 GB": partial(_zeros, shape=(100, 4000, 4000), chunks=(100, 4000, 4000), compression="gzip"),
     "chunks of 1 x 1 x 1": _filled,

@@ -329,7 +329,6 @@ def lines(results: Rows, options: argparse.Namespace) -> list[str]:
     """The figures as a Markdown table."""
     heads = ("recordings", "quantity", "values", "rms of z", *(f"{share} %" for share in WITHIN), "largest z")
     ratios = {"median of std / bound": "std_over_bound", "rms of error / bound": "error_over_bound"}
-    ratios = {head: key for head, key in ratios.items() if any(key in row for row in results)}
     cells = []
     for row in results:
         within = (f"{row[f'within_{share}']:.1%}".replace("100.0", "100") for share in WITHIN)

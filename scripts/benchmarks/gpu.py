@@ -101,7 +101,7 @@ def vibration_of(count: int) -> rsv.Vibration:
 def drawn(size: int, variant: int, num_frames: int) -> Tensor:
     """Frames (T, H, W) of one of the vibrations, without noise."""
     scene = city_and_fields(size + 2 * MARGIN, size + 2 * MARGIN, SEED)
-    vibration = rsv.Vibration(*(part[variant] for part in _parts(vibration_of(VARIANTS))))
+    vibration = vibration_of(VARIANTS)[variant]
     return rsv.simulate_frames(scene, camera(size), vibration, num_frames, frame_size=(size, size))
 
 
@@ -112,10 +112,6 @@ def recordings(size: int, count: int, num_frames: int, device: str) -> Tensor:
     frames = clean[torch.arange(count) % variants][:, :, None]
     noise = torch.Generator(device).manual_seed(SEED)
     return frames.add_(NOISE * torch.randn(frames.shape, generator=noise, device=device))
-
-
-def _parts(vibration: rsv.Vibration) -> tuple[Tensor, Tensor, Tensor]:
-    return vibration.amplitude, vibration.frequency, vibration.phase
 
 
 def measured(work: Callable[[], Any], device: str, runs: int) -> dict[str, Any]:
@@ -133,7 +129,7 @@ def measured(work: Callable[[], Any], device: str, runs: int) -> dict[str, Any]:
 def works_of(frames: Tensor, timing: rsv.SensorTiming) -> dict[str, Callable[[], Any]]:
     """What is done with the stacks of a batch."""
     batch = vibration_of(len(frames))
-    truth = batch if frames.ndim == 5 else rsv.Vibration(*(part[0] for part in _parts(batch)))
+    truth = batch if frames.ndim == 5 else batch[0]
     return {
         "detection": lambda: rsv.detect_vibration(frames, timing),
         "restoration, exact": lambda: rsv.restore(frames, timing, truth),
