@@ -90,7 +90,7 @@ def pair_verdict(
 
     The time origin of the motion is the middle of the first frame, and the other one starts an ``interval`` in s later.
     """
-    if timing.scan_axis == -2:
+    if timing.scan_axis == -2 and motion.num_axes == 2:
         frames = frames[..., detailed_parts(frames[None, None], _JUDGED_COLUMNS)[0]]
     if not bool((motion.amplitude > 0).any()):
         return None

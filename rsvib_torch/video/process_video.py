@@ -82,10 +82,11 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     Tones that sweep are followed in windows of 24 frames, where others leave more than 0.3 px.
 
     Two frames of each part of 32 are judged. Of a part that is worse, or that path and tones do not explain, and that
-    shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone. Frames
-    that cannot be decoded, constant frames and copies are replaced by the frame before. The video is encoded in parts
-    in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is resumed. The shaking of the first frames
-    of each part is compared with that of the input: a video that shakes more is not written.
+    shakes more than as taken, rows are not moved apart: no vibration, and with ``steady`` no wobble, is undone; if it
+    shakes less, it has no verdict. Frames that cannot be decoded, constant frames and copies are replaced by the frame
+    before. The video is encoded in parts in the folder ``.NAME.rsvib`` beside it, from which an interrupted run is
+    resumed. The shaking of the first frames of each part is compared with that of the input: a video that shakes more
+    is not written.
 
     Args:
         source: A video, or another stack as in ``read_stack``.
@@ -158,7 +159,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
         with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
             for part, frames, verdicts in parts:
                 _encode_part(video, motion, folder, part, frames, verdicts, output, progress)
-        _check_shaking(folder)
+        _check_shaking(folder, is_explained=any(video.is_explained(motion, part) for part in range(video.parts)))
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
             gyroscope = {name: plain_values(getattr(motion.path, name)) for name in _OF_GYROSCOPE}
@@ -180,10 +181,20 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     )
 
 
-def _check_shaking(folder: RunFolder) -> None:
-    """Raise a ``ValueError`` if the restored frames shake more than those of the input; nothing is kept."""
+def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
+    """Raise a ``ValueError`` if the restored frames shake more than those of the input; nothing is kept.
+
+    This also happens if it is unknown, and path and tones do not explain the corners of any part.
+    """
     names = {"frame_to_frame": "from frame to frame", "rows": "between the rows"}
-    for key, (before, after) in rms_shaking(record["shaking"] for record in folder.records()).items():
+    shaking = rms_shaking(record["shaking"] for record in folder.records())
+    if not shaking and not is_explained:
+        folder.remove()
+        raise ValueError(
+            "the frames have too little detail: no path of the camera explains the motion of their corners, and the "
+            "shaking of the restored video cannot be measured"
+        )
+    for key, (before, after) in shaking.items():
         if after > _MORE_SHAKING[key] * before + _VISIBLE_SHAKING:
             folder.remove()
             raise ValueError(
@@ -203,6 +214,11 @@ def _planned(
     with closing(open_stack(source)) as reader:
         picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
     frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
+    if job.info.shape[0] < 3:
+        raise ValueError(
+            f"{source}: to be followed, a video needs at least 3 frames, it has {job.info.shape[0]}; use process_stack "
+            "(rsvib run without --video)"
+        )
     times = job.timing.frame_starts(job.info.shape[0]).tolist()
     starts = np.array(times) - times[0]
     # What the track of a GoPro video states of its frames. Rows are read at equal intervals, where exposures end:
@@ -237,10 +253,12 @@ def _restored_parts(
                     continue
                 tracked = ((video.track(motion, index), frame) for index, frame in frames)
                 first = list(islice(tracked, _JUDGED_FRAMES))
-                verdicts[part] = verdict = video.verdict(first)
-                # Parallax makes two frames worse that shake less: corners decide.
+                verdicts[part] = verdict = video.verdict(motion, first)
+                # Parallax and overlays make two frames worse that shake less: corners decide.
                 is_doubted = not video.is_explained(motion, part) or (verdict and verdict.overall == "worse")
                 is_worse = bool(is_doubted) and video.shakes_more(motion, first)
+                if is_doubted and not is_worse:
+                    verdicts[part] = None
                 for track, frame in chain(first, tracked):
                     yield video.left_alone(track) if is_worse else track, frame
 

@@ -125,6 +125,20 @@ def test_corners_at_night_are_those_of_the_lights():
     assert all(min(np.hypot(*(point - [column + 1, row + 1])) for row, column in places) < 5 for point in found)
 
 
+def test_a_few_lights_are_followed_beside_flakes_that_one_frame_shows():
+    rng, (y, x) = np.random.default_rng(3), np.mgrid[:360, :640]
+    lights, flakes = (rng.uniform((20, 20), (340, 620), (count, 2)) for count in (25, 120))
+    follower = CornerFollower(TIMING)
+
+    def taken(spots):
+        light = sum(np.exp(-0.5 * ((y - row) ** 2 + (x - column) ** 2) / 4) for row, column in spots)
+        return np.clip(220 * light, 0, 255).astype(np.uint8)
+
+    assert follower.next(taken([*lights, *flakes]), 0.0) is None
+    moved, _ = shake(follower.next(taken(lights + np.array([-2.0, 3.0])), 1 / 30))
+    np.testing.assert_allclose(moved, (3.0, -2.0), atol=0.1)
+
+
 def test_unrelated_frames_have_no_path():
     noise = np.random.default_rng(0).integers(0, 255, (6, HEIGHT, WIDTH), dtype=np.uint8)
     with pytest.raises(ValueError, match="the frames show different scenes, or no detail"):

@@ -28,10 +28,13 @@ OPTIONS = {"restoration": {"method": "dewarp"}, "workers": 2}
 
 
 class Shaken:
-    """Vibration on a slow pan with shaking of 3 Hz."""
+    """Vibration on a slow pan with shaking along x."""
+
+    def __init__(self, amplitude=2.0, frequency=3.0):  # px, Hz
+        self.amplitude, self.frequency = amplitude, frequency
 
     def displacement(self, t):
-        x = 2.0 * np.sin(2 * np.pi * 3 * t) + 12.0 * t
+        x = self.amplitude * np.sin(2 * np.pi * self.frequency * t) + 12.0 * t
         return VIBRATION.displacement(t) + np.stack([x, 0 * t], -1)
 
 
@@ -154,6 +157,15 @@ def test_a_steady_video_follows_the_mean_of_its_path(shaky, tmp_path):
     assert min(margins.values()) >= 2
 
 
+def test_parts_of_a_video_are_judged_with_the_motion_of_the_hand_in_both_frames(tmp_path):
+    """Between two frames, this hand leaves the parabola of the first one by 2 px."""
+    clip = write(tmp_path / "clip.mp4", counts_of(Shaken(6.0, 6.0)))
+    report = process_video(clip, tmp_path / "steady.mp4", TIMING, border="crop", steady=0.5, **OPTIONS)
+    windows = read_manifest(report.manifest).windows
+    assert [one.outcome for one in windows] == ["helps"] * 2
+    assert min(one.predicted_gain for one in windows) > 6
+
+
 def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
     timing = SensorTiming(row_time=0.73 * 150e-6, exposure_rows=4 / 0.73, frame_rows=1 / RATE / (0.73 * 150e-6))
     report = process_video(clip, tmp_path / "still.mp4", timing, **OPTIONS)
@@ -254,6 +266,8 @@ def test_wrong_arguments_are_refused_before_anything_is_written(clip, tmp_path):
             process_video(clip, tmp_path / "still.mp4", TIMING, **options)
     refuses(lambda: process_video(clip, tmp_path / "still.tif", TIMING), "videos are written to")
     refuses(lambda: process_video(clip, clip, TIMING), "same file as the input")
+    two = f"{clip}[0:2]"
+    refuses(lambda: process_video(two, tmp_path / "still.mp4", TIMING), "at least 3 frames, it has 2")
     assert list(tmp_path.iterdir()) == []
 
 
