@@ -14,7 +14,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,36 +27,28 @@ RESULTS = Path(__file__).parent / "attacks" / "results.json"
 sys.path.append(str(PAGE.parents[1] / "tests"))  # attacks share cases with the tests
 
 
-@dataclass(frozen=True)
-class Attack:
-    """One kind of attack."""
-
-    title: str  # first column of the table
-    count: int  # number of trials for the table of the page
-
-
 # A new attack is one module in scripts/attacks and one line here. Its ``trials(folder, count, seed)`` runs up to
 # ``count`` trials with files in ``folder`` and yields their results; what is drawn at random depends on ``seed`` only.
 # Modules are imported when they are used: child processes of the attacks on storage import this file for every trial.
-ATTACKS: dict[str, Attack] = {
-    "kills": Attack("runs killed and resumed", 207),
-    "power_losses": Attack("power losses, resumed", 450),
-    "damaged_parts": Attack("damaged parts of interrupted runs, resumed", 63),
-    "journals": Attack("damaged journals", 250),
-    "links": Attack("links and foreign files as work folders", 110),
-    "inputs": Attack("outputs that are or contain inputs", 250),
-    "concurrent": Attack("several runs with one output", 45),
-    "disks": Attack("full and read-only disks", 66),
-    "live_sessions": Attack("recordings of a camera", 204),
-    "memory": Attack("`--memory` in different layouts", 15),
-    "crafted": Attack("crafted files", 200),
-    "workers": Attack("killed and missing Dask workers", 9),
-    "api": Attack("hostile arguments of Python functions", 4000),
-    "mutated": Attack("randomly damaged files", 2400),
-    "readers": Attack("damaged files of motion and gyroscopes", 300),
-    "buffers": Attack("buffers of the caller, written to later", 100),
-    "spans": Attack("frames over long time spans", 50),
-    "images": Attack("frames that do not determine a motion", 200),
+ATTACKS: dict[str, tuple[str, int]] = {  # first column of the table, and number of trials for the page
+    "kills": ("runs killed and resumed", 207),
+    "power_losses": ("power losses, resumed", 450),
+    "damaged_parts": ("damaged parts of interrupted runs, resumed", 63),
+    "journals": ("damaged journals", 250),
+    "links": ("links and foreign files as work folders", 110),
+    "inputs": ("outputs that are or contain inputs", 250),
+    "concurrent": ("several runs with one output", 45),
+    "disks": ("full and read-only disks", 66),
+    "live_sessions": ("recordings of a camera", 204),
+    "memory": ("`--memory` in different layouts", 15),
+    "crafted": ("crafted files", 200),
+    "workers": ("killed and missing Dask workers", 9),
+    "api": ("hostile arguments of Python functions", 4000),
+    "mutated": ("randomly damaged files", 2400),
+    "readers": ("damaged files of motion and gyroscopes", 300),
+    "buffers": ("buffers of the caller, written to later", 100),
+    "spans": ("frames over long time spans", 50),
+    "images": ("frames that do not determine a motion", 200),
 }
 
 
@@ -74,7 +65,7 @@ def counted(results: dict[str, dict[str, Any]]) -> list[str]:
     for name, seeds in results.items():
         counts = [sum(one["counts"][outcome] for one in seeds.values()) for outcome in OUTCOMES]
         oldest = min(one["date"] for one in seeds.values())
-        lines.append((f"{ATTACKS[name].title} (`{name}`)", oldest, sum(counts), *counts))
+        lines.append((f"{ATTACKS[name][0]} (`{name}`)", oldest, sum(counts), *counts))
     return table(("attack", "date", "trials", *OUTCOMES), lines)[:-1]
 
 
@@ -99,10 +90,10 @@ def main() -> int:
     stored: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     latest: dict[str, Any] = {}
     for name, seed in itertools.product(options.only, options.seeds):
-        attack, begin, trials = ATTACKS[name], time.perf_counter(), []
+        count, begin, trials = options.count or ATTACKS[name][1], time.perf_counter(), []
         with tempfile.TemporaryDirectory(prefix="reliability-") as folder:
             run = importlib.import_module(f"attacks.{name}").trials
-            for trial in run(Path(folder), options.count or attack.count, seed):
+            for trial in run(Path(folder), count, seed):
                 trials.append(trial)
                 if trial.outcome in FAILURES:
                     failed = True

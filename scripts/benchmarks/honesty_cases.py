@@ -17,9 +17,8 @@ import rsvib_torch as rsv
 
 FRAME_PERIOD = 1 / 24  # s
 BLANKING = 1.15  # row times of a frame period per row of a frame; a frame period stated 10 % too short is still valid
-FULL_ROWS = (
-    2048  # rows to which the numbers of exposure rows refer; in smaller frames it is scaled, and the row time is longer
-)
+# rows to which the numbers of exposure rows refer; in smaller frames it is scaled, and the row time is longer
+FULL_ROWS = 2048
 SCENES = ("city", "chart", "texture", "text")
 SCENE_SEEDS = 2  # drawings of each scene; they are kept in memory
 

@@ -62,7 +62,6 @@ def case(name: str, size: tuple[int, int]) -> dict[str, Any]:
         "std": found.std.displacement.tolist(),
         "error": np.sqrt(np.square(error).mean(0)).tolist(),
         "reliable": found.reliable.tolist(),
-        "reasons": [list(reasons) for reasons in found.reasons],
     }
 
 

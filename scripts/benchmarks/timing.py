@@ -112,9 +112,8 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
     case["raw_db"] = psnr(first.frames, first, stills)
     try:
         found = rsv.detect_vibration(frames, timing)
-    except ValueError as error:  # refused with another message
-        refused = {"outcomes": ["detected"] * 2, "named": [False] * 2, "reasons": [[str(error)]] * 2}
-        return case | refused | {"restored_db": case["raw_db"]}
+    except ValueError:  # refused with another message
+        return case | {"outcomes": ["detected"] * 2, "named": [False] * 2, "restored_db": case["raw_db"]}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", rsv.RestorationWarning)
         restored = rsv.restore(frames[:RESTORED], timing, found)
@@ -122,20 +121,14 @@ def judge_mistake(taken: Recording, name: str, num_frames: int) -> dict[str, Any
     texts = [str(one.message) for one in caught if one.category is rsv.RestorationWarning]
     warned = [text for text in texts if "is not restored" not in text]
     assumed = any(mistake.setting in text.split(":")[0] for text in found.assumptions)
-    case["outcomes"], case["named"], case["reasons"] = [], [], []
+    case["outcomes"], case["named"] = [], []
     for axis in range(2):
-        outcome = judge_axis(found, stated, axis)["outcome"]
-        reasons = list(found.reasons[axis])
-        if outcome in ("refused", "known") or warned:
-            outcome = "detected"
-        elif outcome != "correct":
-            outcome = "assumed" if assumed else "missed"
-        else:
-            outcome = "right"
+        judged = judge_axis(found, stated, axis)["outcome"]
+        outcome = "right" if judged == "correct" else "assumed" if assumed else "missed"
+        outcome = "detected" if judged in ("refused", "known") or warned else outcome
         case["outcomes"].append(outcome)
         codes = [reason.code for reason in found.findings[axis]]
         case["named"].append(outcome == "detected" and mistake.code in codes)
-        case["reasons"].append(reasons)
     case["restored_db"] = psnr(restored.double().numpy(), first, stills)
     return case
 
