@@ -184,7 +184,7 @@ class VideoFrames:
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
             restored = restore_prepared(prepared, motion, self.options)
-        return frames_to_counts(prepared.from_row_order(restored)[0], np.dtype(self.job.info.dtype), scale)
+        return frames_to_counts(prepared.from_row_order(restored)[0], plane.dtype, scale)
 
 
 def _with_pixels_moved(plane: Frame, source: NDArray[np.float32], kernel: int) -> Frame:
