@@ -112,10 +112,10 @@ class Picture:
     color_range: int  # range of the counts, code of FFmpeg: 2 is full, others are limited
     size: tuple[int, int]  # height and width in px
 
-    @property
-    def planar(self) -> bool:
-        """Whether frames are planes Y, U and V of 8 bits in 4:2:0 with even sides."""
-        return self.layout in ("yuv420p", "yuvj420p") and not any(side % 2 for side in self.size)
+    def fits(self, ending: str) -> bool:
+        """Whether a video with this ending can hold the planes Y, U and V: 4:2:0 with even sides, 8 bits in H.264."""
+        layouts = ("yuv420p", "yuvj420p") + ("yuv420p10le",) * (ending in H264)
+        return self.layout in layouts and not any(side % 2 for side in self.size)
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -224,9 +224,12 @@ class VideoReader:
         return _pixels(self._decoded(index))
 
     def planes(self, index: int) -> Array:
-        """Planes of a frame, (3 H / 2, W), Y above U and V; colours keep their counts, and chroma its resolution."""
+        """Planes of a frame in 8 bits, (3 H / 2, W), Y above U and V; chroma keeps its resolution.
+
+        Colours keep their counts; those of 10 bits are a quarter.
+        """
         planes: Array = self._decoded(index).to_ndarray()
-        return planes
+        return planes if planes.dtype == np.uint8 else np.minimum((planes + 2) >> 2, 255).astype(np.uint8)
 
     def _decoded(self, index: int) -> av.VideoFrame:
         if index < self._next:

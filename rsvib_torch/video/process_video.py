@@ -74,7 +74,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     ``gyroscope``, corners of 48 pairs of frames align its rates as in ``align_motion``; the path is the rotation of the
     camera at the time of every row, with the vibration that the gyroscope resolves, and no tones are fitted. Frames
     of 4:2:0 videos are restored as they are stored: luma with the method, chroma, which has half the resolution, with
-    ``"dewarp"``. Decoding, restoration and encoding run in threads.
+    ``"dewarp"``; H.264 gets 8 of 10 bits. Decoding, restoration and encoding run in threads.
 
     If the track of a GoPro video states the exposure of every frame (``SHUT``), it replaces that of ``timing``. If it
     states that the camera has stabilised the images (``IORI``), they are moved as a whole, without tones and wobble.
@@ -118,7 +118,7 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
     rates = None if recording is None else read_gyroscope(recording)
     if rates is None and options.lens_profile is not None:
         raise ValueError("lens_profile belongs to a gyroscope: give gyroscope as well")
-    video, at_once = _planned(source, timing, options, rates)
+    video, at_once = _planned(source, sink, timing, options, rates)
     job = video.frames.job
     if sink.suffix.lower() not in CONTAINERS:
         raise ValueError(f"{sink}: videos are written to {', '.join(CONTAINERS)}")
@@ -205,14 +205,15 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
 
 
 def _planned(
-    source: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
+    source: Path, sink: Path, timing: SensorTiming, options: ProcessVideoOptions, rates: AngularRates | None
 ) -> tuple[VideoPasses, int]:
     """The job of a run with the layout of its frames, and the number of frames to restore at the same time."""
     given = single_frame_options(options.restoration)
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     with closing(open_stack(source)) as reader:
-        picture = reader.picture if isinstance(reader, VideoReader) and reader.picture.planar else None
+        picture = reader.picture if isinstance(reader, VideoReader) else None
+    picture = picture if picture is not None and picture.fits(sink.suffix.lower()) else None
     frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
     if job.info.shape[0] < 3:
         raise ValueError(

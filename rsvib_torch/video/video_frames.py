@@ -184,7 +184,7 @@ class VideoFrames:
         prepared = prepare_frames(images, timing, saturation=saturation, channels="first")
         with torch.no_grad():
             restored = restore_prepared(prepared, motion, self.options)
-        return frames_to_counts(prepared.from_row_order(restored)[0], np.dtype(self.job.info.dtype), scale)
+        return frames_to_counts(prepared.from_row_order(restored)[0], plane.dtype, scale)
 
 
 def _with_pixels_moved(plane: Frame, source: NDArray[np.float32], kernel: int) -> Frame:
@@ -231,10 +231,10 @@ def _lanczos_taps(positions: Array) -> tuple[NDArray[np.int64], NDArray[np.float
 
 
 def _as_counts(values: Frame, dtype: np.dtype[Any]) -> Frame:
-    """Interpolated values, rounded if they are counts."""
+    """Interpolated values, rounded in place if they are counts."""
     if values.dtype != dtype and dtype.kind in "iu":
         limits = np.iinfo(dtype)
-        values = np.clip(np.rint(values), limits.min, limits.max)
+        values = np.clip(np.rint(values, out=values), limits.min, limits.max, out=values)
     return values.astype(dtype, copy=False)
 
 
