@@ -51,7 +51,7 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     # 3. The change of the tones by a change of each time, the tones in the order of a ``Vibration``.
     values = {}
     largest_first = (-fit.amplitude).argsort(-1, stable=True)
-    size = np.where(fit.amplitude > 0, fit.amplitude, 1.0)
+    size = np.where(fit.amplitude > 1e-9, fit.amplitude, 1.0)  # px or rad; a tone that has decayed does not count
     for name in ("row_time", "frame_rows", "exposure_rows"):
         lower, higher = (model_displacements(record(_scaled(timing, name, 1 + sign * _STEP)), fit) for sign in (-1, 1))
         change = (higher - lower) / (2 * _STEP)

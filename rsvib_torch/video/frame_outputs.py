@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rsvib_torch.checks.values import needed_package
 from rsvib_torch.files.atomic import sync
 from rsvib_torch.io.stack_info import H264, StackInfo
-from rsvib_torch.io.video import CONTAINERS, VideoEncoder
+from rsvib_torch.io.video import CONTAINERS, VideoEncoder, check_video
 
 Frame = NDArray[np.uint8]  # (H, W) grey or (H, W, 3) RGB
 
@@ -25,7 +25,7 @@ class FrameOutput(Protocol):
     """An output of video frames."""
 
     def write(self, frame: Frame, index: int) -> None:
-        """Write a frame (H, W) or (H, W, 3); ``index`` counts frame periods from the first frame."""
+        """Write a frame (H, W) or (H, W, 3); ``index`` counts frame periods from the first frame, and rises."""
 
     def close(self) -> None:
         """Finish the output."""
@@ -70,6 +70,8 @@ class VideoOutput:
             self._encoder.write(pixels, index * self._encoder.step)
 
     def _create(self, shape: tuple[int, ...]) -> None:
+        info = StackInfo((2, *shape), "uint8", 255.0, frame_rate=self._rate)  # of any number of frames
+        check_video(self._path, info)
         if self._overwrite:
             self._path.unlink(missing_ok=True)  # a link is replaced, not the file behind it
         try:
@@ -78,7 +80,6 @@ class VideoOutput:
             raise FileExistsError(f"{self._path} was created by another program; choose another name") from error
         sync(self._path.absolute().parent)
         lossy = self._path.suffix.lower() in H264
-        info = StackInfo((2, *shape), "uint8", 255.0, frame_rate=self._rate)  # of any number of frames
         self._container = self._av.open(str(self._path), "w", options=_FRAGMENTS if lossy else _CLUSTERS)
         # ultrafast keeps up with a camera; the other presets make smaller files of the same quality
         options = {"crf": "16", "preset": "ultrafast"} if lossy else {}

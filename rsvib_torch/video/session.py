@@ -96,7 +96,7 @@ def run_live(
     """
     report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
     border, period = border or VideoBorder("mirror"), tracker.timing.frame_period
-    reader, last = FrameReader(source, waiting, drops=drops), None
+    reader, last, index = FrameReader(source, waiting, drops=drops), None, -1
     with ExitStack() as ending:  # from the last line to the first
         ending.callback(torch.set_num_threads, threads)
         torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
@@ -118,9 +118,9 @@ def run_live(
                 spectrogram.add(tracked)
             if progress is not None:
                 progress(tracked, report)
-            frame = to_counts(border(tracked))
+            frame, index = to_counts(border(tracked)), max(index + 1, round(tracked.time / period))
             for output in outputs:
-                output.write(frame, round(tracked.time / period))
+                output.write(frame, index)
             last, report.size = tracked, frame.shape[:2]
             report.frames += 1
             late = math.floor((time.perf_counter() - arrived) / period)

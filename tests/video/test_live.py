@@ -370,6 +370,29 @@ def test_the_motion_of_late_frames_is_predicted(drops):
     assert (report.predicted > 5) == drops
 
 
+class Uneven(Numbers):
+    """Two frames come within one frame period, as from a webcam or a video of variable frame rate."""
+
+    def frames(self):
+        for time_of_frame in (0.0, 0.9, 1.3, 2.2, 4.1):
+            pixels = np.full((1, 1), time_of_frame)
+            yield video.TimedFrame(pixels, time_of_frame * TIMING.frame_period, time.perf_counter())
+
+
+def test_frames_at_uneven_intervals_are_written(tmp_path):
+    output = video.VideoOutput(tmp_path / "video.mkv", 30.0)
+    video.run_live(Uneven(), rsv.VibrationTracker(TIMING), [output], drops=False)
+    times = rsv.read_stack_info(tmp_path / "video.mkv").frame_times
+    assert np.array(times) * 30 == pytest.approx([0, 1, 2, 3, 4], abs=0.04)  # of 0, 0.9, 1.3, 2.2, 4.1
+
+
+def test_sizes_that_the_codec_cannot_hold_are_named(tmp_path):
+    output = video.VideoOutput(tmp_path / "video.mp4", 30.0)
+    message = r"video\.mp4: H\.264 needs an even height and width, got \(1, 1\); write \.mkv"
+    refuses(lambda: video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output]), message)
+    assert not any(tmp_path.iterdir())
+
+
 def test_an_error_of_an_output_ends_the_session(tmp_path):
     source, output = Numbers(), Broken()
     with pytest.raises(OSError, match="disk full"):
