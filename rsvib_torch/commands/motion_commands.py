@@ -336,7 +336,7 @@ class CalibrateOptions(shared.RangeOptions):
     """Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, if
     known."""
     by_motion: bool = False
-    """Use the motion of the camera instead of a light; needs --frame-rate."""
+    """Use the motion of the camera instead of a light."""
     row_time: list[float] | None = option(
         None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
@@ -381,6 +381,11 @@ def calibrate(given: CalibrateOptions) -> Answer:
         infos = [io.read_stack_info(path) for path in paths]
     for sentence in (sentence for info in infos for sentence in io.describe_stack(info, None)):
         note(sentence)
+    frame_rate = given.frame_rate or 0.0
+    if given.by_motion and given.frame_rate is None:
+        frame_rate = shared.rate_of_file(paths[0]) or 0.0
+        if not frame_rate:
+            raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
     with working("reading the frames"):
         stack = io.read_stack(paths, full_scale=given.full_scale)
     axis: Literal[-2, -1] = -1 if given.scan_axis == "x" else -2
@@ -388,7 +393,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
         if given.by_motion:
             result = row_time.calibrate_row_time_by_motion(
                 stack,
-                frame_rate=given.frame_rate or 0.0,
+                frame_rate=frame_rate,
                 row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
                 exposure_time=given.exposure[0] if given.exposure else None,
                 scan_axis=axis,
@@ -439,15 +444,13 @@ def _check_given(given: CalibrateOptions) -> None:
         if (given.flicker_frequency is None) == (not given.exposure):
             raise ValueError(
                 "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
-                "--by-motion and --frame-rate for frames of a vibrating camera"
+                "--by-motion for frames of a vibrating camera"
             )
         return
     light = {"--frequency": given.flicker_frequency, "--on-fraction": given.on_fraction}
     for name, value in (light | {"--light-contrast": given.light_contrast}).items():
         if value is not None:
             raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
-    if given.frame_rate is None:
-        raise ValueError("--by-motion needs --frame-rate of the sensor: the row time is found relative to it")
     if given.exposure and len(given.exposure) > 1:
         raise ValueError("--by-motion takes one --exposure, that of all frames")
     if given.row_time and len(given.row_time) != 2:

@@ -158,11 +158,8 @@ class CameraOptions:
             exposure = None if "exposure_time" in sensor else stated_exposure(frames)
             sensor = sensor | ({} if exposure is None else {"exposure_time": exposure})
             if "exposure_time" in sensor and "frame_rate" not in sensor:
-                frame_rate = stated_rate(io.read_stack_info(frames))
-                if frame_rate is not None:
-                    source = f"from the times in {frames}; --frame-rate replaces it"
-                    note(f"frame rate {frame_rate:.6g} per second, {source}")
-                    sensor = sensor | {"frame_rate": frame_rate}
+                frame_rate = rate_of_file(frames)
+                sensor = sensor | ({} if frame_rate is None else {"frame_rate": frame_rate})
         missing = [option for name, option in _TIMES.items() if name not in sensor]
         if self.config is None and missing:
             raise ValueError(
@@ -270,6 +267,14 @@ class VerdictOptions:
     require_reliable: str | None = option(None, parser=_axes, metavar="AXES")
     """For scripts: exit code 3 if one of these axes is not reliable (in one of the windows), e.g. x,y. The results are
     written all the same."""
+
+
+def rate_of_file(frames: Path) -> float | None:
+    """``stated_rate`` of a file, with a note."""
+    rate_of_frames = stated_rate(io.read_stack_info(frames))
+    if rate_of_frames is not None:
+        note(f"frame rate {rate_of_frames:.6g} per second, from the times in {frames}; --frame-rate replaces it")
+    return rate_of_frames
 
 
 def stated_rate(info: "StackInfo") -> float | None:

@@ -12,6 +12,7 @@ from truth import Motion, recorded
 import rsvib_torch as rsv
 from rsvib_torch.config import read_config
 from rsvib_torch.detection.measurements import Measurements
+from rsvib_torch.io.stack_info import StackInfo
 from rsvib_torch.row_time.by_free_motion import row_time_of_splines
 from rsvib_torch.row_time.joint_fit import FramePlaces
 
@@ -169,4 +170,11 @@ def test_command(two_tones, one_tone, tmp_path, capsys):
     assert re.search(r"error: the row time is not certain: \d+ row times explain", error)
     assert not (tmp_path / "none.toml").exists()
     assert "--frame-rate" in refused(capsys, "calibrate", moving, "--by-motion")
+    clip = tmp_path / "clip.mp4"  # states its frame rate
+    rsv.write_stack(
+        clip, two_tones, dtype="uint8", like=StackInfo(tuple(two_tones.shape), "uint8", 255.0, frame_rate=RATE)
+    )
+    limits = ("--row-time", "40us", "--row-time", "70us")
+    assert rsvib("calibrate", clip, "--by-motion", *limits, "--exposure", "480us", "--overwrite", "--out", out) == 0
+    assert abs(read_config(out).timing.row_time / ROW_TIME - 1) < 5e-3
     assert "--by-motion" in refused(capsys, "calibrate", moving, "--frequency", 100, "--row-time", "1us")
