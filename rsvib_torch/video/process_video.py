@@ -212,8 +212,8 @@ def _planned(
     resources = {name: getattr(options, name) for name in fields_of(ResourceOptions)}
     job, _, at_once = plan_job(source, timing, StackOptions(restoration=given, window=2, **resources))
     with closing(open_stack(source)) as reader:
-        picture = reader.picture if isinstance(reader, VideoReader) else None
-    picture = picture if picture is not None and picture.fits(sink.suffix.lower()) else None
+        stored = reader.picture if isinstance(reader, VideoReader) else None
+    picture = stored if stored is not None and stored.fits(sink.suffix.lower()) else None
     frames = VideoFrames(job, RestorationOptions(**given), picture, masks=options.border != "mirror")
     if job.info.shape[0] < 3:
         raise ValueError(

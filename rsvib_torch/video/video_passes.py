@@ -249,13 +249,14 @@ class VideoPasses:
         if pair is None:
             return None
         (first, one), (second, other) = pair
-        path, motions = motion.path, [track.motion for track in (first, second)]
+        undone, later, path = first.motion, second.motion, motion.path
         if isinstance(one, str) or isinstance(other, str) or not isinstance(path, CameraPath):
+            return None
+        if not (isinstance(undone, Vibration) and isinstance(later, Vibration)):
             return None
         pixels = np.stack([self.frames.luma(one), self.frames.luma(other)])
         images = counts_to_frames(pixels, self.frames.full_scale, "the video").to(self.frames.job.device)
         # The path in both frames and between them: extrapolated from the first frame, a hand was wrong by 0.9 px.
-        undone, later = (one for one in motions if isinstance(one, Vibration))
         axes = min(undone.num_axes, later.num_axes)
         undone = undone if axes == undone.num_axes else undone.translation()
         interval = second.time - first.time
@@ -263,10 +264,7 @@ class VideoPasses:
         change = later.image_motion[:axes] - undone.image_motion
         mean = tensor(step / interval) * (undone.image_motion != 0)  # axes without vibration stay as taken
         both = replace(
-            undone,
-            image_motion=mean - 0.5 * change,
-            image_acceleration=change / interval,
-            image_shift=torch.zeros_like(mean),
+            undone, image_motion=mean - 0.5 * change, image_acceleration=change / interval, image_shift=0.0 * mean
         )
         return pair_verdict(images, self.frames.job.timing, both, interval, self.frames.options)
 
