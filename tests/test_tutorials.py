@@ -60,13 +60,17 @@ def test_video(pages, tmp_path):
 
 
 def test_training(pages, tmp_path):
-    names = run(pages, "training.md", tmp_path)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # with two, the training of the small networks ends elsewhere
+    try:
+        names = run(pages, "training.md", tmp_path)
+    finally:
+        torch.set_num_threads(threads)
     true = names["camera"].drawn_vibration()
     assert true.frequency.shape[0] == 4  # section 5 has drawn new vibrations
     error, still, taken, restored = (names[name] for name in ("error", "still_network", "taken", "restored"))
     assert error(still, names["clips"]) < error(still, restored) < 0.5 * error(still, taken)
-    # 0.95 with one thread and 1.005 with two, whose training ends elsewhere
-    assert error(names["robust_network"], taken) < 1.1 * error(still, taken)
+    assert error(names["robust_network"], taken) < error(still, taken)
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)

@@ -156,7 +156,9 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
             proposal = f" The file names its camera, {info.camera}: {error}."
     if info.is_integer and info.full_scale is None:
         # the largest count of the bit depth that the frame uses; multiples of 16 are 12 bits shifted by 4
-        step = max(math.gcd(*set(first.ravel().tolist())), 1)
+        import numpy as np  # noqa: PLC0415
+
+        step = max(int(np.gcd.reduce(first.ravel())), 1)
         likely["full_scale"] = float(((1 << max(int(first.max()) // step, 255).bit_length()) - 1) * step)
     elif info.dtype != "uint8" and info.full_scale is not None:
         values.setdefault("full_scale", info.full_scale)
