@@ -1,56 +1,45 @@
 """Decorators that exclude functions from mixed precision, from graph compilation and from differentiation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import is_dataclass
 from functools import wraps
-from threading import Lock
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, ProcessSetting
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Float32Products:
-    """Context in which products and convolutions of float32 use float32, not TF32 or bfloat16.
+_BACKENDS: Any = torch.backends  # their attributes are not typed
 
-    The setting belongs to the process: the first of several threads that enter changes it, the last one restores it.
-    """
 
-    _BACKENDS: Any = torch.backends  # their attributes are not typed
-    _KINDS = (
+@contextmanager
+def _products_of_float32() -> Iterator[None]:
+    """Products and convolutions of float32 use float32, not TF32 or bfloat16."""
+    # those of cuDNN's recurrent networks are set together with its convolutions under one name
+    kinds = (
         _BACKENDS.cuda.matmul,
         _BACKENDS.cudnn.conv,
-        _BACKENDS.cudnn.rnn,  # set together with convolutions under one name
+        _BACKENDS.cudnn.rnn,
         _BACKENDS.mkldnn.matmul,
         _BACKENDS.mkldnn.conv,
     )
-
-    def __init__(self) -> None:
-        self._lock, self._users = Lock(), 0
-        self._previous: list[str] = []
-
-    def __enter__(self) -> None:
-        with self._lock:
-            self._users += 1
-            if self._users == 1:
-                self._previous = [kind.fp32_precision for kind in self._KINDS]
-                for kind in self._KINDS:
-                    kind.fp32_precision = "ieee"
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._users -= 1
-            if self._users == 0:
-                for kind, previous in zip(self._KINDS, self._previous, strict=True):
-                    kind.fp32_precision = previous
+    previous = [kind.fp32_precision for kind in kinds]
+    for kind in kinds:
+        kind.fp32_precision = "ieee"
+    yield
+    for kind, value in zip(kinds, previous, strict=True):
+        kind.fp32_precision = value
 
 
-_FLOAT32_PRODUCTS = _Float32Products()
+_FLOAT32_PRODUCTS = ProcessSetting(_products_of_float32)
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
@@ -97,7 +86,7 @@ def without_gradients(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def in_inference_mode(*args: P.args, **kwargs: P.kwargs) -> R:
-        with torch.inference_mode(), np.errstate(all="ignore"):
+        with ONE_BLAS_THREAD, torch.inference_mode(), np.errstate(all="ignore"):
             result = function(*args, **kwargs)
         return outside_inference(result)
 

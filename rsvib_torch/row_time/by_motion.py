@@ -14,6 +14,7 @@ from rsvib_torch.checks.validation import Number, Positive
 from rsvib_torch.checks.validation import options as option_group
 from rsvib_torch.checks.values import check_number
 from rsvib_torch.detection.shapes.free import measure_freely, residual_of_motion
+from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.frames.entry_points import entry_point
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
@@ -126,18 +127,19 @@ def calibrate_row_time_by_motion(frames: FramesOrFiles, options: RowTimeOptions)
         )
     if exposure is not None:
         notes.append("the exposure time is the given one")
-    curve, bands = bands_of_frames(stack, clock, options)
     if num_frames < _MIN_FRAMES:
         found = _undetermined(Reason("too_few_frames_for_row_time", None, num_frames, _MIN_FRAMES))
     else:
-        by_tones = row_time_of_tones(stack, clock, options, bands)
-        found = by_tones or _undetermined(Reason("no_motion_for_row_time"))
-        if found.findings:
-            places = _measured_freely(stack, clock, options, curve)
-            spline = row_time_of_splines(places, num_rows, low, high, directions)
-            if spline is not None and spline[0].std < MAX_RELATIVE_STD * abs(spline[0].row_time):
-                found, spacing = spline
-                notes.append(f"the motion is no sum of few tones: a spline with knots {1e3 * spacing:.3g} ms apart")
+        with threads_for(stack.images):
+            curve, bands = bands_of_frames(stack, clock, options)
+            by_tones = row_time_of_tones(stack, clock, options, bands)
+            found = by_tones or _undetermined(Reason("no_motion_for_row_time"))
+            if found.findings:
+                places = _measured_freely(stack, clock, options, curve)
+                spline = row_time_of_splines(places, num_rows, low, high, directions)
+                if spline is not None and spline[0].std < MAX_RELATIVE_STD * abs(spline[0].row_time):
+                    found, spacing = spline
+                    notes.append(f"the motion is no sum of few tones: a spline with knots {1e3 * spacing:.3g} ms apart")
     return _result(replace(found, findings=reasons_from_row_order(found.findings, sensor)), clock, notes)
 
 

@@ -9,11 +9,10 @@ from itertools import combinations, pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
-from rsvib_torch.execution.parallel import prefetched
+from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
 from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
@@ -107,8 +106,7 @@ class VideoPasses:
                     yield from corners
 
         if self.rates is None:
-            # Threads of BLAS wait for each other after every pair of frames: 3 to 20 times the processor time.
-            with threadpool_limits(limits=1, user_api="blas"):
+            with ONE_BLAS_THREAD:
                 path = camera_path(pairs(), timing, self.frames.size, has_tones=not self.stabilised)
             places = path.places(times)
             shift = self._to_steady(times, lambda number, others: places[others] - places[number])

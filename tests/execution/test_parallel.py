@@ -2,9 +2,11 @@ import threading
 import time
 
 import pytest
+import threadpoolctl
 import torch
 
 from rsvib_torch.execution.parallel import in_parallel, threads_for
+from rsvib_torch.execution.precision import without_gradients
 
 CPU = torch.device("cpu")
 
@@ -58,3 +60,15 @@ def test_operations_on_small_images_use_one_thread_and_independent_work_uses_all
     assert torch.get_num_threads() == 2
     with threads_for(large):
         assert torch.get_num_threads() == 2
+
+
+def blas_threads():
+    return {library["num_threads"] for library in threadpoolctl.threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_fits_use_one_thread_of_blas():
+    allowed = blas_threads()
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        assert without_gradients(blas_threads)() == {1}
+        assert blas_threads() == {2}
+    assert blas_threads() == allowed
