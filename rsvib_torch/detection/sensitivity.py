@@ -11,7 +11,7 @@ import torch
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.result import TimingSensitivity
-from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, model_displacements
+from rsvib_torch.detection.tones.fit import ToneFit, free_jacobian, model_displacements
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
@@ -43,10 +43,9 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     fit = fit.about(whole.centre)
 
     # 2. The pseudo-inverse of the derivatives of the displacements of each axis by its parameters.
-    inverses = []
-    for axis in range(axes):
-        jacobian, to_all = axis_jacobian(whole, fit, axis)
-        inverses.append(to_all @ pseudo_inverse(jacobian.reshape(batch, -1, jacobian.shape[-1])))
+    jacobian, to_all = free_jacobian(whole, fit)
+    columns = np.moveaxis(jacobian, 3, 1).reshape(batch, axes, -1, to_all.shape[-1])
+    inverses = to_all @ pseudo_inverse(columns)  # (B, A, P, D)
 
     # 3. The change of the tones by a change of each time, the tones in the order of a ``Vibration``.
     values = {}
@@ -55,8 +54,8 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     for name in ("row_time", "frame_rows", "exposure_rows"):
         lower, higher = (model_displacements(record(_scaled(timing, name, 1 + sign * _STEP)), fit) for sign in (-1, 1))
         change = (higher - lower) / (2 * _STEP)
-        moved = [-inverses[axis] @ change[..., axis].reshape(batch, -1, 1) for axis in range(axes)]
-        by_tones = split_axis(np.stack(moved, 1)[:, :, : 3 * tones, 0], -1, tones, 3)
+        moved = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
+        by_tones = split_axis(moved[:, :, : 3 * tones, 0], -1, tones, 3)
         along = fit.coefficients.conj() * (by_tones[..., 0] + 1j * by_tones[..., 1])
         amplitude = np.where(fit.active, along.real / np.square(size), 0.0)
         frequency = np.where(fit.active, by_tones[..., 2] / np.maximum(fit.frequencies, 1e-300), 0.0)

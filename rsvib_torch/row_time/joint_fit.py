@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.tones.fit import ToneFit, axis_jacobian, fit_tones, motion_of_fit, residual_of
+from rsvib_torch.detection.tones.fit import ToneFit, fit_tones, motion_of_fit
+from rsvib_torch.detection.tones.uncertainty import linearised
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.row_time.row_tones import RowRecord
@@ -78,28 +79,15 @@ def fit_row_time(
     for _ in range(iterations):
         measured = places.timed(row_time)
         fit = fit_tones(measured, fit.frequencies, fit.active, fit.model)
-        residual = residual_of(measured, fit)
-        free = fit.active.sum(-1) * 3 + fit.drift.shape[-1]
-        variance = measured.square(residual) / np.maximum(measured.num_measurements - free - 0.5, 1.0)
-        weighted = measured.scaled(1 / np.maximum(variance, 1e-300))
-        tones = [axis_jacobian(measured, fit, axis)[0][0] for axis in range(2)]  # (N, G, M)
-        zero = np.zeros_like(tones[0])
-        columns = np.concatenate(
-            [
-                np.stack([tones[0], zero], 2),
-                np.stack([zero, tones[1]], 2),
-                row_time_columns(measured, places.rows, motion_of_fit(fit))[0, ..., None],
-            ],
-            -1,
-        )  # (N, G, 2, P)
-        of_information = np.einsum("nac,ngcq->ngaq", weighted.information[0], columns)
-        gram = np.einsum("ngap,ngaq->pq", columns, of_information)
-        right = np.einsum("ngap,nga->p", of_information, residual[0])
-        scale = 1 / np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1.0))
-        eye = np.diag(1e-13 + (gram.diagonal() <= 0))
-        inverse = np.linalg.inv(gram * scale * scale[:, None] + eye) * scale * scale[:, None]
-        step = float((inverse @ right)[-1])
-        std = (max(float(inverse[-1, -1]), 0.0) / float(np.squeeze(measured.independent))) ** 0.5
+        by_row_time = row_time_columns(measured, places.rows, motion_of_fit(fit))[..., None]
+        # the part of the change by the row time that no change of the tones cancels
+        information = step = 0.0
+        for axis, problem in linearised(measured, fit):
+            unexplained = problem.unexplained(by_row_time[:, :, :, axis], axis)[0][0, :, 0]
+            information += float(np.square(unexplained).sum())
+            step += float(unexplained @ problem.residual[0])
+        information = max(information, 1e-300)
+        std, step = information**-0.5, step / information
         row_time = row_time + min(max(step, -0.02 * row_time), 0.02 * row_time)
         if abs(step) < 1e-2 * std:
             break

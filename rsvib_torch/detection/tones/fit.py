@@ -539,13 +539,11 @@ def tone_displacements(fit: ToneFit, exposure_starts: Array, exposure_time: floa
     return (jacobian[..., :count] * tones.reshape(len(tones), 1, -1, count)).sum(-1)
 
 
-def axis_jacobian(measurements: Measurements, fit: ToneFit, axis: int) -> tuple[Array, Array]:
-    """Derivatives (B, N, G, M) of the displacements of an axis by its free parameters, and the matrix (P, M) to all."""
-    problem = _Problem(measurements, fit.active, fit.model)
-    jacobian = problem.jacobian(fit.parameters)[..., axis, :]
-    free = split_axis(problem.free, 1, problem.axes, -1)[:, axis]
-    to_all = _constraints(fit.model, fit.active.shape[-1], 1)
-    return (jacobian @ to_all) * free[:, None, None], to_all
+def free_jacobian(measurements: Measurements, fit: ToneFit) -> tuple[Array, Array]:
+    """Derivatives (B, N, G, A, M) of displacements by the free parameters of an axis, and the matrix (P, M) to all."""
+    problem, to_all = _Problem(measurements, fit.active, fit.model), _constraints(fit.model, fit.active.shape[-1], 1)
+    free = split_axis(problem.free, 1, problem.axes, -1)[:, None, None]
+    return (problem.jacobian(fit.parameters) @ to_all) * free, to_all
 
 
 def amplitude_std(fit: ToneFit) -> Array:

@@ -36,10 +36,10 @@ from scipy import special
 from rsvib_torch.detection.measurements import Measurements, cholesky_root
 from rsvib_torch.detection.tones.fit import (
     ToneFit,
-    axis_jacobian,
     displacement_jacobian,
     displacement_std,
     displacements,
+    free_jacobian,
     model_displacements,
     offset_gain,
     residual_of,
@@ -105,11 +105,11 @@ class LinearisedFit:
     to_all: Array  # (P, M), from the free parameters of an axis to all
 
     @classmethod
-    def of_axes(cls, measurements: Measurements, fit: ToneFit, axes: list[int]) -> "LinearisedFit":
-        """The problem of one axis, or of all."""
-        residual = residual_of(measurements, fit)[..., axes]
-        jacobians, constraints = zip(*(axis_jacobian(measurements, fit, one) for one in axes), strict=True)
-        jacobian = np.stack(jacobians, 3)  # (B, N, G, A, M)
+    def of_axes(
+        cls, measurements: Measurements, axes: list[int], jacobian: Array, residual: Array, to_all: Array
+    ) -> "LinearisedFit":
+        """The problem of one axis, or of all, from the ``free_jacobian`` and the residual (B, N, G, A') of a fit."""
+        jacobian, residual = jacobian[..., axes, :], residual[..., axes]
         spent = (np.square(jacobian).max((1, 2)) > 0).sum((1, 2))
         spare = np.maximum(measurements.num_measurements[:, axes].sum(1) - spent, 1.0)
         one = measurements.inverse_variances[..., axes, None] if len(axes) == 1 else measurements.information
@@ -119,7 +119,7 @@ class LinearisedFit:
         root = root / deviation
         X = root[:, :, None, :, :, None] * jacobian[..., None, :, :]  # (B, N, G, A, A, M)
         X = X.reshape(*whitened.shape, -1)
-        return cls(axes, root, X, pseudo_inverse(X), whitened / deviation[:, :, 0, 0], constraints[0])
+        return cls(axes, root, X, pseudo_inverse(X), whitened / deviation[:, :, 0, 0], to_all)
 
     def rounding(self, axis: int) -> Array:
         """(B,) error of the squared norm of whitened responses of about 1 px, for displacements without noise."""
@@ -154,13 +154,13 @@ class LinearisedFit:
         total[:, self.axes] += split_axis(change, -1, len(self.axes), -1) @ self.to_all.T
 
 
-def _problems(measurements: Measurements, fit: ToneFit) -> list[tuple[int, LinearisedFit]]:
-    """Each axis with the problem that contains it."""
-    axes = list(range(fit.coefficients.shape[1]))
-    if len(axes) == 2:
-        return [(axis, LinearisedFit.of_axes(measurements, fit, [axis])) for axis in axes]
-    together = LinearisedFit.of_axes(measurements, fit, axes)
-    return [(axis, together) for axis in axes]
+def linearised(measurements: Measurements, fit: ToneFit) -> list[tuple[int, LinearisedFit]]:
+    """Each axis of a fit with the problem that contains it."""
+    (jacobian, to_all), residual = free_jacobian(measurements, fit), residual_of(measurements, fit)
+    axes = range(fit.coefficients.shape[1])
+    parts = [[axis] for axis in axes] if len(axes) == 2 else [list(axes)]
+    problems = [LinearisedFit.of_axes(measurements, part, jacobian, residual, to_all) for part in parts]
+    return [(axis, problem) for problem in problems for axis in problem.axes]
 
 
 # --- Aliasing ---
@@ -172,7 +172,7 @@ def without_aliasing(measurements: Measurements, fit: ToneFit, size: Array) -> T
     covariance, axes = fit.covariance.copy(), fit.drift.shape[1]
     change = np.zeros((len(covariance), axes, covariance.shape[-1] // axes))
     bias = _unit_bias(measurements, fit)
-    for axis, problem in _problems(measurements, fit)[:2]:
+    for axis, problem in linearised(measurements, fit)[:2]:
         Z, by_unit = problem.unexplained(bias[:, :, :, axis], axis)
         precision = 1 / np.square(size * _BIAS_STD[axis])  # (B, 3), of b, c and s before they are measured
         normal = Z.mT @ Z + (problem.rounding(axis)[:, None] + precision)[..., None] * np.eye(3)
@@ -311,7 +311,7 @@ def with_further_tones(
     stated = [(fit.covariance.copy(), variance.copy()) for _ in range(2)]
     jacobian = displacement_jacobian(fit, rows, measurements.exposure_time)
     slow_errors = _slow_errors(measurements, fit)
-    for axis, problem in _problems(measurements, fit):
+    for axis, problem in linearised(measurements, fit):
         of_axis = _added(measurements, fit, axis, problem, rows, jacobian, slow_errors[:, axis], number_is_known)
         for (covariance, variance), (added, moved) in zip(stated, of_axis, strict=True):
             problem.add_covariance(covariance, added)
