@@ -20,7 +20,7 @@ import pydantic
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError, core_schema
 
-from rsvib_torch.checks.values import MAX_NUMBER, Error, described, named
+from rsvib_torch.checks.values import MAX_NUMBER, described, named
 from rsvib_torch.files.reading import Table, read_text
 from rsvib_torch.text import one_line, quoted
 
@@ -110,7 +110,7 @@ def options(group: type[_Group]) -> type[_Group]:
         try:
             initialise(self, **values)
         except ValidationError as error:
-            raise _mistakes(made, values, error)[0].in_python() from None
+            raise _mistakes(made, values, error)[0].error from None
 
     made.__init__ = __init__
     return made  # type: ignore[no-any-return]
@@ -198,9 +198,11 @@ def validate(model: type[_Result], data: Mapping[str, object], source: str) -> _
         return TypeAdapter(model).validate_python(data, context={"file": source})
     except ValidationError as error:
         mistakes = _mistakes(model, data, error)
-        lines = [mistake.in_file(source) for mistake in mistakes]
+        lines = [": ".join(filter(None, (source, one_line(one.path, 200), one.line))) for one in mistakes]
         more = [f"{source}: {len(lines) - _MAX_LINES} more mistakes"] if len(lines) > _MAX_LINES else []
-        raise mistakes[0].named(MistakesError([*lines[:_MAX_LINES], *more])) from error
+        all_lines = MistakesError([*lines[:_MAX_LINES], *more])
+        vars(all_lines).update(vars(mistakes[0].error))  # its argument
+        raise all_lines from error
 
 
 def validated(name: str, value: object, adapter: TypeAdapter[Any], kind: object) -> Any:
@@ -208,9 +210,7 @@ def validated(name: str, value: object, adapter: TypeAdapter[Any], kind: object)
     try:
         return adapter.validate_python(_plain(value))
     except ValidationError as error:
-        mistake = _mistakes(kind, value, error)[0]
-        mistake.path = f"{name}.{mistake.path}".removesuffix(".").replace(".[", "[")
-        raise mistake.in_python() from None
+        raise _mistakes(kind, value, error, name)[0].error from None
 
 
 @dataclass
@@ -218,57 +218,23 @@ class _Mistake:
     """A mistake at one key."""
 
     path: str  # the key, with the tables around it
-    value: object = None  # the value
-    expected: str = ""  # what was expected instead
-    text: str = ""  # a sentence that replaces the others
-    known: tuple[str, ...] = ()  # the keys that exist, for one that does not
-    choices: tuple[object, ...] = ()  # the choices, if there is nothing else
-    accepts_none: bool = False  # whether None is possible in Python
-    kind: type[Exception] = ValueError  # the exception in Python
+    error: Exception  # in Python, with the argument that it is about (``named``)
+    line: str  # about a file, without its name and the key
     is_bound: bool = False  # whether the value has the right type and is out of bounds
-    cause: Exception | None = None  # the error of a validator, which may state its argument
-
-    def in_python(self) -> Exception:
-        """The exception."""
-        if self.known:
-            return TypeError(f"unknown option {quoted(self.path)}; the options are {', '.join(self.known)}")
-        return self.named(self.kind(self.text or f"{self.path} {self._problem} {described(self.value)}"))
-
-    def named(self, error: Error) -> Error:
-        """An error with the argument that this mistake is about, for the options of commands."""
-        if self.cause is not None:
-            path = ".".join(filter(None, (self.path, getattr(self.cause, "argument", ""))))
-            return named(error, path, getattr(self.cause, "problem", str(self.cause)))
-        return error if self.text else named(error, self.path, f"{self._problem} {quoted(self.value)}")
-
-    @property
-    def _problem(self) -> str:
-        if self.choices:
-            return f"must be one of {', '.join(map(repr, self.choices))}; got"
-        expected = self.expected.replace("true or false", "True or False")
-        return f"must be {expected}{' or None' * self.accepts_none}, got"
-
-    def in_file(self, source: str) -> str:
-        """The line about a file."""
-        place = f"{source}: {one_line(self.path, 200)}" if self.path else source
-        if self.known:
-            return f"{place}: unknown key; expected one of {', '.join(self.known)}"
-        return f"{place}: {self.text or f'expected {self.expected}, got {quoted(self.value)}'}"
 
 
-def _mistakes(model: object, data: object, error: ValidationError) -> list[_Mistake]:
+def _mistakes(model: object, data: object, error: ValidationError, name: str = "") -> list[_Mistake]:
     """The mistakes that pydantic found, one for each key: of the members of a union, that of the fitting type."""
     found: dict[str, _Mistake] = {}
     for entry in error.errors(include_url=False):
-        mistake = _mistake(model, data, entry)
+        mistake = _mistake(model, data, entry, name)
         if mistake.path not in found or (mistake.is_bound and not found[mistake.path].is_bound):
             found[mistake.path] = mistake
     return list(found.values())
 
 
-def _mistake(model: object, data: object, entry: ErrorDetails) -> _Mistake:
-    """What an entry of pydantic means: the key at its location, and what is wrong."""
-    path = ""
+def _mistake(model: object, data: object, entry: ErrorDetails, path: str) -> _Mistake:
+    """What an entry of pydantic means: the key at its location, behind that of the data, and what is wrong."""
     value, expected = data, model
     kind, context = entry["type"], entry.get("ctx", {})
     for step in entry["loc"]:
@@ -281,9 +247,11 @@ def _mistake(model: object, data: object, entry: ErrorDetails) -> _Mistake:
                 break  # the rest of the location names a member of a union
             path = f"{path}.{step}" if path else step
             if step not in value:
-                return _Mistake(path, text=f"missing key; expected {expected_text(keys[step])}", kind=TypeError)
+                text = f"missing key; expected {expected_text(keys[step])}"
+                return _Mistake(path, TypeError(text), text)
             if kind in ("extra_forbidden", "unexpected_keyword_argument") and step not in keys:
-                return _Mistake(path, known=tuple(keys))
+                unknown = TypeError(f"unknown option {quoted(path)}; the options are {', '.join(keys)}")
+                return _Mistake(path, unknown, f"unknown key; expected one of {', '.join(keys)}")
             value, expected = value[step], keys.get(step, Any)
         elif isinstance(value, (list, tuple)) and isinstance(step, int) and step < len(value):
             path, value = f"{path}[{step}]", value[step]
@@ -291,16 +259,24 @@ def _mistake(model: object, data: object, entry: ErrorDetails) -> _Mistake:
         else:
             break  # the rest of the location names a member of a union
     if kind == _NOT_AN_OPTION:
-        return _Mistake(".".join(filter(None, (path, context["name"]))), text=context["message"], kind=TypeError)
-    if kind == "value_error":
-        return _Mistake(path, text=str(context["error"]), cause=context["error"])
-    if kind in _BOUNDS:
-        return _Mistake(path, value, _BOUNDS[kind].format(**context), is_bound=True)
-    choices = [member for member in members_of(expected) if get_origin(member) is Literal]
-    only = tuple(name for member in choices for name in get_args(member)) if choices == [*members_of(expected)] else ()
-    accepts_none = type(None) in get_args(expected)
-    error = ValueError if only else TypeError
-    return _Mistake(path, value, expected_text(expected), kind=error, choices=only, accepts_none=accepts_none)
+        path, text = ".".join(filter(None, (path, context["name"]))), context["message"]
+        return _Mistake(path, TypeError(text), text)
+    if kind == "value_error":  # of a validator, which may state its argument
+        cause, text = context["error"], str(context["error"])
+        argument = ".".join(filter(None, (path, getattr(cause, "argument", ""))))
+        return _Mistake(path, named(ValueError(text), argument, getattr(cause, "problem", text)), text)
+    members = members_of(expected)
+    choices = [repr(name) for member in members if get_origin(member) is Literal for name in get_args(member)]
+    stated = _BOUNDS[kind].format(**context) if kind in _BOUNDS else expected_text(expected)
+    error: type[Exception] = ValueError
+    if choices and kind not in _BOUNDS and all(get_origin(member) is Literal for member in members):
+        problem = f"must be one of {', '.join(choices)}; got"
+    else:
+        or_none = " or None" if kind not in _BOUNDS and type(None) in get_args(expected) else ""
+        error = ValueError if kind in _BOUNDS else TypeError
+        problem = f"must be {stated.replace('true or false', 'True or False')}{or_none}, got"
+    made = named(error(f"{path} {problem} {described(value)}"), path, f"{problem} {quoted(value)}")
+    return _Mistake(path, made, f"expected {stated}, got {quoted(value)}", kind in _BOUNDS)
 
 
 def members_of(annotation: object) -> tuple[Any, ...]:
