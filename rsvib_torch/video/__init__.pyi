@@ -1,5 +1,4 @@
-from .frame_outputs import FrameOutput, PipeOutput, VideoOutput
-from .live_page import PageOutput
+from .frame_outputs import FrameOutput, PageOutput, PipeOutput, VideoOutput
 from .process_video import process_video
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame

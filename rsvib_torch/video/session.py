@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -97,11 +96,17 @@ def run_live(
     report, begin, threads = LiveReport(), time.perf_counter(), torch.get_num_threads()
     border, period = border or VideoBorder("mirror"), tracker.timing.frame_period
     reader, last, index = FrameReader(source, waiting, drops=drops), None, -1
+
+    def saved(_: Any, error: BaseException | None, *__: Any) -> None:
+        if save is not None and report.frames > 0:
+            with suppress(*[] if error is None else [Exception]):  # after an error of the session, those of saving
+                save()
+
     with ExitStack() as ending:  # from the last line to the first
         ending.callback(torch.set_num_threads, threads)
         torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
         in_time = ending.enter_context(_signals_stop(reader))
-        ending.push(partial(_save, save, report))
+        ending.push(saved)
         ending.enter_context(suppress(BrokenPipeError, _AbandonedError))  # the program behind a pipe has ended
         ending.callback(in_time)
         ending.callback(reader.close)
@@ -131,47 +136,31 @@ def run_live(
     return report
 
 
-def _save(save: Callable[[], object] | None, report: LiveReport, _: Any, error: BaseException | None, *__: Any) -> None:
-    """Save what belongs to the written frames; after an error of the session, errors of ``save`` are not shown."""
-    if save is not None and report.frames > 0:
-        with suppress(*[] if error is None else [Exception]):
-            save()
-
-
 @contextmanager
 def _signals_stop(reader: FrameReader) -> Iterator[Callable[[], None]]:
     """Signals that end the process stop the reader instead; only the main thread can set their handlers.
 
     ``_LONGEST_END`` later the main thread is interrupted, unless the function that this yields was called before.
     """
-    before: dict[signal.Signals, Any] = {}
-    timers: list[threading.Timer] = []
-    late = threading.Event()
+    before: dict[signal.Signals, Any] = {}  # the handlers that are replaced
 
-    def interrupt(number: int) -> None:
-        late.set()
-        signal.pthread_kill(threading.main_thread().ident or 0, number)
-
-    def stop(number: int, _: Any) -> None:
+    def stop(*_: object) -> None:
         reader.stop()
-        if late.is_set():
-            late.clear()
-            raise _AbandonedError
-        if not timers:
-            timers.append(threading.Timer(_LONGEST_END, interrupt, [number]))
-            timers[0].daemon = True
-            timers[0].start()
+        if signal.SIGALRM in before and not any(signal.getitimer(signal.ITIMER_REAL)):
+            signal.setitimer(signal.ITIMER_REAL, _LONGEST_END)
+
+    def interrupt(*_: object) -> None:
+        raise _AbandonedError
 
     def in_time() -> None:
-        for timer in timers:
-            timer.cancel()
-        late.clear()
+        if signal.SIGALRM in before:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     if threading.current_thread() is threading.main_thread():
         usual = (signal.SIG_DFL, signal.default_int_handler)
-        before = {number: signal.getsignal(number) for number in _SIGNALS if signal.getsignal(number) in usual}
-    for number in before:
-        signal.signal(number, stop)
+        for number in (*_SIGNALS, signal.SIGALRM):
+            if signal.getsignal(number) in usual:
+                before[number] = signal.signal(number, interrupt if number == signal.SIGALRM else stop)
     try:
         yield in_time
     finally:

@@ -4,6 +4,8 @@ import math
 from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rsvib_torch.checks.values import check_number, needed_package
@@ -99,9 +101,6 @@ class Spectrogram:
 
 def save_spectrogram(path: Path, spectrogram: Spectrogram) -> list[Path]:
     """Write ``PATH.png`` and ``PATH.zarr`` (group with ``amplitude`` (2, T, F) in px, ``time``, ``frequency``)."""
-    from matplotlib.colors import LogNorm  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     zarr = needed_package("zarr", "writing Zarr", "formats")
     times, frequencies, amplitude = spectrogram.result()
     if len(times) == 0:
