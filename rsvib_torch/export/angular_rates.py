@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.validation import Count
-from rsvib_torch.export.exported import Size, num_rows_of
+from rsvib_torch.export.pixel_map import Size, num_rows_of
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.validation import Count, Number, Positive, read_json, validated
-from rsvib_torch.export.exported import Size, num_rows_of
+from rsvib_torch.export.pixel_map import Size, num_rows_of
 from rsvib_torch.files.atomic import check_outputs, whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.camera import Camera

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.validation import Count
-from rsvib_torch.export.exported import Size, num_rows_of
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.files.atomic import whole_folder
 from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.motion.field import ColumnMotion
@@ -21,6 +21,16 @@ from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import StmapConvention
 from rsvib_torch.restoration.frame_motion import frame_motion
+
+Size = tuple[Count, Count]  # (height, width) of the frames in px
+
+
+def num_rows_of(motion: Motion, timing: SensorTiming, size: Size) -> int:
+    """Number of rows, along the scan axis, of frames of a size."""
+    check_single("motion", motion)
+    rows = size[int(timing.scan_axis)]
+    timing.check_rows(rows)
+    return int(rows)
 
 
 @checks_arguments

@@ -3,6 +3,7 @@ from .formats import register_format as register_format
 from .frame_times import TimingWarning as TimingWarning
 from .frame_times import describe_stack as describe_stack
 from .frame_times import exposure_times as exposure_times
+from .frame_times import stated_rate as stated_rate
 from .frame_times import timing_from_first_frame as timing_from_first_frame
 from .full_scale import counts_to_frames as counts_to_frames
 from .stack_info import H264 as H264

@@ -6,6 +6,7 @@ or written (``packaged_format``).
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -70,16 +71,12 @@ def packaged_format(
     ``open``, ``write`` and ``check`` name functions of ``StackFormat`` in the ``module``. ``tests/test_imports.py``
     reads these calls as imports.
     """
+    functions: Table = {use: partial(_call, module, f) for use, f in (("write", write), ("check", check)) if f}
+    return StackFormat(name, endings, partial(_call, module, open), **functions, **stated)
 
-    def imported(function: str) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            return getattr(import_module(module), function)(*arguments)
 
-        return call
-
-    named = {"write": write, "check": check}
-    functions: Table = {use: imported(function) for use, function in named.items() if function is not None}
-    return StackFormat(name, endings, imported(open), **functions, **stated)
+def _call(module: str, function: str, *arguments: Any) -> Any:
+    return getattr(import_module(module), function)(*arguments)
 
 
 _KEPT = ("full_scale", "frame_times", "orientation", "resolution")

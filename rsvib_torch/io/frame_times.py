@@ -68,6 +68,12 @@ def _spacing(info: StackInfo) -> _Spacing | None:
     return _Spacing(None, median, (float(intervals.min()), float(intervals.max())), info.time_error)
 
 
+def stated_rate(info: StackInfo) -> float | None:
+    """Frames per second that a file states by its times, between which frames may be missing, or as a rate."""
+    spacing = _spacing(info)
+    return None if spacing is None else 1.0 / spacing.interval
+
+
 def _same_rate(info: StackInfo, timing: SensorTiming) -> bool:
     """Whether the frame rate of a file, if it states one, is that of the sensor.
 

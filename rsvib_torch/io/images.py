@@ -156,13 +156,6 @@ def _read_info(file: Path) -> StackInfo:
     return reader.info
 
 
-def _read_frame(file: Path) -> Array:
-    if file.suffix.lower() not in _TIFF:
-        return decode_image(file)
-    with closing(open_tiff(file)) as reader:
-        return reader.frame(0)
-
-
 def open_images(path: Path) -> BlockReader:
     """Open the files of a folder, or one file; frames are decoded on access."""
     files = _frame_files(path)
@@ -195,7 +188,10 @@ def open_images(path: Path) -> BlockReader:
         try:
             if index in damaged:
                 raise damaged[index]
-            return _read_frame(files[index]).reshape(1, *stack.shape[1:])
+            if files[index].suffix.lower() not in _TIFF:
+                return decode_image(files[index]).reshape(1, *stack.shape[1:])
+            with closing(open_tiff(files[index])) as reader:
+                return reader.frame(0).reshape(1, *stack.shape[1:])
         except ValueError as error:
             message = str(error) if str(error).startswith(str(files[index])) else f"{files[index]}: {error}"
             raise FrameError(message) from error

@@ -1,11 +1,17 @@
-"""Stacks in TIFF and BigTIFF files, also compressed."""
+"""Stacks in TIFF and BigTIFF files, also compressed, and the metadata that a restoration copies to its output.
 
+Tags that describe how pixels are stored are left to the writer. Of all others a table states whether they are copied;
+those that are not are named, so that the user learns what is lost.
+"""
+
+import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import tifffile
@@ -13,9 +19,8 @@ import tifffile
 from rsvib_torch.files.reading import Table
 from rsvib_torch.io.blocks import BlockReader, contiguous_reader
 from rsvib_torch.io.full_scale import check_dtype, known_full_scale
-from rsvib_torch.io.stack_info import FrameError, StackInfo, readable_stack
+from rsvib_torch.io.stack_info import FrameError, Scope, StackInfo, Tag, readable_stack
 from rsvib_torch.io.stated_metadata import attributes_of, orientation_of, tiff_times
-from rsvib_torch.io.tiff_metadata import json_description, read_metadata, writer_options
 from rsvib_torch.numerics.tables import Array
 
 _PHOTOMETRIC: tuple[int, ...] = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
@@ -45,11 +50,7 @@ def _pages(tif: tifffile.TiffFile) -> list[_Page]:
     pages: list[_Page] = []
     visited: set[int] = set()
     file, kinds = tif.filehandle, {}
-    while True:
-        try:
-            page = cast(tifffile.TiffPage, tif.pages[len(pages)])
-        except IndexError:
-            break
+    for page in cast(Iterable[tifffile.TiffPage], tif.pages):
         if page.offset in visited:
             raise ValueError("its chain of pages runs in a circle")
         visited.add(page.offset)
@@ -101,7 +102,7 @@ def _info(
     if photometric not in _PHOTOMETRIC:
         raise ValueError(f"pixels are {_name(photometric)}; expected grey (black is 0) or RGB")
     check_dtype(dtype)
-    metadata, bits = json_description(tif), tif.pages.first.bitspersample
+    metadata, bits = _json_description(tif), tif.pages.first.bitspersample
     full_scale = metadata.get("full_scale")
     if full_scale is None and isinstance(bits, int) and bits not in (8, 16, 32, 64) and dtype.kind == "u":
         full_scale = 2**bits - 1  # packed pixels, e.g. 4095 for 12 bits
@@ -114,7 +115,7 @@ def _info(
         orientation=orientation_of(tif.pages.first.tags.valueof("Orientation")),
         **tiff_times(tif, shape[0], metadata),
     )
-    return replace(info, metadata=read_metadata(tif, info))
+    return replace(info, metadata=_metadata(tif, info))
 
 
 def _axes_of(series: tifffile.TiffPageSeries) -> tuple[str, tuple[int, ...]]:
@@ -122,22 +123,6 @@ def _axes_of(series: tifffile.TiffPageSeries) -> tuple[str, tuple[int, ...]]:
     if hasattr(series, "get_axes"):  # before tifffile 2026.5.2
         return series.get_axes(squeeze=False), series.get_shape(squeeze=False)
     return series.axes, series.shape
-
-
-def _series_info(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries) -> tuple[StackInfo, tuple[int, ...]]:
-    """The stack in a series of pages, and the permutation of the stored axes into (ones, T, C, H, W)."""
-    axes, shape = _axes_of(series)
-    rows, columns = axes.index("Y"), axes.index("X")
-    channels = [i for i, axis in enumerate(axes) if axis in "SC" and shape[i] > 1]
-    times = [i for i in range(len(axes)) if i not in (rows, columns, *channels) and shape[i] > 1]
-    if len(channels) > 1 or len(times) > 1:
-        raise ValueError(f"axes {axes} of sizes {tuple(shape)}; expected one axis of frames and one of channels")
-    kept = (*times, *channels, rows, columns)
-    ones = tuple(i for i in range(len(axes)) if i not in kept)
-    stack = tuple(shape[i] for i in kept)
-    last = bool(channels) and channels[0] > columns
-    stack = stack if times else (1, *stack)
-    return _info(tif, stack, series.dtype, series.keyframe.photometric, channels_last=last), (*ones, *kept)
 
 
 def _page_reader(
@@ -189,8 +174,21 @@ def _open_series(path: Path, tif: tifffile.TiffFile) -> BlockReader:
     """Reader of a file whose pages are arranged as one array."""
     # with axes of length 1, which is an option from tifffile 2026.5.2 on
     series = (tif.series(squeeze=False) if callable(tif.series) else tif.series)[0]
-    info, order = _series_info(tif, series)
-    shape, pages, T = _axes_of(series)[1], series.pages, info.shape[0]
+    # 1. The stack, and the permutation of the stored axes into (ones, T, C, H, W).
+    axes, shape = _axes_of(series)
+    rows, columns = axes.index("Y"), axes.index("X")
+    channels = [i for i, axis in enumerate(axes) if axis in "SC" and shape[i] > 1]
+    times = [i for i in range(len(axes)) if i not in (rows, columns, *channels) and shape[i] > 1]
+    if len(channels) > 1 or len(times) > 1:
+        raise ValueError(f"axes {axes} of sizes {tuple(shape)}; expected one axis of frames and one of channels")
+    kept = (*times, *channels, rows, columns)
+    order = (*(i for i in range(len(axes)) if i not in kept), *kept)
+    stack = tuple(shape[i] for i in kept)
+    last = bool(channels) and channels[0] > columns
+    stack = stack if times else (1, *stack)
+    info = _info(tif, stack, series.dtype, series.keyframe.photometric, channels_last=last)
+    # 2. Its frames: one after another, or in pages.
+    pages, T = series.pages, info.shape[0]
     in_order = tuple(sorted(order))
     frame_by_frame = order == in_order or (info.channels_last and (*order[:-3], *order[-2:], order[-3]) == in_order)
     if series.dataoffset is not None and frame_by_frame:
@@ -198,10 +196,10 @@ def _open_series(path: Path, tif: tifffile.TiffFile) -> BlockReader:
         return contiguous_reader(path, info, series.dataoffset, series.dtype.newbyteorder(tif.byteorder))
     size = path.stat().st_size
     _check_complete([_is_complete(page, size) for page in pages], math.prod(shape) * series.dtype.itemsize, size)
-    time = order[len(order) - len(info.shape)] if T > 1 else 0
+    time = times[0] if times else 0
     of_pages = next(i for i in range(len(shape) + 1) if math.prod(shape[:i]) == len(pages))  # axes with one page each
     if T > 1 and time >= of_pages:
-        raise ValueError(f"axes {series.axes}: a page has several frames; expected one frame per page")
+        raise ValueError(f"axes {axes}: a page has several frames; expected one frame per page")
     numbers = np.arange(len(pages)).reshape(*shape[:of_pages], *[1] * (len(shape) - of_pages))
     of_frames = np.moveaxis(numbers, time, 0).reshape(T, -1).tolist()
     frame_shape = tuple(1 if T > 1 and i == time else size for i, size in enumerate(shape))
@@ -225,7 +223,7 @@ _PROGRAMS = (
 
 def _are_arranged(tif: tifffile.TiffFile, count: int) -> bool:
     """Whether the ``count`` pages of a file are arranged as one array; otherwise every page is a frame."""
-    metadata = json_description(tif)
+    metadata = _json_description(tif)
     if "shape" in metadata:  # series of pages that were written one by one would take quadratic time
         shape = tuple(metadata["shape"])
         pages = math.prod(shape) // math.prod(tif.pages.first.shape)
@@ -256,6 +254,151 @@ def open_tiff(path: Path) -> BlockReader:
         return reader
 
 
+# Metadata
+
+_DESCRIPTION, _IMAGEJ_COUNTS, _IMAGEJ = 270, 50838, 50839  # codes of tags
+_JSON = "JSON metadata"  # keys of the description that tifffile writes
+_RESOLUTION = "resolution"  # without a unit of length, which ImageJ states in the description
+# keys of that description for the reader only
+_LAYOUT_KEYS = ("shape", "axes", "truncated", "full_scale", "frame_times", "frame_rate")
+_IMAGEJ_KEY = "rsvib="  # line of an ImageJ description: ImageJ uses the last description, so that there is no other one
+
+_OF_THE_FILE = (
+    "DocumentName Make Model DateTime Artist HostComputer XMP Copyright ExposureTime FNumber IPTCNAA InterColorProfile "
+    "GDAL_METADATA GDAL_NODATA GEO_METADATA"
+)
+_OF_THE_IMAGE = (
+    "ModelPixelScaleTag IntergraphMatrixTag ModelTiepointTag ModelTransformationTag GeoKeyDirectoryTag "
+    "GeoDoubleParamsTag GeoAsciiParamsTag RPCCoefficientTag"
+)
+_COPIED: dict[int, Scope] = {
+    **{tifffile.TIFF.TAGS[name]: "file" for name in _OF_THE_FILE.split()},
+    **{tifffile.TIFF.TAGS[name]: "image" for name in _OF_THE_IMAGE.split()},
+    **dict.fromkeys(range(65000, 65536), "file"),  # reusable range: values of the writing program
+}
+_FIRST_PRIVATE = 32768
+# Tags of stored pixels: all below the private range that are not copied, except references to other images; and these.
+_STORAGE = {32995, 32996, 32997, 32998, _IMAGEJ_COUNTS, _IMAGEJ}
+_SUBIFDS = 330
+
+
+def _json_description(tif: tifffile.TiffFile) -> Table:
+    """What tifffile or this package states in the description of the first page; empty if there is nothing."""
+    page = tif.pages.first
+    lines = [line for line in page.description.splitlines() if line.startswith(_IMAGEJ_KEY)]
+    return _parsed(page.shaped_description or (lines[0].removeprefix(_IMAGEJ_KEY) if lines else ""))
+
+
+def _parsed(text: str) -> Table:
+    with suppress(ValueError):
+        values = json.loads(text)
+        return values if isinstance(values, dict) else {}
+    return {}
+
+
+def _metadata(tif: tifffile.TiffFile, info: StackInfo) -> dict[str, Tag | None]:
+    """Metadata of a TIFF file by name; None for those that cannot be copied to the file that this package writes.
+
+    Descriptions of the arrangement of its pages (OME, ImageJ) are copied only if those of the output will be the same.
+    """
+    numbers = sorted({1, len(tif.pages) - 1})  # a sample: values differ in all pages or in none
+    others = [cast(tifffile.TiffPage, tif.pages.get(number)) for number in numbers if 0 < number < len(tif.pages)]
+    found: dict[str, Tag | None] = {}
+    for tag in tif.pages.first.tags:
+        private = tag.code >= _FIRST_PRIVATE and tag.code not in _STORAGE
+        if tag.code == _DESCRIPTION or not (tag.code in _COPIED or private or tag.code == _SUBIFDS):
+            continue
+        name = tag.name if not tag.name.isdecimal() else f"tag {tag.name}"
+        values = [_value(page.tags.get(tag.code)) for page in (tif.pages.first, *others)]
+        if tag.code not in _COPIED or values[0] is None:
+            found[name] = None
+        elif any(value not in (None, values[0]) for value in values[1:]):
+            found[f"{name} (differs between pages)"] = None
+        else:
+            found[name] = Tag(tag.code, int(tag.dtype), tag.count, values[0], None in values[1:], _COPIED[tag.code])
+    x, y, unit = (_value(tif.pages.first.tags.get(code)) for code in (282, 283, 296))
+    rational = all(isinstance(scale, tuple) and len(scale) == 2 and min(scale) > 0 for scale in (x, y))
+    if rational and unit == 1 and (x, y) != ((1, 1), (1, 1)):
+        found[_RESOLUTION] = Tag(282, 5, 2, (x, y), False, "image")
+    same_pages = info.axes == "THW" or (info.channels_last and info.shape[1] in (3, 4))
+    return found | _descriptions(tif, others, info.shape[0] if same_pages else -1)
+
+
+def _value(tag: tifffile.TiffTag | None) -> Any:
+    """The value of a tag, None if it is missing, damaged or a structure of its own."""
+    value = None
+    with suppress(Exception):  # any type, from a damaged file
+        value = None if tag is None else tag.value
+    parts = value if isinstance(value, tuple) else (value,)
+    return value if all(isinstance(part, (int, float, str, bytes)) for part in parts) else None
+
+
+def _descriptions(tif: tifffile.TiffFile, others: Sequence[tifffile.TiffPage], frames: int) -> dict[str, Tag | None]:
+    """Descriptions of the first page; ``frames`` of the file that will be written as the same pages."""
+    first = tif.pages.first
+    found: dict[str, Tag | None] = {}
+    written = {key: value for key, value in _parsed(first.shaped_description or "").items() if key not in _LAYOUT_KEYS}
+    if written:
+        alike = all(_parsed(page.shaped_description or "").items() >= written.items() for page in others)
+        alike |= all(not page.shaped_description for page in others)
+        name = _JSON if alike else f"{_JSON} (differs between pages)"
+        found[name] = _text(json.dumps(written), "file") if alike else None
+    text = _free_text(first)
+    if first.is_imagej:
+        kept = "".join(f"{line}\n" for line in text.splitlines() if not line.startswith(_IMAGEJ_KEY))
+        found["ImageJ metadata"] = _text(kept, "stack") if frames > 0 else None
+        if _IMAGEJ in first.tags:
+            values = first.tags[_IMAGEJ].value
+            known = frames > 0 and isinstance(values, dict)
+            found["ImageJ overlays and labels"] = Tag(_IMAGEJ, 1, 0, values, True, "stack") if known else None
+    elif first.is_ome:
+        single = frames == len(tif.pages) and "FileName=" not in text
+        found["OME-XML"] = _text(text, "stack") if single else None
+    elif text and any(_free_text(page) not in ("", text) for page in others):
+        found["ImageDescription (differs between pages)"] = None
+    elif text:
+        found["ImageDescription"] = _text(text, "file")
+    return found
+
+
+def _free_text(page: tifffile.TiffPage) -> str:
+    """The description of a page that is not that of tifffile."""
+    texts = (page.description, page.description1)
+    return next((text for text in texts if text and text != page.shaped_description), "")
+
+
+def _text(text: str, scope: Scope) -> Tag:
+    return Tag(_DESCRIPTION, 2, 0, text, True, scope)
+
+
+def _writer_options(info: StackInfo, description: Mapping[str, object]) -> Table:
+    """Options of ``tifffile.imwrite`` that store the metadata of a stack, and a description as JSON."""
+    extratags: list[tuple[object, ...]] = []
+    options: Table = {"metadata": dict(description), "extratags": extratags}
+    for name, tag in info.metadata.items():
+        if tag is None:
+            continue
+        if name == _JSON:
+            options["metadata"] = {**json.loads(tag.value), **options["metadata"]}
+        elif name == _RESOLUTION:
+            options.update(resolution=tag.value, resolutionunit="NONE")
+        elif tag.code == _IMAGEJ:
+            extratags += tifffile.imagej_metadata_tag(tag.value, "<" if sys.byteorder == "little" else ">")
+        elif tag.code == _DESCRIPTION:
+            options["description"] = tag.value.encode()
+        else:
+            value = tag.value.encode() if isinstance(tag.value, str) else tag.value
+            extratags.append((tag.code, tag.dtype, tag.count, value, tag.first_page))
+    if info.metadata.get("ImageJ metadata") is not None:
+        values = {key: value for key, value in description.items() if key != "axes"}
+        line = f"{_IMAGEJ_KEY}{json.dumps(values)}\n" if values else ""
+        options.update(metadata=None, description=options["description"] + line.encode())
+    return options
+
+
+# Writing
+
+
 def _layout(info: StackInfo) -> tuple[StackInfo, Table]:
     """The stack as it is stored, and options of ``tifffile.imwrite``: three or four channels are stored last (RGB)."""
     colour = info.axes == "TCHW" and info.shape[1] in (3, 4)
@@ -263,7 +406,7 @@ def _layout(info: StackInfo) -> tuple[StackInfo, Table]:
     axes = "TYX" if info.axes == "THW" else "TYXS" if colour else "TSYX" if info.shape[1] > 1 else "TCYX"
     plain = replace(info, orientation=1, resolution=None)  # those are tags
     description = {**attributes_of(plain), "axes": axes}
-    options = {"photometric": "rgb" if colour else "minisblack", **writer_options(info, description)}
+    options = {"photometric": "rgb" if colour else "minisblack", **_writer_options(info, description)}
     if axes == "TSYX":
         options["planarconfig"] = "separate"
     if info.orientation != 1:

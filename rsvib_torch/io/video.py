@@ -15,7 +15,7 @@ from functools import lru_cache
 from io import BytesIO
 from itertools import chain, count, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def _av() -> Any:
     return needed_package("av", "reading and writing video", "video")
 
 
-def open_container(video: Path | BinaryIO) -> Any:
+def open_container(video: Path | IO[bytes]) -> Any:
     """Open a video for decoding; formats that refer to other files (playlists) are refused."""
     formats = "matroska,webm,avi,mov,mp4,mpegts,mpeg,mpegvideo,asf"
     av = _av()
@@ -287,17 +287,6 @@ def presentation_times(info: StackInfo) -> tuple[Fraction, list[int]]:
     return unit, [round(time / unit) for time in times]
 
 
-def _encoded_as(path: Path, info: StackInfo) -> tuple[str, str, float]:
-    """Pixel formats of the array of a frame and of the encoder, and their full scale."""
-    grey, lossy = info.axes == "THW" or info.shape[1] == 1, path.suffix.lower() in H264
-    bits = next(bits for bits in (8, 10, 12, 14, 16) if lossy or 2**bits - 1 >= (info.full_scale or 0.0))
-    if bits > 8:
-        layout = f"gray{bits}le" if grey else f"gbrp{bits}le"
-        return layout, layout, 2.0**bits - 1.0
-    layout = "gray" if grey else "rgb24"
-    return layout, "yuv420p" if lossy else "gray" if grey else "bgr0", 255.0
-
-
 class VideoEncoder:
     """Encodes frames into a container that is open for writing; the ending of ``path`` selects the codec.
 
@@ -316,7 +305,13 @@ class VideoEncoder:
         options: Mapping[str, str] = {},
     ) -> None:
         self._container, self._info, self._picture, lossy = container, info, picture, path.suffix.lower() in H264
-        self._layout, self._encoded, self._full_scale = _encoded_as(path, info)
+        # The pixel formats of the array of a frame and of the encoder, and their full scale.
+        grey = info.axes == "THW" or info.shape[1] == 1
+        bits = next(bits for bits in (8, 10, 12, 14, 16) if lossy or 2**bits - 1 >= (info.full_scale or 0.0))
+        self._layout, self._full_scale = "gray" if grey else "rgb24", 2.0**bits - 1.0
+        self._encoded = "yuv420p" if lossy else "gray" if grey else "bgr0"
+        if bits > 8:
+            self._layout = self._encoded = f"gray{bits}le" if grey else f"gbrp{bits}le"
         self.unit, self.ticks = presentation_times(info)
         self.step = int(np.median(np.diff(self.ticks))) if len(self.ticks) > 1 else 1
         rate = 1 / (self.unit * self.step) if len(self.ticks) > 1 else Fraction(_DEFAULT_RATE)
@@ -434,7 +429,7 @@ _PART_OPTIONS = {"preset": "ultrafast", "crf": "14", "bf": "0"}
 
 @contextmanager
 def part_of_video(
-    file: BinaryIO, video: Path, info: StackInfo, picture: Picture | None
+    file: IO[bytes], video: Path, info: StackInfo, picture: Picture | None
 ) -> Iterator[Callable[[Array], None]]:
     """Encode consecutive frames of a video into a new file; only ``join_parts`` gives them their times.
 
@@ -451,7 +446,7 @@ def part_of_video(
         encoder.finish()
 
 
-def join_parts(path: Path, info: StackInfo, parts: Iterable[BinaryIO]) -> None:
+def join_parts(path: Path, info: StackInfo, parts: Iterable[IO[bytes]]) -> None:
     """Write the video whose frames are in ``parts``, with the times, the metadata and the sound of its source."""
     unit, ticks = presentation_times(info)
     with ExitStack() as opened:
