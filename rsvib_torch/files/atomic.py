@@ -220,17 +220,12 @@ def _inside(path: _Path, folder: _Path) -> bool:
     return any(place != above and place.is_relative_to(above) for place in _places(path) for above in _places(folder))
 
 
-def _identity(path: _Path) -> tuple[int, int] | None:
-    """Device and number of a file or folder, which all its names share; None if it does not exist."""
-    with suppress(OSError):
-        status = os.stat(path)
-        return status.st_dev, status.st_ino
-    return None
-
-
 def _same(path: _Path, other: _Path) -> bool:
-    identity = _identity(path)
-    return (identity is not None and identity == _identity(other)) or not _places(path).isdisjoint(_places(other))
+    """Whether two paths are names of one file."""
+    with suppress(OSError):  # one of them does not exist
+        if os.path.samefile(path, other):
+            return True
+    return not _places(path).isdisjoint(_places(other))
 
 
 def _conflict(output: _Path, source: _Path) -> str | None:
@@ -239,14 +234,11 @@ def _conflict(output: _Path, source: _Path) -> str | None:
         return f"it is the same file as the input {source}"
     if _inside(source, output):
         return f"it contains the input {source}"
-    if not os.path.isdir(source):
-        return None
     if _inside(output, source):
         return f"it lies inside the input folder {source}"
-    identity = _identity(output)
-    if identity is not None and not os.path.isdir(output):
+    if os.path.isfile(output):
         for member in (Path(place, name) for place, _, names in os.walk(source) for name in names):
-            if _identity(member) == identity:
+            if os.path.exists(member) and os.path.samefile(member, output):
                 return f"it is the same file as {member} of the input"
     return None
 
@@ -269,6 +261,6 @@ def check_outputs(outputs: Iterable[_Path], inputs: Iterable[_Path], *, folder: 
             if reason is not None:
                 raise ValueError(f"{problem}: {reason}; choose another {remedy}")
     for one, other in combinations(outputs, 2):
-        if _same(one, other) or _inside(one, other) or _inside(other, one):
-            reason = "they are the same file" if _same(one, other) else "one lies inside the other"
+        if (same := _same(one, other)) or _inside(one, other) or _inside(other, one):
+            reason = "they are the same file" if same else "one lies inside the other"
             raise ValueError(f"cannot write {one} and {other}: {reason}; choose two names")

@@ -38,6 +38,7 @@ from rsvib_torch.restoration import RestorationMtf, RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES, AXIS_UNITS, FIGURES
 from rsvib_torch.results.result_files import figure_png, write_figure
 from rsvib_torch.row_time import RowTimeCalibration
+from rsvib_torch.stacks import StackManifest
 from rsvib_torch.text import measured_text
 
 _INK, _GREY, _GRID = "#222222", "#8a8a8a", "#d9d9d9"
@@ -741,5 +742,6 @@ FIGURES.update(
         (RestorationMtf, 0): _restoration_mtf_figure,
         (OffsetCurve, 0): _measured_offsets_figure,
         (RestorationVerdict, 0): _verdict_figure,
+        (StackManifest, 0): lambda manifest: windows_figure(manifest.times(), manifest.detections()),
     }
 )

@@ -21,11 +21,12 @@ from torch import Tensor
 from rsvib_torch.checks.arguments import check_fields, check_shapes, checked_methods
 from rsvib_torch.checks.validation import read_json
 from rsvib_torch.checks.values import check_number, described, needed_package
+from rsvib_torch.files.atomic import write_json
 from rsvib_torch.files.reading import Table
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.higher_packages import imported
 from rsvib_torch.results.reason import texts
-from rsvib_torch.results.result_files import figure_png, result_of, save_result, write_figure
+from rsvib_torch.results.result_files import figure_png, result_of, write_figure
 from rsvib_torch.text import AXES, data_uri, text_table, wrapped
 
 if TYPE_CHECKING:
@@ -249,7 +250,7 @@ class Result(Summarised):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, which ``load`` reads; an existing file is replaced."""
-        save_result(self, Path(path))
+        write_json(path, {"format": self.file_format, "version": 1, **self.to_dict(), "units": dict(self.units)})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_fields, hints_of
 from rsvib_torch.checks.validation import members_of
-from rsvib_torch.files.atomic import whole_file, write_json
+from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.results.reason import read_findings
 from rsvib_torch.text import quoted
@@ -22,13 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def save_result(result: Any, path: Path) -> None:
-    """Write a ``Result`` as JSON, see ``Result.save``."""
-    write_json(path, {"format": result.file_format, "version": 1, **result.to_dict(), "units": dict(result.units)})
-
-
 def result_of(kind: type[Any], data: Table, path: Path) -> Any:
-    """A result of a class from the content of a file that ``save_result`` wrote, see ``Result.load``."""
+    """A result of a class from the content of a file that ``Result.save`` wrote, see ``Result.load``."""
     if data.get("format") != kind.file_format or data.get("version") != 1:
         raise ValueError(
             f"{path}: expected format {kind.file_format!r} of version 1, as {kind.__name__}.save writes it, got "

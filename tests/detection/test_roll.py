@@ -219,7 +219,7 @@ def test_commands_write_the_results_of_a_rolling_camera(rolling, tmp_path, capsy
     assert answer["detection"]["vibration"]["amplitude"][2][0] == pytest.approx(2.5e-3, rel=0.03)
     assert answer["restoration"]["axes"] == ["x", "y", "roll"]
     assert (tmp_path / "page" / "offsets_roll.png").exists()
-    assert "Roll vibrates by" in (tmp_path / "page" / "report.html").read_text()
+    assert "The vibration along roll is " in (tmp_path / "page" / "report.html").read_text()
     assert rsvib("detect", tmp_path / "frames.tif", "--out", tmp_path / "windows", *config, "--window", 3) == 0
     assert "roll" in capsys.readouterr().out
     head, *lines = (tmp_path / "windows" / "tones.csv").read_text().splitlines()

@@ -414,7 +414,7 @@ def test_command_writes_a_page(place, capsys):
     text = "".join(reader.text)
     assert "Vibration in chart & <co>.tif" in text
     assert "The vibration of the camera was measured and removed; restoration improves the frames." in text
-    found = re.search(r"Along x the image vibrates by ([\d.]+) ± [\d.]+ px at ([\d.]+)", text)
+    found = re.search(r"The vibration along x is ([\d.]+) ± [\d.]+ px at ([\d.]+)", text)
     assert float(found[1]) == pytest.approx(1.6, rel=0.01)
     assert float(found[2]) == pytest.approx(71.0, rel=0.002)
     assert (place / "out" / "psf.png").exists()

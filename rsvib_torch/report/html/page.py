@@ -280,7 +280,7 @@ def write_report_page(folder: Path, report: Report, edges: Sequence[Box] | None 
         lines = [*vibration[1:], *(restoration if report.windows.output is not None else [])]
         windows = {"lines": lines, "table": report.windows.tone_table()}
         if report.windows.gyroscope is None:  # no tones are searched for otherwise
-            figures["windows"] = drawing(plots.windows_figure(report.windows.times(), report.windows.detections()))
+            figures["windows"] = drawing(report.windows.plot())
     content = {
         "report": report,
         "title": report.title,

@@ -76,42 +76,6 @@ def overall_result(result: DetectionResult, verdict: RestorationVerdict | None, 
     return "doubt", "The vibration was measured and removed in part."
 
 
-def _axis_sentences(result: DetectionResult, axis: int) -> list[str]:
-    """Vibration and uniform motion along an axis."""
-    name, tones = AXIS_NAMES[axis], tones_text(result, axis)
-    if not bool(result.reliable[axis]):
-        reasons = "; ".join(str(reason) for reason in result.reasons[axis])
-        sentences = [f"The vibration along {name} is not reliable: {reasons}."]
-    elif axis >= 2:
-        sentences = [f"{name.capitalize()} vibrates by {' and '.join(tones)}."]
-    elif tones:
-        sentences = [f"Along {name} the image vibrates by {' and '.join(tones)}."]
-    else:
-        sentences = [f"No vibration was detected along {name}."]
-    if axis >= 2:
-        return sentences
-    speed, std = float(result.vibration.image_motion[axis]), float(result.std.image_motion[axis])
-    if math.isfinite(std) and abs(speed) > max(4 * std, 1.0):  # px/s; significant, and not negligible
-        sentences.append(f"Along {name} the image also moves uniformly, by {measured_text(speed, std)} px/s.")
-    return sentences
-
-
-def _blind_sentences(result: DetectionResult, timing: SensorTiming, within: float = 3.0) -> list[str]:
-    """A sentence for every tone that is less than ``within`` Hz away from a blind frequency."""
-    sentences = []
-    for axis, tone in result.vibration.amplitude.nonzero().tolist():
-        frequency = float(result.vibration.frequency[axis, tone])
-        blind = blind_frequencies(timing, frequency + 2 * within)
-        nearest = float(blind[(blind - frequency).abs().argmin()]) if len(blind) else math.inf
-        if abs(nearest - frequency) < within:
-            sentences.append(
-                f"The tone at {frequency:.1f} Hz along {AXIS_NAMES[axis]} is {abs(nearest - frequency):.1f} Hz from "
-                f"the blind frequency {nearest:.1f} Hz, at which all frames are displaced alike; errors are amplified "
-                f"(offset gain {abs(float(result.gain[axis, tone])):.2f})."
-            )
-    return sentences
-
-
 def verdict_sentences(
     result: DetectionResult,
     removed: Vibration,
@@ -127,8 +91,17 @@ def verdict_sentences(
     ``removed`` is the part of the detected vibration that was removed; ``left_alone`` has a reason for each other axis.
     """
     sentences = [overall_result(result, verdict, restored)[1]]
-    for axis in range(result.vibration.num_axes):
-        sentences += _axis_sentences(result, axis)
+    for axis, name in enumerate(AXIS_NAMES[: result.vibration.num_axes]):
+        if bool(result.reliable[axis]):
+            sentences.append(f"The vibration along {name} is {' and '.join(tones_text(result, axis)) or 'none'}.")
+        else:
+            why = "; ".join(str(reason) for reason in result.reasons[axis])
+            sentences.append(f"The vibration along {name} is not reliable: {why}.")
+        if axis < 2:
+            speed, std = float(result.vibration.image_motion[axis]), float(result.std.image_motion[axis])
+            if math.isfinite(std) and abs(speed) > max(4 * std, 1.0):  # px/s; significant, and not negligible
+                text = measured_text(speed, std)
+                sentences.append(f"Along {name} the image also moves uniformly, by {text} px/s.")
     removed = removed.translation()  # at the centre of the frame
     if bool(removed.moving_axes().any()):
         size = removed.amplitude.sum(-1)
@@ -137,7 +110,6 @@ def verdict_sentences(
             f"Rows are displaced by up to {float(size[0]):.2f} px along x and {float(size[1]):.2f} px along y, and "
             f"blurred by up to {float(blur[0]):.2f} px and {float(blur[1]):.2f} px during their exposure."
         )
-    sentences += _blind_sentences(result, timing)
     if bool(result.reliable.all()):  # otherwise the reasons are given above
         sentences += [_sentence(str(reason)) for reason in left_alone]
     if verdict is not None:
