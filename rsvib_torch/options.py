@@ -461,20 +461,21 @@ class ProcessVideoOptions(RunOptions, ResourceOptions):
     """Options of ``process_video``; each of its two passes counts as half of the progress."""
 
     border: BorderName = "mirror"
-    """Pixels that the sensor did not record: ``"mirror"``: extrapolated from each frame by itself; ``"hold"``: as in
-    the frame before; ``"crop"``: cut off by constant margins."""
+    """Pixels that the sensor did not record: ``"mirror"``, extrapolated from each frame by itself; ``"hold"``, as in
+    the frame before; ``"crop"``, cut off by constant margins."""
     steady: NotNegative = 0.0
-    """s; every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose period is this time
+    """Every frame is moved to a smooth path, and its skew and wobble are undone: shaking whose period is this time in s
     or shorter is removed, slower motion is kept. 0: frames stay where they are, and only vibration is removed."""
     crop_limit: Side = 0.1
     """Largest displacement of a corner of a frame by ``steady``, in parts of the width or height; where the path would
     need more, it is smoothed less."""
     gyroscope: FilePath = None
-    """File with the rates of a gyroscope, as in ``read_gyroscope``, or ``"auto"``: the track of the video itself. The
-    path of the camera is its rotation by the gyroscope, instead of the path and the tones by corners."""
+    """File with the rates of a gyroscope (gyroflow log, GoPro video, CSV), or ``"auto"``: the track of the video.
+    See ``read_gyroscope``. The path of the camera is its rotation by the gyroscope, instead of the path and the tones
+    by corners."""
     lens_profile: FilePath = None
-    """With ``gyroscope``: lens profile of Gyroflow (JSON), as in ``Camera.from_gyroflow``. By default, a focal length
-    without distortion is fitted."""
+    """Lens profile of Gyroflow (JSON), which goes with ``gyroscope``. See ``Camera.from_gyroflow``; by default, a focal
+    length without distortion is fitted."""
     restoration: OptionTable = None
     """``method`` (default ``"exact"``), its options, and ``saturation``, as in ``restore``, for frames whose full scale
     is 1. Without ``saturation``, saturated pixels count as measured: their values are restored 0.2 dB worse if 1 % of

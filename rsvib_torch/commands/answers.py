@@ -107,6 +107,18 @@ def restoration_lines(result: stacks.RestoredFrames, count: int) -> list[str]:
     return [wrapped(line) for line in lines]
 
 
+def restoration_of(run: stacks.StackReport, restored: Path) -> tuple[list[str], Table]:
+    """What a run restored, as lines and as data, with warnings; of a single window with its verdict."""
+    note_lost(restored, run.not_kept)
+    if run.windows == 1 and run.first is not None and run.first.restoration is not None:
+        first = run.first.restoration
+        warn_of_restoration(first)
+        return restoration_lines(first, run.first.window.last + 1), reports.restoration_data(first)
+    stored = stacks.read_manifest(run.manifest)
+    warn_of_failures(stored)
+    return [run.summary(), *stored.lines()[1][1:]], stored.totals()
+
+
 def next_step(sentence: str, *command: object) -> str:
     """A step: a sentence, and the command that does it, which can be copied into a shell."""
     return f"{sentence}:\n  {' '.join(['rsvib', *map(_shell_word, map(str, command))])}"
@@ -200,12 +212,8 @@ def write_windows(folder: Path, manifest: stacks.StackManifest, pixel_size: floa
     with working("drawing the windows"):
         write_json(folder / "windows.json", {"format": "rsvib windows", "version": 1, **manifest.totals()})
         reports.write_table(folder / "tones.csv", manifest, pixel_size=pixel_size)
-
-        def draw() -> Figure:
-            return reports.windows_figure(manifest.times(), manifest.detections())
-
         # otherwise, no tones are searched for
-        drawn = draw_safely(folder / "windows.png", draw) if manifest.gyroscope is None else []
+        drawn = draw_safely(folder / "windows.png", manifest.plot) if manifest.gyroscope is None else []
     return [*drawn, "windows.json", "tones.csv"]
 
 

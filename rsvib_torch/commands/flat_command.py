@@ -49,7 +49,8 @@ class Given:
                     usual.append(str(stated.default))
                 # the first sentence of the description
                 text = re.split(r"(?<=\.) (?=[A-Z])", stated.description.replace("``", "").replace('"', ""))[0]
-                form = {"text": self.context + text, "show_default": ", or ".join(usual) or False}
+                text = self.context + text[0].lower() + text[1:] if self.context else text
+                form = {"text": text, "show_default": ", or ".join(usual) or False}
                 yield _parameter(name, stated.annotation, None, {**form, **self.forms.get(name, {})})
 
 

@@ -16,10 +16,10 @@ from rsvib_torch import gyroscope, io
 from rsvib_torch.checks.validation import MistakesError, fields_of, options
 from rsvib_torch.commands.answers import run_step
 from rsvib_torch.commands.flat_command import Given, argument, option
-from rsvib_torch.commands.shared_options import SENSOR_FORMS, rate, seconds, stated_exposure, stated_rate
+from rsvib_torch.commands.shared_options import SENSOR_FORMS, check_new, rate, seconds, stated_exposure
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.config import presets, read_config
-from rsvib_torch.files.atomic import check_outputs, check_writable, whole_file
+from rsvib_torch.files.atomic import check_writable, whole_file
 from rsvib_torch.files.reading import Table
 from rsvib_torch.motion.cameras import camera_mode, find_cameras
 from rsvib_torch.motion.timing import SensorSection, SensorTiming
@@ -42,16 +42,7 @@ class InitOptions:
     """Configuration file to write."""
     sensor: Annotated[
         Table,
-        Given(
-            SensorSection,
-            forms={
-                **SENSOR_FORMS,
-                "full_scale": {
-                    "text": "Count that corresponds to full scale, e.g. 4095 for 12 bits.",
-                    "show_default": "from the file",
-                },
-            },
-        ),
+        Given(SensorSection, forms={**SENSOR_FORMS, "full_scale": {"show_default": "from the file"}}),
     ]
     camera: str | None = None
     """Model of the camera, for its measured row time (rsvib cameras lists them)."""
@@ -80,9 +71,7 @@ def init(given: InitOptions) -> Answer:
         raise ValueError("--camera and --row-time both state the row time; give one of them")
     if preset is None and frames is None:
         raise ValueError("give a stack of frames, or --preset NAME (--list-presets lists them)")
-    if out.exists() and not given.overwrite:
-        raise ValueError(f"{out} exists; --overwrite replaces it, --out FILE writes another file")
-    check_outputs([out], [] if frames is None else io.stack_files(frames))
+    check_new([out], given.overwrite, [] if frames is None else io.stack_files(frames))
     check_writable(out)
     if preset is not None and preset not in presets():
         raise ValueError(f"--preset must be one of {', '.join(presets())}; got {preset!r}")
@@ -136,7 +125,7 @@ def _describe_camera(path: Path, given: Table, camera: str | None) -> str:
     size = f"{info.shape[0]} frames of {info.shape[-2]} x {info.shape[-1]} px (height x width), {info.dtype}"
     note(f"{path}: {size}")
     values, rows = dict(given), info.shape[-1 if given.get("scan_axis") == "x" else -2]
-    stated = stated_rate(info)
+    stated = io.stated_rate(info)
     if stated is not None and "frame_rate" not in given:
         values["frame_rate"] = stated
         note(f"frame rate {stated:.6g} per second, from the times in the file")

@@ -50,14 +50,14 @@ def motion(given: MotionOptions) -> Answer:
     shared.check_new([out], given.overwrite, given.inputs)
     check_writable(out)
     chosen = {name: value for name, value in given.detection.items() if given.model == "free" or name == "search"}
-    stack = load(given)
+    pixels, timing = load(given)
     result: detection.MotionDetection | detection.SweptTone
     with working("detecting the motion"):
         if given.model == "free":
-            result = detection.detect_motion(stack.frames, stack.timing, **chosen)
+            result = detection.detect_motion(pixels, timing, **chosen)
         else:
-            result = detection.detect_swept_tone(stack.frames, stack.timing, **chosen)
-    columns = reports.motion_columns(result, stack.timing)
+            result = detection.detect_swept_tone(pixels, timing, **chosen)
+    columns = reports.motion_columns(result, timing)
     reports.write_columns(out, columns)
     known_motion = ("--motion", out, "--unit", "px", "--offset", "0")
     restore = ("known", frames, frames.with_name("restored.tif"), *given.settings.arguments, *known_motion)
@@ -151,13 +151,18 @@ def known(given: KnownOptions) -> Answer:
     results: dict[str, list[str]] = {}
     data: Table = {"alignment": None, "check": None}
     if given.offset is None or not isinstance(recorded, rsvib_torch.FreeMotion):
+        camera = None  # the stated lens of a gyroscope
+        if given.lens_profile is not None:
+            camera = rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
+        elif given.unit is None and given.focal_length is not None:
+            camera = rsvib_torch.Camera(given.focal_length)
         with working("aligning the recording"):
             found = stacks.align_stack(
                 given.stack,
                 info,
                 timing,
                 recorded,
-                camera=_camera(given, info),
+                camera=camera,
                 offsets=given.offsets,
                 ignore=ignore,
                 fit_gain=given.fit_gain,
@@ -195,16 +200,7 @@ def known(given: KnownOptions) -> Answer:
     of_run |= {name: value for name, value in given.settings.stack.items() if name == "window"} | given.processing
     with working(f"restoring {given.stack.name}", counts=counts) as progress:
         run = stacks.process_stack(given.stack, given.restored, timing, **of_run, progress=progress if counts else None)
-    answers.note_lost(given.restored, run.not_kept)
-    stored, first = stacks.read_manifest(manifest), None if run.first is None else run.first.restoration
-    if run.windows == 1 and first is not None:
-        answers.warn_of_restoration(first)
-        results["Restoration"] = answers.restoration_lines(first, info.shape[0])
-        data["restoration"] = reports.restoration_data(first)
-    else:
-        answers.warn_of_failures(stored)
-        results["Restoration"] = [run.summary(), *stored.lines()[1][1:]]
-        data["restoration"] = stored.totals()
+    results["Restoration"], data["restoration"] = answers.restoration_of(run, given.restored)
     return Answer(results, data, [given.restored, manifest])
 
 
@@ -226,13 +222,6 @@ def _recorded(given: KnownOptions) -> rsvib_torch.FreeMotion | rsvib_torch.Angul
             "--unit; axes and clock of a gyroscope are estimated from the frames"
         )
     return rsvib_torch.read_gyroscope(given.motion)
-
-
-def _camera(given: KnownOptions, info: StackInfo) -> rsvib_torch.Camera | None:
-    """The stated lens of a gyroscope."""
-    if given.lens_profile is not None:
-        return rsvib_torch.Camera.from_gyroflow(given.lens_profile, info.shape[-1], info.shape[-2])
-    return rsvib_torch.Camera(given.focal_length) if given.unit is None and given.focal_length is not None else None
 
 
 def _refuse(given: KnownOptions, reasons: tuple[str, ...]) -> None:
@@ -341,11 +330,8 @@ class CalibrateOptions(shared.RangeOptions):
         None, show_default="a readout within a tenth to the whole of the frame period", **shared.TIME
     )
     """With --by-motion: given twice, the shortest and the longest possible row time, e.g. 10us."""
-    readout_direction: Literal["forward", "reverse"] | None = option(
-        None,
-        show_default="determined from the frames",
-        text=f"With --by-motion, if known. {shared.SENSOR_FORMS['readout_direction']['text']}",
-    )
+    readout_direction: Literal["forward", "reverse"] | None = option(None, show_default="determined from the frames")
+    """With --by-motion, if known: forward if the top row (or left column) is read first, reverse if the last one is."""
     frame_rate: float | None = option(None, **shared.SENSOR_FORMS["frame_rate"])
     on_fraction: float | None = None
     """Duty cycle of a light that is switched on and off; determines the exposure time."""

@@ -44,27 +44,12 @@ class RunOptions(RestorationCommand, PixelSizeOptions, VerdictOptions):
         Table,
         Given(
             ProcessVideoOptions,
+            ("border", "steady", "crop_limit", "gyroscope", "lens_profile"),
             context="With --video, ",
             forms={
-                "border": {
-                    "text": "With --video, pixels that the sensor did not record: mirror, extrapolated; hold, as in "
-                    "the frame before; crop, cut off by constant margins."
-                },
-                "steady": {
-                    "text": "With --video, move the image to a smooth path: shaking of this period or shorter is "
-                    "removed.",
-                    "metavar": "SECONDS",
-                    "show_default": "the image stays where it is",
-                },
-                "crop_limit": {
-                    "text": "With --steady, the largest shift of a corner, in parts of the width or height."
-                },
-                "gyroscope": {
-                    "text": "With --video, follow the rotation by a gyroscope instead of corners: a gyroflow "
-                    "log, a GoPro video or a CSV; auto: the track of the video itself.",
-                    "metavar": "FILE",
-                },
-                "lens_profile": {"text": "With --gyroscope, lens profile of Gyroflow (JSON).", "metavar": "FILE"},
+                "steady": {"metavar": "SECONDS", "show_default": "the image stays where it is"},
+                "gyroscope": {"metavar": "FILE"},
+                "lens_profile": {"metavar": "FILE"},
             },
         ),
     ]

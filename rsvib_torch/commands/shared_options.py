@@ -1,6 +1,5 @@
 """Arguments and options that several commands share, and their combination with the configuration file."""
 
-import itertools
 import os
 import re
 import statistics
@@ -96,8 +95,8 @@ SENSOR_FORMS: dict[str, Table] = {
         "metavar": "NUMBER",
         "show_default": "from the file, or the configuration",
     },
-    "scan_axis": {"text": "y: image rows are exposed one after another; x: image columns."},
-    "readout_direction": {"text": "forward: the top row (or left column) is read first; reverse: the last one is."},
+    "scan_axis": {},
+    "readout_direction": {},
 }
 
 
@@ -270,20 +269,11 @@ class VerdictOptions:
 
 
 def rate_of_file(frames: Path) -> float | None:
-    """``stated_rate`` of a file, with a note."""
-    rate_of_frames = stated_rate(io.read_stack_info(frames))
+    """``io.stated_rate`` of a file, with a note."""
+    rate_of_frames = io.stated_rate(io.read_stack_info(frames))
     if rate_of_frames is not None:
         note(f"frame rate {rate_of_frames:.6g} per second, from the times in {frames}; --frame-rate replaces it")
     return rate_of_frames
-
-
-def stated_rate(info: "StackInfo") -> float | None:
-    """Frames per second from the frame times of a file, between which frames may be missing, or from its rate."""
-    if info.frame_times is None or len(info.frame_times) < 2:
-        return info.frame_rate
-    intervals = [later - earlier for earlier, later in itertools.pairwise(info.frame_times)]
-    period = statistics.median(intervals)
-    return sum(max(round(interval / period), 1) for interval in intervals) / sum(intervals)
 
 
 def stated_exposure(path: Path) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,23 +28,16 @@ if TYPE_CHECKING:
 
     from rsvib_torch.config import Config
     from rsvib_torch.motion.detected_vibration import DetectedVibration
-    from rsvib_torch.motion.motion import Motion
 
 
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 
 
-@dataclass(frozen=True)
-class Stack:
-    """Frames in memory."""
+def load(given: shared.StackCommand, restoration: Table | None = None) -> tuple[Tensor, rsvib_torch.SensorTiming]:
+    """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows.
 
-    frames: Tensor  # (T, H, W) or (T, C, H, W), full scale 1
-    info: io.StackInfo  # data type and metadata of the file, with exposure times for frame times
-    timing: rsvib_torch.SensorTiming  # the sensor, with the frame times of the file
-
-
-def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
-    """Read a stack that is processed as a whole, if the memory suffices for it and for the restoration that follows."""
+    The frames are (T, H, W) or (T, C, H, W), full scale 1; the timing has the frame times of the file.
+    """
     path, config = given.stack, given.settings
     info = io.read_stack_info(path)
     scale = shared.full_scale_of(path, info, config, given.full_scale)
@@ -53,9 +46,7 @@ def load(given: shared.StackCommand, restoration: Table | None = None) -> Stack:
         frames = io.read_stack(path, full_scale=scale)
     timing = io.timing_from_first_frame(config.timing, info)
     print_notes(info, config)
-    times = io.exposure_times(info, config.timing)
-    info = replace(info, frame_times=times, time_error=0.0, frame_rate=info.frame_rate or config.timing.frame_rate)
-    return Stack(frames.to(given.torch_device), info, timing)
+    return frames.to(given.torch_device), timing
 
 
 def read_frame(path: Path, index: int, full_scale: float | None) -> Tensor:
@@ -71,19 +62,9 @@ def print_notes(info: io.StackInfo, config: Config) -> None:
         note(sentence)
 
 
-def _detect(stack: Stack, config: Config) -> detection.DetectionResult:
+def _detect(frames: Tensor, timing: rsvib_torch.SensorTiming, config: Config) -> detection.DetectionResult:
     with working("detecting the vibration"):
-        return detection.detect_vibration(stack.frames, stack.timing, **config.detection)
-
-
-def _restore(
-    stack: Stack, motion: Motion | DetectedVibration, options: Table, force: bool, output: str = "frames"
-) -> stacks.RestoredFrames:
-    """Restore frames, and judge the result on eight pairs of frames; ``output`` names what will be written."""
-    with working("restoring and judging"):
-        result = stacks.restore_trusted(stack.frames, stack.timing, motion, options, force=force, most_pairs=8)
-    answers.warn_of_restoration(result, output)
-    return result
+        return detection.detect_vibration(frames, timing, **config.detection)
 
 
 @options
@@ -181,8 +162,8 @@ def detect(given: DetectOptions) -> Answer:
         if many:
             print_notes(info, settings)
         else:
-            stack = load(given)
-            result = _detect(stack, settings)
+            pixels, timing = load(given)
+            result = _detect(pixels, timing, settings)
             may_change = windows.get("follow") is not False and stacks.may_change(result, count)
         if many or may_change:
             stored = _detect_windows(given, info, folder / "manifest.json", windows)
@@ -193,7 +174,7 @@ def detect(given: DetectOptions) -> Answer:
             else:
                 result = None
         if result is not None:
-            names = answers.write_detection(folder, result, stack.timing, given.pixel_size)
+            names = answers.write_detection(folder, result, timing, given.pixel_size)
             answer = answers.stack_answer(frames, result, given.pixel_size)
             answer.next_steps += answers.steps_after_detection(result, frames, settings, out / "vibration.json")
         else:
@@ -251,60 +232,60 @@ def restore_frames(given: RestoreOptions) -> Answer:
     unchanged, unless --force is given.
     """
     settings, frames, restored, report = given.settings, given.stack, given.restored, given.report
-    outputs, inputs = io.stack_files(restored), [*given.inputs, given.vibration]
-    shared.check_new([*outputs, *([] if report is None else [report])], given.overwrite, inputs)
+    manifest = restored.with_name(f"{restored.name}.manifest.json")
+    outputs = [*io.stack_files(restored), manifest, *([] if report is None else [report])]
+    shared.check_new(outputs, given.overwrite, [*given.inputs, given.vibration])
     check_regular(given.vibration)
     with given.vibration.open("rb") as file:
-        is_manifest = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
-    if is_manifest:
+        of_windows = b'"rsvib stack"' in file.read(200)  # bytes; the format is the first key of either file
+    info, scale, options = given.planned_restoration(given.restoration)
+    detected = None
+    detections: list[DetectedVibration | None] = []
+    if of_windows:
         if report is not None:
             raise ValueError("--report needs a vibration.json; the verdict on each window is in its manifest.json")
-        shared.check_new([*outputs, restored.with_name(f"{restored.name}.manifest.json")], given.overwrite, inputs)
-        return _restore_windows(given)
-    info, scale, options = given.planned_restoration(given.restoration)
-    detected = reports.read_vibration(given.vibration, io.timing_from_first_frame(settings.timing, info))
-    io.check_stack_target(restored, shared.restored_shape(info, options), dtype=info.dtype, full_scale=scale, like=info)
+        window, detections = _detected_windows(given.vibration, settings.timing)
+    else:
+        timing = io.timing_from_first_frame(settings.timing, info)
+        detected, window = reports.read_vibration(given.vibration, timing), max(2, info.shape[0])
+        stacks.check_stack_fits(info, options, on_gpu=given.torch_device.type != "cpu")
+    shape = shared.restored_shape(info, options)
+    io.check_stack_target(restored, shape, dtype=info.dtype, full_scale=scale, like=info)
     if report is not None:
         check_writable(report)
-    stack = load(given, options)
-    result = _restore(stack, detected, options, given.force)
-    images = result.frames if info.nodata is None else stacks.without_data(result.frames, stack.frames)
-    with working(f"writing {restored.name}"):
-        io.write_stack(restored, images, dtype=info.dtype, full_scale=scale, like=stack.info)
-    not_kept = io.metadata_not_kept(stack.info, restored, tuple(images.shape))
-    answers.note_lost(restored, not_kept)
-    if report is not None:
-        reports.write_restoration(report, result, options, not_kept)
-    return Answer(
-        {"Vibration": [detected.summary()], "Restoration": answers.restoration_lines(result, len(stack.frames))},
-        {"detection": detected.to_dict(), "restoration": reports.restoration_data(result)},
-        [restored, *([] if report is None else [report])],
-        [answers.page_step(frames, frames.with_name("report"), settings)] * result.restored,
-    )
+    print_notes(info, settings)
+    common = given.of_stack(scale, options) | {"force": given.force, "window": window}
+    common["given"] = detections or [detected]
+    with working(f"restoring {frames.name}", counts=of_windows) as progress:
+        common["progress"] = progress if of_windows else None
+        run = stacks.process_stack(frames, restored, settings.timing, **common)
+    lines, data = answers.restoration_of(run, restored)
+    files, first = [restored, manifest], None if run.first is None else run.first.restoration
+    if detected is None:
+        answer = answers.windows_answer("Vibration", stacks.read_manifest(manifest))
+    else:
+        answer = Answer({"Vibration": [detected.summary()]}, {"detection": detected.to_dict()})
+        answer.next_steps += [answers.page_step(frames, frames.with_name("report"), settings)] * run.restored
+    answer.results["Restoration"], answer.data["restoration"] = lines, data
+    if report is not None and first is not None:
+        reports.write_restoration(report, first, options, run.not_kept)
+        files.append(report)
+    answer.files += files
+    return answer
 
 
-def _restore_windows(given: RestoreOptions) -> Answer:
-    """Restore a stack with the detections of its windows."""
-    vibration, timing = given.vibration, given.settings.timing
-    manifest = stacks.read_manifest(vibration)
+def _detected_windows(path: Path, timing: rsvib_torch.SensorTiming) -> tuple[int, list[DetectedVibration | None]]:
+    """Number of frames of the windows of a manifest, and their detections, with the timing of the frames."""
+    manifest = stacks.read_manifest(path)
     stored = manifest.timing
     if timing.frame_start_times is None:  # frame times of the file were stored with the detection
         timing = replace(timing, frame_start_times=stored.frame_start_times)
-    reports.check_same_timing(str(vibration), stored, timing)
+    reports.check_same_timing(str(path), stored, timing)
     window = manifest.settings.get("window")
     if not isinstance(window, int) or any(record.followed is not None for record in manifest.windows):
         followed = "its vibration was followed from frame to frame, and is not that of windows"
-        raise ValueError(f"{vibration}: {followed}; repeat rsvib run, or detect the windows (rsvib detect --window 8)")
-    info, scale, options = given.planned_restoration(given.restoration)
-    print_notes(info, given.settings)
-    common = given.of_stack(scale, options) | {"force": given.force, "window": window}
-    common["given"] = manifest.detections()
-    with working(f"restoring {given.stack.name}", counts=True) as progress:
-        result = stacks.process_stack(given.stack, given.restored, given.settings.timing, **common, progress=progress)
-    answers.note_lost(given.restored, result.not_kept)
-    answer = answers.windows_answer("Vibration", stacks.read_manifest(result.manifest), result)
-    answer.files += [given.restored, result.manifest]
-    return answer
+        raise ValueError(f"{path}: {followed}; repeat rsvib run, or detect the windows (rsvib detect --window 8)")
+    return window, manifest.detections()
 
 
 @options
@@ -337,9 +318,11 @@ def report(given: ReportOptions) -> Answer:
         made = given.manifest.with_name(windows.output["name"])
         if windows.totals()["restored"] and made.exists():
             return _report_of_run(given, windows, made)
-    stack = load(given, options)
-    detection = _detect(stack, settings)
-    result = _restore(stack, detection, options, given.force, "page")
+    pixels, timing = load(given, options)
+    detection = _detect(pixels, timing, settings)
+    with working("restoring and judging"):
+        result = stacks.restore_trusted(pixels, timing, detection, options, force=given.force, most_pairs=8)
+    answers.warn_of_restoration(result, "page")
     pattern = options.get("mosaic")
     steps = []
     if result.restored:
@@ -348,7 +331,7 @@ def report(given: ReportOptions) -> Answer:
         forced = ("report", frames, out.with_name(f"{out.name}_forced"), *settings.arguments, "--force")
         steps = [answers.next_step("inspect the restored frames nevertheless", *forced)]
     steps += answers.steps_after_detection(detection, frames, settings)
-    answer = answers.stack_answer(frames, detection, None, result, len(stack.frames))
+    answer = answers.stack_answer(frames, detection, None, result, len(pixels))
     if windows is not None and windows.output is not None:  # restored by windows, here as a whole
         title = "Restoration of the page, of one vibration in all frames"
         answer.results[title] = answer.results.pop("Restoration")
@@ -358,10 +341,10 @@ def report(given: ReportOptions) -> Answer:
         given,
         windows,
         answer,
-        frames=stack.frames if pattern is None else preparation.colour_frames(stack.frames, pattern),
+        frames=pixels if pattern is None else preparation.colour_frames(pixels, pattern),
         restored=result.frames,
         was_restored=result.restored,
-        timing=stack.timing,
+        timing=timing,
         detection=detection,
         verdict=result.verdict,
         left_alone=result.left_alone,

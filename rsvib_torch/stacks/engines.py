@@ -111,8 +111,9 @@ def compute_with_dask(
 
         def submit(window: Window) -> tuple[Any, Window]:
             # the job is sent with every task: scattered data are lost with the worker that holds them
-            task = client.submit(_compute_on_worker, job.of_window(window), window, one_thread, retries=3, pure=False)
-            return task, window
+            given = None if job.given is None else {window.index: job.given[window.index]}
+            of_window = replace(job, given=given)
+            return client.submit(_compute_on_worker, of_window, window, one_thread, retries=3, pure=False), window
 
         def capacity() -> int:
             return 2 * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))

@@ -3,10 +3,10 @@
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -31,7 +31,6 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import (
     BadFrames,
     OptionTable,
-    ProcessStackOptions,
     RestorationOptions,
     StackDetectionOptions,
     StackOptions,
@@ -49,7 +48,7 @@ from rsvib_torch.stacks.window_restoration import (
     restore_trusted,
     without_data,
 )
-from rsvib_torch.stacks.windows import Window, cut_windows, window_record, window_timing
+from rsvib_torch.stacks.windows import Window, WindowRecord, cut_windows, window_timing
 from rsvib_torch.tracking.following import follow_vibration
 
 WindowFrames = list[Array | str]  # pixels as stored, or why a frame cannot be read
@@ -69,7 +68,13 @@ class WindowResult(Summarised):
     restoration: RestoredFrames | None  # None without a detection
     error: str | None  # why detection or restoration failed
     bad_frames: Mapping[int, str]  # frames of ``window.written`` that could not be used; they are not in ``frames``
-    unchanged: tuple[int, ...] = ()  # indices of frames of a restored window that are as taken: unknown motion
+
+    @property
+    def changed(self) -> dict[int, Tensor]:
+        """The restored frames by index, without those that are as taken because their motion is unknown."""
+        as_taken = () if self.restoration is None else self.restoration.as_taken
+        frames = enumerate(zip(self.indices, self.frames, strict=True)) if self.restored else ()
+        return {index: frame for number, (index, frame) in frames if number not in as_taken}
 
     def summary(self) -> str:
         """Frames of the window, its vibration, and what was restored."""
@@ -86,10 +91,10 @@ class WindowResult(Summarised):
 
 @dataclass(frozen=True, eq=False)
 class StoredWindow:
-    """Frames of a window as they are stored, and the content of its ``WindowRecord``."""
+    """Frames of a window as they are stored, and its record."""
 
     frames: list[Array]
-    record: Table
+    record: WindowRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +105,9 @@ class StackJob:
     info: StackInfo  # what its file states
     timing: SensorTiming  # timing of the whole stack
     full_scale: float | None  # count that corresponds to 1.0; None for floats
-    detection: Mapping[str, Any] = field(default_factory=dict)  # options of ``detect_vibration``
+    detection: OptionTable = None  # options of ``detect_vibration``
     # options of ``restore``, for frames whose full scale is 1; None for detection only
-    restoration: OptionTable = field(default_factory=dict)
+    restoration: OptionTable = None
     # detections to use instead, by number of the window; None where a window has none
     given: Mapping[int, DetectedVibration | None] | None = None
     motion: FreeMotion | None = None  # motion of all frames to use instead, from the start of the first one
@@ -136,10 +141,6 @@ class StackJob:
         rate = out.frame_rate or timing.frame_rate
         return replace(out, full_scale=self.full_scale, frame_times=times, time_error=0.0, frame_rate=rate)
 
-    def of_window(self, window: Window) -> "StackJob":
-        """The job with only those given detections that ``window`` needs."""
-        return self if self.given is None else replace(self, given={window.index: self.given[window.index]})
-
     def compute(self, window: Window, pixels: WindowFrames) -> WindowResult:
         """Detect the vibration in a window, restore its frames and judge the result."""
         usable, faults = self._usable(window, pixels)
@@ -161,7 +162,7 @@ class StackJob:
             elif self.given is not None:
                 found = detection = self.given[window.index]
             else:
-                found = detection = detect_vibration(frames, timing, **self.detection)
+                found = detection = detect_vibration(frames, timing, **self.detection or {})
                 if self.follow == "auto" and may_change(detection, len(usable)):
                     followed = self._followed(as_taken, usable)
                     reliable = followed.detection is not None and followed.detection.reliable.double().mean(0).sum()
@@ -181,18 +182,23 @@ class StackJob:
             )
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, detection=detection, error=" ".join(str(error).split()))
-        one_image = self.chosen.joint is True and restoration.restored
-        restored = restoration.frames if one_image else restoration.frames[: len(kept)]
-        if self.info.nodata is not None:
-            restored = without_data(restored, frames if one_image else frames[: len(kept)])
-        return replace(
-            as_taken,
-            indices=() if one_image else kept,
-            frames=restored if restoration.restored else as_taken.frames,
-            restored=restoration.restored,
-            detection=detection,
-            restoration=restoration,
-        )
+        if self.chosen.joint is True and restoration.restored:  # one image of all frames
+            as_taken, kept = replace(as_taken, indices=()), tuple(inside)
+        return self._restored(as_taken, frames[: len(kept)], detection, restoration)
+
+    def _restored(
+        self,
+        as_taken: WindowResult,
+        taken: Tensor,
+        detection: DetectionResult | DetectedVibration | None,
+        restoration: RestoredFrames,
+    ) -> WindowResult:
+        """The result of a window whose frames were restored, from those frames as taken."""
+        result = replace(as_taken, restored=restoration.restored, detection=detection, restoration=restoration)
+        if not restoration.restored:
+            return result
+        frames = restoration.frames if not as_taken.indices else restoration.frames[: len(as_taken.indices)]
+        return replace(result, frames=frames if self.info.nodata is None else without_data(frames, taken))
 
     def _motion_of(self, window: Window) -> FreeMotion:
         """The given motion in a window, with the time origin at its first frame."""
@@ -234,20 +240,10 @@ class StackJob:
                 return replace(as_taken, detection=followed)
             frames = as_taken.frames
             timing = window_timing(self.timing, window, kept)
-            restoration, left = restore_followed(frames, timing, followed, self.restoration, force=self.force)
+            restoration = restore_followed(frames, timing, followed, self.restoration, force=self.force)
         except (ValueError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             return replace(as_taken, error=" ".join(str(error).split()))
-        restored = restoration.frames
-        if self.info.nodata is not None:
-            restored = without_data(restored, frames)
-        return replace(
-            as_taken,
-            frames=restored,
-            restored=restoration.restored,
-            detection=followed,
-            restoration=restoration,
-            unchanged=tuple(kept[number] for number in left),
-        )
+        return self._restored(as_taken, frames, followed, restoration)
 
     def stored(self, result: WindowResult, pixels: WindowFrames) -> StoredWindow:
         """The frames of a result as they are stored: frames that were not restored are unchanged.
@@ -263,10 +259,9 @@ class StackJob:
             frames = list(counts(result.frames))
             return StoredWindow(frames, self.record(result, len(frames)))
         written = list(result.window.written)
-        restored = dict(zip(result.indices, result.frames, strict=True)) if result.restored else {}
-        frames = []
+        restored, frames = result.changed, []
         for index in [written[len(written) // 2]] if self.chosen.joint is True else written:
-            if index in restored and index not in result.unchanged:
+            if index in restored:
                 frames.append(counts(restored[index]))
             elif self.bad_frames == "pass" or index not in result.bad_frames:
                 frame = pixels[index - result.window.frames.start]
@@ -278,24 +273,24 @@ class StackJob:
                 frames.append(frame)
         return StoredWindow(frames, self.record(result, len(frames)))
 
-    def record(self, result: WindowResult, written: int) -> Table:
-        """Content of the ``WindowRecord`` of a result of which ``written`` frames were written."""
+    def record(self, result: WindowResult, written: int) -> WindowRecord:
+        """The record of a result of which ``written`` frames were written."""
         window, restoration = result.window, result.restoration
         followed = result.indices if isinstance(result.detection, FollowedVibration) else None
-        return window_record(
+        return WindowRecord.of(
             None if restoration is None else restoration.verdict,
             result.bad_frames,
+            result.detection,
             restored=result.restored,
             window=window.index,
             first=window.first,
             last=window.last,
             start_time=float(self.timing.frame_starts(window.first + 1)[-1]),
             written=written,
-            detection=result.detection and DetectedVibration.of(result.detection),
             left_alone=() if restoration is None else restoration.left_alone,
             error=result.error,
             followed=followed,
-            restored_frames=None if followed is None else result.restored * len({*followed} - {*result.unchanged}),
+            restored_frames=None if followed is None else len(result.changed),
         )
 
 
@@ -334,17 +329,17 @@ def single_frame_options(restoration: OptionTable) -> Table:
     return {name: value for name, value in (restoration or {}).items() if name not in _TOGETHER}
 
 
-def _follows(
-    options: StackDetectionOptions, restoration: OptionTable, detection: OptionTable, given: object
-) -> bool | Literal["auto"]:
+def _follows(stated: Table) -> bool | Literal["auto"]:
     """Whether it is followed; ``"auto"`` is not where options are given that frames one by one do not have."""
-    if options.follow is True:
-        if detection or given is not None:
+    follow: bool | Literal["auto"] = stated["follow"]
+    is_known = bool(stated["detection"]) or any(stated.get(name) is not None for name in ("given", "motion"))
+    if follow is True:
+        if is_known:
             raise ValueError("follow=True has no options of detection, and no given detections")
-        single_frame_options(restoration)
-    elif options.follow == "auto":
-        return False if detection or given is not None or options_of_windows(restoration) else "auto"
-    return options.follow
+        single_frame_options(stated.get("restoration"))
+    elif follow == "auto" and (is_known or options_of_windows(stated.get("restoration"))):
+        return False
+    return follow
 
 
 def plan_job(
@@ -356,38 +351,24 @@ def plan_job(
     computed ``here``, on this machine.
     """
     info = read_stack_info(source)
-    full_scale = None
-    if info.is_integer:
-        stated = info.full_scale if options.full_scale is None else options.full_scale
-        full_scale = scales.required_full_scale(stated, np.dtype(info.dtype), source)
+    full_scale = info.full_scale if options.full_scale is None else options.full_scale
+    full_scale = scales.required_full_scale(full_scale, np.dtype(info.dtype), source) if info.is_integer else None
     timing = timing_of_stack(timing, info)
     timing.frame_starts(info.shape[0])  # raises an error if there are too few frame start times
     timing.check_rows(info.shape[int(timing.scan_axis)])
-    detection = dict(options.detection or {})
-    VibrationOptions(**detection)  # raises an error for wrong ones
+    VibrationOptions(**options.detection or {})  # raises an error for wrong ones
     check_choice("device", options.device.partition(":")[0], ("auto", "cpu", "cuda"))
     default = "cuda" if torch.cuda.is_available() else "cpu"
     device = default if options.device == "auto" else options.device
     on_gpu = device != "cpu"
-    restored = options if isinstance(options, StackOptions) else None
-    run = options if isinstance(options, ProcessStackOptions) else ProcessStackOptions()
-    restoration = None if restored is None else dict(restored.restoration or {})
-    follow = _follows(options, restoration, detection, run.given if run.motion is None else run.motion)
-    job = StackJob(
-        Path(source),
-        info,
-        timing,
-        full_scale,
-        detection,
-        restoration,
-        given=None if run.given is None else dict(enumerate(run.given)),
-        motion=run.motion,
-        bad_frames=run.bad_frames,
-        force=restored is not None and restored.force,
-        device=device,
-        window=options.window,
-        follow=follow,
-    )
+    names = [field.name for field in fields(StackJob)]  # many of which are options
+    stated: Table = {name: getattr(options, name) for name in names if hasattr(options, name)}
+    if isinstance(options, StackOptions):
+        stated["restoration"] = options.restoration or {}
+    if stated.get("given") is not None:
+        stated["given"] = dict(enumerate(stated["given"]))
+    stated |= {"full_scale": full_scale, "device": device, "follow": _follows(stated)}
+    job = StackJob(Path(source), info, timing, **stated)
     if job.chosen.mosaic is not None:
         check_mosaic(job.chosen.mosaic, info.shape, str(source))
     check_optics(job.chosen.optics)
@@ -402,7 +383,7 @@ def plan_job(
     if not here:  # the memory of other machines is not known
         return job, windows, most
     at_once = windows_at_once(
-        info, job.window, memory=options.memory, most=most, restoration=restoration, on_gpu=on_gpu, margin=margin
+        info, job.window, memory=options.memory, most=most, restoration=job.restoration, on_gpu=on_gpu, margin=margin
     )
     return job, windows, at_once
 
@@ -464,6 +445,6 @@ def restore_block(
     if frames.dtype.kind != "f":
         scale = scales.required_full_scale(scale, frames.dtype, "frames")
     info = StackInfo(stored.shape, stored.dtype.name, scale)
-    job = StackJob(Path("frames"), info, timing, scale, detection or {}, options, force=force, device=device)
+    job = StackJob(Path("frames"), info, timing, scale, detection, options, force=force, device=device)
     window, pixels = Window(0, 0, len(stored) - 1, len(stored)), list(stored)
     return np.moveaxis(np.stack(job.stored(job.compute(window, pixels), pixels).frames), -3, axis)

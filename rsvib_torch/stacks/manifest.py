@@ -31,7 +31,7 @@ from rsvib_torch.results.presentation import (
 from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks.job import StackJob
 from rsvib_torch.stacks.windows import WindowRecord
-from rsvib_torch.text import json_text, measured_text, number_of, text_table, wrapped
+from rsvib_torch.text import measured_text, number_of, text_table, wrapped
 
 
 def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[str, tuple[float, ...]]:
@@ -41,8 +41,20 @@ def rms_shaking(parts: Iterable[dict[str, tuple[float, ...]] | None]) -> dict[st
     return {name: tuple(np.sqrt(np.square([part[name] for part in known]).mean(0)).tolist()) for name in names}
 
 
+_UNITS = {
+    "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
+    "amplitude": "px",
+    "frequency": "Hz",
+    "period": "s",
+    "phase": "rad at start_time",
+    "image_motion": "px/s",
+    "image_acceleration": "px/s^2",
+    "residual": "px",
+}
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class StackManifest(Result, file_format="rsvib stack"):
+class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
     """Content of ``manifest.json``."""
 
     input: Table  # name, size and hash of the stack
@@ -101,8 +113,7 @@ class StackManifest(Result, file_format="rsvib stack"):
             if record.followed is not None and record.detection is not None:
                 found = [(frame, record.detection[number]) for number, frame in enumerate(record.followed)]
             for frame, detection in found:
-                one = record.middle if frame is None else frame
-                ends = (record.first, record.last) if one is None else (one, one)
+                ends = (record.first, record.last) if frame is None else (frame, frame)
                 middle = None if starts is None else 0.5 * (starts[ends[0]] + starts[ends[1]]) + half_frame
                 yield record, frame, detection, middle
 
@@ -309,7 +320,7 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
             "full_scale": job.full_scale,
             "window": job.window,
             "follow": job.follow,
-            "detection": dict(job.detection),
+            "detection": dict(job.detection or {}),
             "restoration": None if job.restoration is None else dict(job.restoration),
             "given": given,
             "bad_frames": job.bad_frames,
@@ -323,24 +334,11 @@ def manifest_header(job: StackJob, output: str | None, compression: str | None) 
     return copy
 
 
-_UNITS = {
-    "start_time": "s, of the first row of the first frame of a window, the time origin of its detection",
-    "amplitude": "px",
-    "frequency": "Hz",
-    "period": "s",
-    "phase": "rad at start_time",
-    "image_motion": "px/s",
-    "image_acceleration": "px/s^2",
-    "residual": "px",
-}
-
-
-def manifest_text(header: Table, records: Iterable[Table], not_kept: Sequence[str] = (), **results: Any) -> str:
-    """A manifest as JSON, from the content of its ``WindowRecord``s."""
-    windows = list(records)
-    bad = {index: reason for record in windows for index, reason in record["bad_frames"].items()}
-    stated = {"format": "rsvib stack", "version": 1, **header, "units": _UNITS}
-    return json_text({**stated, "windows": windows, "bad_frames": bad, "not_kept": list(not_kept), **results}) + "\n"
+def stack_manifest(header: Table, records: Iterable[WindowRecord], **results: Any) -> StackManifest:
+    """The manifest of a run, from its header and the records of all windows."""
+    windows = tuple(records)
+    bad = {index: reason for record in windows for index, reason in record.bad_frames.items()}
+    return StackManifest(**header, bad_frames=bad, windows=windows, **results)
 
 
 @checks_arguments

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsvib_torch.files.atomic import check_outputs, whole_file
+from rsvib_torch.files.atomic import check_outputs, check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.frames.entry_points import file_options, source_options
 from rsvib_torch.io.stack_reading import PathLike
@@ -18,7 +18,7 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import DetectStackOptions, ProcessStackOptions, Progress, StackOptions
 from rsvib_torch.stacks.engines import compute_here, compute_with_dask
 from rsvib_torch.stacks.job import StoredWindow, WindowFrames, WindowResult, plan_job
-from rsvib_torch.stacks.manifest import manifest_header, manifest_text
+from rsvib_torch.stacks.manifest import manifest_header, stack_manifest
 from rsvib_torch.stacks.run_folder import RunFolder, StackReport, check_space, run_to_file
 from rsvib_torch.stacks.windows import Window
 
@@ -70,11 +70,10 @@ def detect_stack(source: PathLike, sink: PathLike, timing: SensorTiming, options
     """
     job, windows, at_once = plan_job(source, timing, options)
     check_outputs([sink], stack_files(source))
-
+    check_writable(Path(sink))
     results = compute_here(job, windows, lambda result, _: StoredWindow([], job.record(result, 0)), at_once=at_once)
-    with whole_file(sink) as part:
-        records = (stored.record for stored in _watched(results, windows, windows, [], options.progress))
-        part.write_text(manifest_text(manifest_header(job, None, None), records), encoding="utf-8")
+    records = (stored.record for stored in _watched(results, windows, windows, [], options.progress))
+    stack_manifest(manifest_header(job, None, None), records).save(sink)
 
 
 @file_options(ProcessStackOptions)
@@ -146,6 +145,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
         return job.stored(result, pixels)
 
     def compute(folder: RunFolder) -> Table:
+        nonlocal out
         remaining = [window for window in windows if window.index not in folder]
         frames = len(remaining) if joined else sum(window.kept for window in remaining)
         # the finished windows and the output are on the disk together, until the output is complete
@@ -155,11 +155,12 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
             results = compute_here(job, remaining, finish, at_once=at_once)
         else:
             results = compute_with_dask(job, remaining, scheduler=scheduler, workers=at_once)
-        errors = [record["error"] for record in folder.records()]
+        errors = [record.error for record in folder.records()]
         for stored in _watched(results, windows, remaining, errors, options.progress, folder.remove):
             # channels may be stored last
             folder.add(stored.record, array=np.ascontiguousarray(np.stack(stored.frames)) if stored.frames else None)
-        return {"not_kept": metadata_not_kept(job.info, sink, (folder.written, *out.shape[1:]))}
+        out = out.with_frames(folder.written)
+        return {"not_kept": metadata_not_kept(job.info, sink, out.shape)}
 
     def stored(folder: RunFolder) -> Iterator[Array]:
         for name in folder.files():
@@ -167,7 +168,7 @@ def process_stack(source: PathLike, sink: PathLike, timing: SensorTiming, option
                 yield from np.load(file, allow_pickle=False)
 
     def write(folder: RunFolder) -> None:
-        write_frames(form, sink, out.with_frames(folder.written), stored(folder), compression)
+        write_frames(form, sink, out, stored(folder), compression)
 
     report = run_to_file(
         sink,
@@ -199,7 +200,7 @@ def _watched(
         progress(done, total)
     with closing(results):
         for window, stored in zip(remaining, results, strict=True):
-            errors.append(stored.record["error"])
+            errors.append(stored.record.error)
             if len(errors) >= min(_MAX_INITIAL_FAILURES, len(windows)) and all(errors):
                 fail()
                 raise ValueError(errors[0])

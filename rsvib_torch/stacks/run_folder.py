@@ -22,9 +22,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Literal
 
 import numpy as np
 
@@ -36,9 +35,11 @@ from rsvib_torch.files.reading import Table
 from rsvib_torch.io.stack_writing import stack_files
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.options import RunOptions
-from rsvib_torch.results.presentation import Summarised
+from rsvib_torch.results.presentation import Summarised, plain_values
+from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks.job import WindowResult
-from rsvib_torch.stacks.manifest import manifest_text, read_manifest
+from rsvib_torch.stacks.manifest import StackManifest, read_manifest, stack_manifest
+from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.text import number_of, one_line
 
 _JOURNAL = "journal"
@@ -81,7 +82,7 @@ class RunFolder:
 
     def __init__(self, sink: Path, header: Mapping[str, object], *, resume: bool) -> None:
         self.sink, self.path, self._above = sink, work_folder(sink), nearest_folder(sink)
-        self._windows: dict[int, tuple[int, int, int]] = {}  # finished: place and size of the line; frames
+        self._windows: dict[int, bytes] = {}  # finished: record and hashes of the files as JSON
         self._digest = b""  # of the last line of the journal
         atomic.make_folder(self.path.parent)
         while not self._open():
@@ -89,9 +90,7 @@ class RunFolder:
         with ExitStack() as opened:
             opened.callback(os.close, self._folder)
             names = self._checked_names()
-            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | _SAFELY
-            self._journal = os.open(_JOURNAL, flags, 0o600, dir_fd=self._folder)
-            opened.callback(os.close, self._journal)
+            self._journal = opened.enter_context(self._file(_JOURNAL, "a+b"))
             self._read_journal(dict(header), names, resume=resume)
             self._opened = opened.pop_all()
 
@@ -147,25 +146,29 @@ class RunFolder:
                 raise self._refusal("it has another name than files of a run", name)
         return names
 
+    def _file(self, name: str, mode: Literal["rb", "x+b", "a+b"]) -> IO[bytes]:
+        """Open a file of the folder, wherever the folder is now, and never through a link."""
+        return open(name, mode, opener=lambda name, flags: os.open(name, flags | _SAFELY, 0o600, dir_fd=self._folder))
+
     def _read_journal(self, header: Table, names: Iterable[str], *, resume: bool) -> None:
         """Find the windows whose files are as they were written; a journal without windows begins anew."""
         start_over = f"delete {self.path} to start over"
+        damaged = ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
         stored, end = None, 0
-        with self.open(_JOURNAL) as lines:
-            for line in lines:
-                if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
-                    break
-                digest, _, body = line[:-1].partition(b" ")
-                if digest != _keyed(body, self._digest):
-                    raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
-                entry = json.loads(body)
-                if end == 0:
-                    stored = entry
-                else:
-                    self._windows[entry["record"]["window"]] = end, len(line), entry["record"]["written"]
-                self._digest, end = digest, end + len(line)
+        self._journal.seek(0)
+        for line in self._journal:
+            if not line.endswith(b"\n") or b"\0" in line:  # it was not yet on the disk
+                break
+            digest, _, body = line[:-1].partition(b" ")
+            if digest != _keyed(body, self._digest):
+                raise damaged
+            if end == 0:
+                stored = json.loads(body)
+            else:
+                self._windows[json.loads(body)["record"]["window"]] = body
+            self._digest, end = digest, end + len(line)
         if end == 0 and set(names) > {_JOURNAL}:
-            raise ValueError(f"{self.path / _JOURNAL} is damaged; {start_over}")
+            raise damaged
         if not self._windows:
             end, self._digest = 0, b""
         elif not resume:
@@ -175,65 +178,57 @@ class RunFolder:
             )
         elif difference := _difference(stored, header):
             raise ValueError(f"{self.sink}: cannot resume: {difference}; {start_over}")
-        os.ftruncate(self._journal, end)
+        self._journal.truncate(end)
         if not self._windows:
             self._append(header)
             os.fsync(self._folder)
-        for window in list(self._windows):
+        for window, body in list(self._windows.items()):
             whole = False  # whether its files are those that were written
             with suppress(OSError):
-                whole = all(self._digest_of(name) == digest for name, digest in self._entry(window)["files"].items())
+                whole = all(self._digest_of(name) == digest for name, digest in json.loads(body)["files"].items())
             if not whole:
                 del self._windows[window]
 
-    def _entry(self, window: int) -> Table:
-        """The line of a window, which is not kept in memory."""
-        place, size, _ = self._windows[window]
-        entry: Table = json.loads(os.pread(self._journal, size, place).partition(b" ")[2])
-        return entry
-
-    def _append(self, entry: Mapping[str, object]) -> tuple[int, int]:
-        """Write a line of the journal, which is on the disk when the function returns; its place and size."""
+    def _append(self, entry: Mapping[str, object]) -> bytes:
+        """Write a line of the journal, which is on the disk when the function returns, and return it as JSON."""
         body = json.dumps(entry).encode()
         self._digest = _keyed(body, self._digest)
-        line = self._digest + b" " + body + b"\n"
-        place, remaining = os.fstat(self._journal).st_size, memoryview(line)
-        while remaining:
-            remaining = remaining[os.write(self._journal, remaining) :]
-        os.fsync(self._journal)
-        return place, len(line)
+        self._journal.write(self._digest + b" " + body + b"\n")
+        self._journal.flush()
+        os.fsync(self._journal.fileno())
+        return body
 
     def _digest_of(self, name: str, *, synchronised: bool = False) -> str:
         with self.open(name) as file:
             if synchronised:
                 os.fsync(file.fileno())
-            return hashlib.file_digest(file, _blake2b).hexdigest()
+            return hashlib.file_digest(file, _blake2b).hexdigest()  # type: ignore[arg-type]
 
-    def create(self, name: str) -> BinaryIO:
+    def create(self, name: str) -> IO[bytes]:
         """A new file of a window, whose name begins with the number of the window in six digits."""
         with suppress(FileNotFoundError):
             os.unlink(name, dir_fd=self._folder)
-        return os.fdopen(os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | _SAFELY, 0o600, dir_fd=self._folder), "w+b")
+        return self._file(name, "x+b")
 
-    def open(self, name: str) -> BufferedReader:
+    def open(self, name: str) -> IO[bytes]:
         """A file of the folder for reading."""
-        return os.fdopen(os.open(name, os.O_RDONLY | _SAFELY, dir_fd=self._folder), "rb")
+        return self._file(name, "rb")
 
-    def add(self, record: Table, names: Sequence[str] = (), array: Array | None = None) -> None:
-        """Enter the ``WindowRecord`` of a window with its closed files, and an array, which becomes the last of them.
+    def add(self, record: WindowRecord, names: Sequence[str] = (), array: Array | None = None) -> None:
+        """Enter the record of a window with its closed files, and an array, which becomes the last of them.
 
         It is on the disk when the function returns.
         """
         names = list(names)
         with disk_errors_named(self):
             if array is not None:
-                names.append(f"{record['window']:06d}.npy")
+                names.append(f"{record.window:06d}.npy")
                 with self.create(names[-1]) as file:
                     np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
                     file.write(array.data)  # errors of np.save do not contain the reason
             digests = {name: self._digest_of(name, synchronised=True) for name in names}
             os.fsync(self._folder)  # their names
-            self._windows[record["window"]] = *self._append({"record": record, "files": digests}), record["written"]
+            self._windows[record.window] = self._append({"record": plain_values(record), "files": digests})
 
     def __contains__(self, window: int) -> bool:
         return window in self._windows
@@ -246,15 +241,18 @@ class RunFolder:
     @property
     def written(self) -> int:
         """Number of their frames."""
-        return sum(frames for *_, frames in self._windows.values())
+        return sum(entry["record"]["written"] for entry in self._entries())
 
-    def records(self) -> Iterator[Table]:
+    def _entries(self) -> Iterator[Table]:
+        return (json.loads(self._windows[window]) for window in sorted(self._windows))
+
+    def records(self) -> Iterator[WindowRecord]:
         """Records of the finished windows in order."""
-        return (self._entry(window)["record"] for window in sorted(self._windows))
+        return (decode(WindowRecord, entry["record"], _JOURNAL) for entry in self._entries())
 
     def files(self) -> Iterator[str]:
         """Names of the files of the finished windows in order."""
-        return (name for window in sorted(self._windows) for name in self._entry(window)["files"])
+        return (name for entry in self._entries() for name in entry["files"])
 
     def remove(self) -> None:
         """Remove the folder, and the empty folders above it that were created for it.
@@ -364,48 +362,48 @@ def run_to_file(
 ) -> StackReport:
     """Compute the windows of a run that are not finished, and write the output and its manifest; neither is an input.
 
-    ``compute`` adds the missing windows to the folder and returns further keys of the manifest, among them the metadata
-    that are ``not_kept``; ``write`` writes the output from the folder.
+    ``compute`` adds the missing windows to the folder and returns further fields of the manifest; ``write`` writes the
+    output from the folder.
     """
     start = time.perf_counter()
-    manifest = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
-    check_outputs([*stack_files(sink), work_folder(sink), manifest], inputs)
+    path = sink.with_name(f"{sink.name}.manifest.json") if options.manifest is None else Path(options.manifest)
+    check_outputs([*stack_files(sink), work_folder(sink), path], inputs)
 
-    def report(windows_done: Iterable[Table], resumed: int, lost: Sequence[str]) -> StackReport:
-        records = list(windows_done)
+    def report(manifest: StackManifest, resumed: int) -> StackReport:
+        records = manifest.windows
         return StackReport(
-            frames=sum(record["written"] for record in records),
+            frames=sum(record.written for record in records),
             windows=windows,
-            restored=sum(record["frames"] == "restored" for record in records),
-            failed=sum(record["error"] is not None for record in records),
-            bad_frames=sum(len(record["bad_frames"]) for record in records),
+            restored=sum(record.frames == "restored" for record in records),
+            failed=sum(record.error is not None for record in records),
+            bad_frames=len(manifest.bad_frames),
             resumed=resumed,
             seconds=time.perf_counter() - start,
             first=None,
-            manifest=manifest,
-            not_kept=tuple(lost),
+            manifest=path,
+            not_kept=manifest.not_kept,
         )
 
-    if options.resume and not work_folder(sink).exists() and sink.exists() and manifest.exists():
-        complete = read_manifest(manifest)
+    if options.resume and not work_folder(sink).exists() and sink.exists() and path.exists():
+        complete = read_manifest(path)
         difference = _difference({name: getattr(complete, name) for name in header}, header)
         if difference:
             raise ValueError(f"{sink}: cannot resume: {difference}; omit resume to replace the output")
-        for path in (sink, manifest):
-            atomic.remove_abandoned(path)
-        return report(map(vars, complete.windows), windows, complete.not_kept)
+        for written in (sink, path):
+            atomic.remove_abandoned(written)
+        return report(complete, windows)
     folder = RunFolder(sink, header, resume=options.resume)
     try:
         resumed = folder.count
         results = compute(folder)
         with disk_errors_named(folder):
-            atomic.make_folder(manifest.parent)
-            with atomic.whole_file(manifest) as part:
-                part.write_text(manifest_text(header, folder.records(), **results), encoding="utf-8")
+            atomic.make_folder(path.parent)
+            manifest = stack_manifest(header, folder.records(), **results)
+            with atomic.whole_file(path) as part:
+                manifest.save(part)
                 write(folder)
-            sync(manifest.absolute().parent)  # the temporary folder is gone as well
-        summary = report(folder.records(), resumed, results["not_kept"])
+            sync(path.absolute().parent)  # the temporary folder is gone as well
         folder.remove()
-        return summary
+        return report(manifest, resumed)
     finally:
         folder.close()

@@ -41,6 +41,7 @@ class RestoredFrames:
     verdict: RestorationVerdict | None  # whether restoration helps; None if frames could not be compared
     moves: bool  # whether there was a vibration to remove
     axes: int = 2  # number of components of the motion: 2, 3 with roll, 4 with roll and zoom
+    as_taken: tuple[int, ...] = ()  # numbers of frames that were not restored, of frames that have a motion each
 
     def restored_axes(self) -> list[str]:
         """Names of the axes that were restored."""
@@ -154,8 +155,8 @@ def restore_followed(
     options: Mapping[str, Any],
     *,
     force: bool = False,
-) -> tuple[RestoredFrames, tuple[int, ...]]:
-    """``restore_trusted`` of frames that each have their own vibration, and the numbers of those that are as taken."""
+) -> RestoredFrames:
+    """``restore_trusted`` of frames that each have their own vibration."""
     chosen = RestorationOptions(**options)
     prepared = prepare_frames(frames, timing, saturation=chosen.saturation)
     restored, undone, left_alone = restore_each(prepared, followed, chosen)
@@ -170,4 +171,4 @@ def restore_followed(
     keep = any(moving) and (verdict is None or verdict.overall != "worse" or force)
     result = prepared.from_row_order(restored) if keep else frames
     unchanged = tuple(index for index, moves in enumerate(moving) if not (moves and keep))
-    return RestoredFrames(result, keep, left_alone, verdict, any(moving)), unchanged
+    return RestoredFrames(result, keep, left_alone, verdict, any(moving), as_taken=unchanged)

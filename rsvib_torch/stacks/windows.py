@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from rsvib_torch.checks.values import check_whole_number
-from rsvib_torch.files.reading import Table
+from rsvib_torch.detection import DetectionResult
 from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.restoration import RestorationVerdict
@@ -99,17 +99,24 @@ class WindowRecord:
     # of a window that was followed: the frames of its detection, and those that are restored
     followed: tuple[int, ...] | None = None
     restored_frames: int | None = None
-    middle: int | None = None  # of a part of a video, the frame whose vibration is stated
 
-
-def window_record(
-    verdict: RestorationVerdict | None, bad_frames: Mapping[int, str], *, restored: bool, **known: Any
-) -> Table:
-    """Content of a ``WindowRecord`` as JSON, from a verdict and the other fields."""
-    record = {**known, "frames": "restored" if restored else "as taken", "bad_frames": bad_frames}
-    record |= {"outcome": None, "summary": None, "predicted_gain": None}
-    if verdict is not None:
-        gain = verdict.predicted_gain.nanmean()
-        record |= {"outcome": verdict.overall, "summary": verdict.sentence, "predicted_gain": gain}
-    plain: Table = plain_values(record)
-    return plain
+    @classmethod
+    def of(
+        cls,
+        verdict: RestorationVerdict | None,
+        bad_frames: Mapping[int, str],
+        detection: DetectionResult | DetectedVibration | None,
+        *,
+        restored: bool,
+        **known: Any,
+    ) -> "WindowRecord":
+        """A record from a verdict, a detection and the other fields."""
+        return cls(
+            **known,
+            frames="restored" if restored else "as taken",
+            detection=None if detection is None else DetectedVibration.of(detection).to("cpu"),
+            outcome=None if verdict is None else verdict.overall,
+            summary=None if verdict is None else verdict.sentence,
+            predicted_gain=None if verdict is None else plain_values(verdict.predicted_gain.nanmean()),
+            bad_frames={str(index): reason for index, reason in bad_frames.items()},
+        )

@@ -5,7 +5,6 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from itertools import chain, count, groupby, islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -52,15 +51,6 @@ _OF_GYROSCOPE = ("orientation", "offset", "offset_std", "scale", "bias", "focal_
 
 Planes = list[Frame]
 _Restored = tuple[FrameTrack, RestoredFrame]
-
-
-class _Output(NamedTuple):
-    """The video to write."""
-
-    path: Path
-    info: StackInfo
-    border: str  # as in ``process_video``
-    margins: Margins | None  # that are cut off
 
 
 @file_options(ProcessVideoOptions)
@@ -155,10 +145,9 @@ def process_video(source: PathLike, sink: PathLike, timing: SensorTiming, option
             kept = margins.cut(torch.empty(content.shape[-2:], device="meta")).shape
             content = replace(content, shape=(*content.shape[:-2], *kept))
         check_info_target(sink, content, check_folder=False)
-        output = _Output(sink, content, border, margins)
         with closing(_restored_parts(video, motion, folder, at_once, progress)) as parts:
             for part, frames, verdicts in parts:
-                _encode_part(video, motion, folder, part, frames, verdicts, output, progress)
+                _encode_part(video, motion, folder, part, frames, verdicts, content, margins, progress)
         _check_shaking(folder, is_explained=any(video.is_explained(motion, part) for part in range(video.parts)))
         gyroscope = None
         if isinstance(motion.path, RotationAlignment):
@@ -187,7 +176,7 @@ def _check_shaking(folder: RunFolder, *, is_explained: bool) -> None:
     This also happens if it is unknown, and path and tones do not explain the corners of any part.
     """
     names = {"frame_to_frame": "from frame to frame", "rows": "between the rows"}
-    shaking = rms_shaking(record["shaking"] for record in folder.records())
+    shaking = rms_shaking(record.shaking for record in folder.records())
     if not shaking and not is_explained:
         folder.remove()
         raise ValueError(
@@ -280,11 +269,15 @@ def _encode_part(
     part: int,
     frames: Iterator[_Restored],
     verdicts: dict[int, RestorationVerdict | None],
-    output: _Output,
+    info: StackInfo,
+    margins: Margins | None,
     progress: Callable[[], None],
 ) -> None:
-    """Encode the frames of a part, and enter it in the folder with the frame that it ends with."""
-    layout, name = video.frames, f"{part:06d}{output.path.suffix.lower()}"
+    """Encode the frames of a part of a video to write, and enter it in the folder with the frame that it ends with.
+
+    The margins are cut off.
+    """
+    layout, name = video.frames, f"{part:06d}{folder.sink.suffix.lower()}"
     tracks: list[FrameTrack] = []
     written: list[Frame] = []  # the first frames
     before: Planes | None = None  # the frame before, without margins cut off
@@ -293,13 +286,13 @@ def _encode_part(
             before = layout.planes(np.load(file, allow_pickle=False))
     with ExitStack() as opened:
         with disk_errors_named(folder):
-            encoded = part_of_video(folder.create(name), output.path, output.info, layout.picture)
+            encoded = part_of_video(folder.create(name), folder.sink, info, layout.picture)
             write = opened.enter_context(encoded)
         for track, restored in frames:
             if tracks:
                 progress()  # the frame before is complete
-            before = _without_gaps(restored, before, layout, output.border)
-            final = layout.frame(_cut(before, output.margins))
+            before = _without_gaps(restored, before, layout)
+            final = layout.frame(_cut(before, margins))
             with disk_errors_named(folder):
                 write(final)
             if len(tracks) < CHECKED_FRAMES:
@@ -313,12 +306,12 @@ def _encode_part(
     progress()
 
 
-def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: VideoFrames, border: str) -> Planes:
+def _without_gaps(restored: RestoredFrame, before: Planes | None, layout: VideoFrames) -> Planes:
     """Planes of a frame to write: those of the frame before where there are none, and at hidden pixels if they hold."""
     planes = restored.planes
     if planes is None or (restored.fault is not None and before is not None):
         return layout.black() if before is None else before
-    if border == "mirror" or restored.visible is None or before is None:
+    if restored.visible is None or before is None:  # nothing is hidden, or it is mirrored
         return planes
     pairs = zip(restored.visible, planes, before, strict=True)
     return [np.where(visible, plane, old) for visible, plane, old in pairs]

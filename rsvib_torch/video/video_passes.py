@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rsvib_torch.detection.sensitivity import timing_sensitivity, with_row_time_std
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit
 from rsvib_torch.execution.parallel import ONE_BLAS_THREAD, prefetched
-from rsvib_torch.files.reading import Table
 from rsvib_torch.gyroscope.corner_tracks import followed_pair, tracks_of_pairs
 from rsvib_torch.gyroscope.gyroscope_rates import AngularRates
 from rsvib_torch.gyroscope.rotation_alignment import RotationAlignment, align_rates
@@ -32,7 +31,7 @@ from rsvib_torch.results.reason import Reason
 from rsvib_torch.stacks.job import stored_frame
 from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
-from rsvib_torch.stacks.windows import window_record
+from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.video import Margins
 from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
@@ -119,7 +118,12 @@ class VideoPasses:
             return VideoMotion(path, times, by_corners, faults, shakes)
         for _ in pairs():  # for ``compared``, and for the shaking
             pass
-        found = self._alignment(self.rates, compared)
+        tracks = tracks_of_pairs(compared, self.starts, timing, self.frames.size)
+        starts = tensor(np.array([self.starts[index : index + 2] for index in compared]))
+        size, fitted = self.frames.size if timing.scan_axis == -2 else self.frames.size[::-1], self.camera is None
+        found = align_rates(tracks, starts, size, timing, self.rates, self.camera, fit_focal_length=fitted)
+        if not found.reliable:
+            raise ValueError(f"the gyroscope ({self.rates.source}) does not fit the video: {'; '.join(found.reasons)}")
         rotation = RecordedRotation.aligned(self.rates, found, times)
         turned = self._to_steady(times, rotation.apart)
         return VideoMotion(found, times, lambda index: rotation.motion(index, turned[index], half), faults, shakes)
@@ -162,17 +166,6 @@ class VideoPasses:
     def _to_steady(self, times: Array, apart: Callable[[int, slice], Array]) -> Array:
         return steady_shifts(times, apart, self.steady, self.frames.size, self.crop_limit)
 
-    def _alignment(self, rates: AngularRates, pairs: dict[int, Corners]) -> RotationAlignment:
-        """The alignment of the gyroscope by the corners between some frames, by number, and the next ones."""
-        timing, size = self.frames.job.timing, self.frames.size
-        tracks = tracks_of_pairs(pairs, self.starts, timing, size)
-        starts = tensor(np.array([self.starts[index : index + 2] for index in pairs]))
-        rows_first, fitted = size if timing.scan_axis == -2 else size[::-1], self.camera is None
-        found = align_rates(tracks, starts, rows_first, timing, rates, self.camera, fit_focal_length=fitted)
-        if not found.reliable:
-            raise ValueError(f"the gyroscope ({rates.source}) does not fit the video: {'; '.join(found.reasons)}")
-        return found
-
     def _removed(self, tones: list[Tone], polynomial: Array) -> Vibration:
         """The tones, skew and wobble by the path, and what the path is not smooth by."""
         if self.steady == 0:  # axes without vibration stay as taken
@@ -214,7 +207,7 @@ class VideoPasses:
 
     # Verdict and record of a part
 
-    def shaking(self, motion: VideoMotion, first: int, frames: list[Frame]) -> dict[str, list[float]] | None:
+    def shaking(self, motion: VideoMotion, first: int, frames: list[Frame]) -> dict[str, tuple[float, ...]] | None:
         """``WindowRecord.shaking`` from frames of the output, the first of which has a number; None if unknown."""
         measured: list[tuple[tuple[Array, float], tuple[Array, float]]] = []  # of neighbouring frames, before and after
         follower = CornerFollower(self.frames.job.timing)
@@ -229,8 +222,8 @@ class VideoPasses:
         changes = np.diff([[moved for moved, _ in pair] for pair in measured], axis=0)  # (pairs - 1, 2, 2) px
         rows = np.array([[rows for _, rows in pair] for pair in measured])  # (pairs, 2) px
         return {
-            "frame_to_frame": np.sqrt(np.square(changes).sum(-1).mean(0)).tolist(),
-            "rows": np.sqrt(np.square(rows).mean(0)).tolist(),
+            "frame_to_frame": tuple(np.sqrt(np.square(changes).sum(-1).mean(0)).tolist()),
+            "rows": tuple(np.sqrt(np.square(rows).mean(0)).tolist()),
         }
 
     def shakes_more(self, motion: VideoMotion, frames: list[tuple[FrameTrack, Frame | str]]) -> bool:
@@ -273,8 +266,8 @@ class VideoPasses:
         motion: VideoMotion,
         verdict: RestorationVerdict | None,
         first_frames: list[Frame],
-    ) -> Table:
-        """Content of the ``WindowRecord`` of a part of the video, the first frames of which are given as written."""
+    ) -> WindowRecord:
+        """The record of a part of the video, the first frames of which are given as written."""
         path = motion.path
         detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
         left = [
@@ -282,17 +275,17 @@ class VideoPasses:
             for name, why in zip(AXIS_NAMES, detection.reasons if detection else (), strict=False)
             if why
         ]
-        return window_record(
+        return WindowRecord.of(
             verdict,
             {track.index: track.fault for track in tracks if track.fault is not None},
+            detection,
             restored=any(bool(track.motion.moving_axes().any()) for track in tracks if track.fault is None),
             window=part,
             first=tracks[0].index,
             last=tracks[-1].index,
             start_time=tracks[0].time,
             written=len(tracks),
-            detection=detection,
-            left_alone=left,
+            left_alone=tuple(left),
             error=None,
             shaking=self.shaking(motion, tracks[0].index, first_frames),
         )

@@ -180,7 +180,7 @@ def test_presets(place, frames, capsys):
     assert (place / "camera.toml").read_text() == presets()["in_orbit"]
     capsys.readouterr()
     for arguments, message in (
-        (("--preset", "push_scan"), "camera.toml exists; --overwrite replaces it"),
+        (("--preset", "push_scan"), "results exist already in"),
         (("--preset", "moon", "--overwrite"), "--preset must be one of in_orbit, iso12233, push_scan; got 'moon'"),
         ((), "give a stack of frames, or --preset NAME"),
         (("none.mp4", *TIMES, "--out", "c.toml"), "none.mp4 does not exist"),
