@@ -149,6 +149,11 @@ class BandedFactor:
         """The opposite of ``tensors``."""
         return cls(_Triangle(upper, inverse), middle, middle_inverse)
 
+    def log_determinant(self) -> Tensor:
+        """Logarithms (S,) of the determinants of the matrices, float64."""
+        ends, middle = (inverse.double().log().sum(0) for inverse in (self.ends.inverse, self.middle_inverse))
+        return -(ends.view(2, -1).sum(0) + middle)
+
     def halves(self, values: Tensor) -> Tensor:
         """The halves (H, M, 2 S) of values (K, M, S)."""
         half = len(self.ends.upper)

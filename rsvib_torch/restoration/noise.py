@@ -22,7 +22,7 @@ from rsvib_torch.frames.pixels import cut_parts
 from rsvib_torch.numerics.fourier import squared_modulus, waves
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
-from rsvib_torch.restoration.scene_model.cross_validation import sample_rows, smoothness
+from rsvib_torch.restoration.scene_model.cross_validation import sample_rows
 from rsvib_torch.restoration.scene_model.observation import RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, power_transfer, spread_starts, taper
 
@@ -374,7 +374,10 @@ def _residual_power(
     count = min(num_frequencies, width // 4)
     chosen = np.linspace(width // 4, width // 2, count, dtype=np.float32).astype(np.int64)
     sample = sample_rows(images, kernels, chosen)
-    explained = sample.explain([smoothness(len(images), count, prior_weight)])
+    # correlation 0.9 of neighbouring rows of the scene
+    products = torch.zeros(1, 2, 2, len(images), count, dtype=torch.float64, device=images.device)
+    products[0, 0, 0], products[0, 0, 1], products[0, 1, 0] = prior_weight, 0.9**2 * prior_weight, -0.9 * prior_weight
+    explained = sample.explain(products)
     freedom = explained.count * count - explained.freedom[0].sum(-1)
     return torch.as_tensor(explained.power[0].sum(-1) / freedom, dtype=images.dtype, device=images.device)
 

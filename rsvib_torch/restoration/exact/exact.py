@@ -212,7 +212,7 @@ class FrameModel:
                 self._row_kernels(some),
                 self.prior.of(stack_of[:, 0], member_of),
                 self.level[stack_of].square(),
-                self._blur_reaches(some)[:, None],
+                torch.from_numpy(self._blur_reaches(some)[:, None]).to(self.frames.device),
                 certain=self.level_is_certain,
             )
         return strengths[representative]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.numerics.fourier import extend_rows, fast_length
 from rsvib_torch.restoration.exact.scene_solver import SceneProblem, SceneSolver
+from rsvib_torch.restoration.scene_model.observation import frequencies_of
 
 # px along the row from its middle; above, the boundary extension is filled: a larger blur mixes it into the frame
 FILLED_BLUR_REACH = 1.0
@@ -121,7 +122,7 @@ def with_extension(problem: SceneProblem, width: int) -> SceneProblem:
     joined = replace(
         problem,
         data=extend_rows(strips, length),
-        observation=problem.observation.with_period(length),
+        observation=problem.observation.at_frequencies(frequencies_of(length), length),
         precision=precision[0].view(*problem.precision.shape[:-1], -1),
     )
     # the extension is hardly mixed into the frame by a blur below 1 px, on the finer grid: more iterations gain 0.01 dB

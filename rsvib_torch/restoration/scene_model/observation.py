@@ -349,7 +349,7 @@ class Observation:
         self, kernels: RowKernels, num_rows: int, period: int, dtype: torch.dtype, num_scenes: int = 1
     ) -> None:
         self.kernels, self.num_rows, self.period, self.dtype = kernels, num_rows, period, dtype
-        self.num_scenes, self.u = num_scenes, _frequencies(period)
+        self.num_scenes, self.u = num_scenes, frequencies_of(period)
         first, last = kernels.needed(num_rows)
         lowest, highest = torch.stack(kernels.first.aminmax()).tolist()
         self.top = min(lowest, first)
@@ -375,10 +375,13 @@ class Observation:
         kernels = replace(self.kernels, weight=weight)
         return type(self)(kernels, self.num_rows, self.period, self.dtype, self.num_scenes)
 
-    def with_period(self, period: int) -> "Observation":
-        """The same for rows of another period."""
+    def at_frequencies(self, u: Tensor, period: int) -> "Observation":
+        """The same for rows of another period, at frequencies (U,) in cycles per px on the CPU.
+
+        Frequencies that are not all of a period are for kernels whose middles are 0.
+        """
         other = copy(self)
-        other.period, other.u = period, _frequencies(period)
+        other.period, other.u = period, u
         return other
 
     def A(self, coefficients: Tensor) -> Tensor:  # noqa: N802 - name that solvers use
@@ -427,7 +430,7 @@ class Observation:
         return scenes
 
 
-def _frequencies(period: int) -> Tensor:
+def frequencies_of(period: int) -> Tensor:
     """Frequencies (U,) of rows of a period in cycles per px, on the CPU."""
     frequencies: Tensor = torch.fft.rfftfreq(period, dtype=torch.float64, device="cpu")
     return frequencies

@@ -58,11 +58,6 @@ class RowPrior:
         later = functional.pad(a, (0, 0, 0, 0, 0, ORDER)).unfold(0, len(a), 1)  # a_(k + d), (d, N, U, k)
         return a * later.movedim(-1, 1)
 
-    def ratio(self, noise_power: Tensor) -> Tensor:
-        """Noise power over the variance of e, (N, U), for noise of power (N, 1) in data of weight 1."""
-        innovation = self.power * (1 - self.reflections.square()).prod(0)
-        return (noise_power + self.interpolation_power.mean(1)) / innovation
-
     def resampled(self, count: int) -> "RowPrior":
         """The prior at ``count`` frequencies spread over the same range."""
         parts = [self.power.log()[:, None], self.reflections.movedim(0, 1), self.interpolation_power.log()]
@@ -78,18 +73,13 @@ class RowPrior:
         ``blur_reach`` is the largest distance along the row in px during an exposure from its middle; it and
         ``strength``, a factor on the precision, are numbers or (N, 1).
         """
-        precision: Tensor = self.products() * bounded_ratio(self.ratio(noise_power) * strength, blur_reach)
-        return precision
-
-
-def bounded_ratio(ratio: "Table", blur_reach: "Table") -> "Table":
-    """A ratio of noise power and variance of e for which systems can be solved in single precision.
-
-    Above 1e3, the systems lose digits without a gain; below 1e-4, rows displaced by half a pixel lose them. Long
-    exposures observe every place from many rows, and allow a bound lower by the length of the blur in px.
-    """
-    lowest = 1e-4 / (1 + blur_reach)
-    return ratio.clip(lowest, None).clip(None, 1e3)
+        # above 1e3, the systems lose digits in single precision without a gain; below 1e-4, rows displaced by half a
+        # pixel lose them. Long exposures observe every place from many rows, and allow a lower bound by the length of
+        # the blur in px
+        innovation = self.power * (1 - self.reflections.square()).prod(0)
+        ratio = (noise_power + self.interpolation_power.mean(1)) / innovation * strength
+        lowest = torch.as_tensor(1e-4 / (1 + blur_reach), dtype=ratio.dtype, device=ratio.device)
+        return self.products() * ratio.maximum(lowest).clamp(max=1e3)
 
 
 Table = Any  # a tensor, or an array of NumPy: operators that both have
