@@ -7,6 +7,7 @@ the frames is that of the middle column; derivatives by roll and zoom depend on 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 import torch
@@ -16,15 +17,18 @@ from torch.nn import functional
 
 from rsvib_torch.checks.arguments import check_images, checks_arguments
 from rsvib_torch.checks.validation import Positive
+from rsvib_torch.execution.chunking import runs
 from rsvib_torch.frames.orientation import frames_to_row_order
 from rsvib_torch.imaging import exposure_nodes, exposure_trajectory, rows_showing, simulate_frames
+from rsvib_torch.imaging.blur import row_taps
 from rsvib_torch.motion.field import ColumnMotion, displacement_factors
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
-from rsvib_torch.numerics.banded_solver import solve_banded
-from rsvib_torch.numerics.fourier import extend_rows, fast_length
-from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored, spread_taps
+from rsvib_torch.numerics.banded_solver import solve_halves
+from rsvib_torch.numerics.fourier import extend_rows, fast_length, waves
+from rsvib_torch.numerics.splines import bspline_coefficients, bspline_weights, mirrored
+from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 
 _DEGREE = 13  # of the spline across rows; degree 9 changes bounds of a drawn scene by 0.2 %, 15 by 0.05 %
 _MARGIN = 16  # px over which the scene closes to a period; 8 and 32 px change these bounds by less than 3e-5
@@ -98,7 +102,6 @@ def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Ten
     rows, ``margin`` px beyond its ends, without detail above 0.4 cycles/row; only pixels count whose content is visible
     in another frame.
     """
-    place = _Places.of(recording)
     length = fast_length(recording.scene.shape[1] + 2 * margin)
     scene = _within_band(recording.scene)
     if max(recording.axes) > 1:
@@ -107,14 +110,23 @@ def projected_information(recording: Recording, *, margin: int = _MARGIN) -> Ten
         fields = (scene - scene.mean()) * moments  # the mean has no derivatives; without it the borders are small
     else:
         fields = scene[None]
-    coefficients = bspline_coefficients(fields, _DEGREE, -2)
-    spectra = torch.fft.rfft(extend_rows(coefficients, length, hold=0.0))  # (F, Hs, U)
-    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=spectra.device)
-    step = max(1, _CHUNK // place.first.numel())
-    parts = zip(spectra.split(step, -1), u.split(step), strict=True)
-    residuals = [_unexplained(place, *part) for part in parts]
+    spectra = torch.fft.rfft(extend_rows(bspline_coefficients(fields, _DEGREE, -2), length, hold=0.0))  # (F, Hs, U)
+    displacement, weights = exposure_trajectory(recording.motion, recording.starts, recording.timing, "gauss")
+    ones = weights.new_ones(recording.num_frames)
+    kernels = _SplineKernels.of_rows(displacement, weights, ones, recording.size[0], margin=len(scene))
+    observation = Observation(kernels, recording.size[0], length, torch.float64)
+    normal = observation.normal(0).in_windows([slice(0, observation.count)])
+    ridge = (_RIDGE * normal.left.abs().amax()).expand(1, 1, 1, 1)
+    residuals = []
+    for part in runs(len(observation.u), max(1, _CHUNK // recording.starts.numel())):
+        u = observation.u[part]
+        derivatives = _derivatives(recording, displacement, weights, spectra[..., part], u.to(spectra.device))
+        data = derivatives.transpose(0, 1)[None]  # (1, T, P, R, U)
+        right = observation.adjoint(data, part).flatten(2)
+        explained = solve_halves(normal.at(u, ridge.expand(1, 1, 1, len(u))), right)
+        residuals.append(data - observation.forward(explained[:, :, None], part))
     columns = slice(recording.origin[1], recording.origin[1] + recording.size[1])
-    images = torch.fft.irfft(torch.cat(residuals, dim=-1), n=length)[..., columns]  # (P, T, R, W)
+    images = torch.fft.irfft(torch.cat(residuals, dim=-1)[0].transpose(0, 1), n=length)[..., columns]  # (P, T, R, W)
     images = (images * _shown_twice(recording)).flatten(1)
     information: Tensor = images @ images.T
     return information
@@ -130,68 +142,40 @@ def _within_band(scene: Tensor, low: float = 0.35, high: float = 0.45) -> Tensor
     return smooth
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """Observation operator: coefficients of the scene for each row at the N nodes of its exposure."""
+class _SplineKernels(RowKernels):
+    """Kernels of rows that act on the coefficients of B-splines across rows."""
 
-    first: Tensor  # (T, R) first scene row
-    taps: Tensor  # (T, R, N, J) weights of the scene rows from the first on
-    slopes: Tensor  # (T, R, N, J) their derivatives by the place
-    along: Tensor  # (T, R, N) displacement along the row in px
-    weights: Tensor  # (N,) of the nodes
-    sensitivity: Tensor  # (P, T, R, N) derivatives of the displacement
-    axes: tuple[int, ...]  # as in ``Recording``
-
-    @classmethod
-    def of(cls, recording: Recording) -> "_Places":
-        starts = recording.starts
-        displacement, weights = exposure_trajectory(recording.motion, starts, recording.timing, "gauss")
-        times, _ = exposure_nodes(recording.timing, "gauss", len(weights))
-        rows = torch.arange(recording.size[0], dtype=torch.float64, device=starts.device)
-        place = recording.origin[0] + rows[:, None] - displacement[..., 1]
-        cell = place.floor()
-        first, taps = spread_taps(cell, bspline_weights(place - cell, _DEGREE))
-        _, slopes = spread_taps(cell, bspline_weights(place - cell, _DEGREE, derivative=1))
-        sensitivity = recording.sensitivity(starts[..., None] + times.to(starts.device))
-        return cls(first - _DEGREE // 2, taps, slopes, displacement[..., 0], weights, sensitivity, recording.axes)
+    interpolated = partial(bspline_weights, degree=_DEGREE)
+    before = _DEGREE // 2
 
 
-def _unexplained(place: _Places, spectra: Tensor, u: Tensor) -> Tensor:
-    """Derivatives of the spectra of all rows less the part that a scene explains, (P, T, R, U)."""
-    angle = (-2 * math.pi) * place.along[..., None] * u
-    ramps = torch.polar(torch.ones_like(angle), angle) * place.weights[:, None]  # (T, R, N, U)
-    reach = place.taps.shape[-1]
-    source = place.first[..., None] + torch.arange(reach, device=u.device)  # (T, R, J)
+def _derivatives(recording: Recording, displacement: Tensor, weights: Tensor, spectra: Tensor, u: Tensor) -> Tensor:
+    """Derivatives of the spectra of all rows by the parameters, (P, T, R, U).
+
+    The ``displacement`` (T, R, N, 2) is that at the N nodes of the exposures, with ``weights`` (N,); ``spectra`` (F,
+    Hs, U) are those of the coefficients of the fields.
+    """
+    times, _ = exposure_nodes(recording.timing, "gauss", len(weights))
+    sensitivity = recording.sensitivity(recording.starts[..., None] + times.to(u.device))  # (P, T, R, N)
+    place = recording.origin[0] + torch.arange(recording.size[0], device=u.device)[:, None] - displacement[..., 1]
+    (first, value), (_, slope) = (
+        row_taps(place, weights, partial(bspline_weights, degree=_DEGREE, derivative=order)) for order in (0, 1)
+    )
+    source = first[..., None] + torch.arange(value.shape[-2], device=u.device) - _DEGREE // 2  # (T, R, J)
+    value, slope = (taps.mT.to(spectra.dtype) for taps in (value, slope))  # (T, R, N, J)
+    ramps = waves(displacement[..., 0], u)  # (T, R, N, U)
     images: dict[tuple[int, str], Tensor] = {}  # at the nodes of the exposures, (T, R, N, U)
     for number, field in enumerate(spectra):
-        seen = field[mirrored(source, len(field))]
-        value = (place.taps.to(seen.dtype) @ seen) * ramps
-        images[number, "x"] = value * (2j * math.pi * u)
-        images[number, "y"] = (place.slopes.to(seen.dtype) @ seen) * ramps
-        images[number, ""] = value
+        seen = field[mirrored(source, len(field))]  # (T, R, J, U)
+        images[number, ""] = (value @ seen) * ramps
+        images[number, "x"] = images[number, ""] * (2j * math.pi * u)
+        images[number, "y"] = (slope @ seen) * ramps
     by_component = [
         torch.stack([-factor * images[field, of] for field, of, factor in terms]).sum(0)
-        for terms in _DERIVATIVES[: max(place.axes) + 1]
+        for terms in _DERIVATIVES[: max(recording.axes) + 1]
     ]
-    by_parameter = zip(place.axes, place.sensitivity, strict=True)
-    derivatives = torch.stack([(slope[..., None] * by_component[axis]).sum(-2) for axis, slope in by_parameter])
-    kernels = place.taps.to(ramps.dtype).transpose(-2, -1) @ ramps  # (T, R, J, U)
-    base = (place.first - place.first.amin()).flatten()
-    count = int(base.amax()) + reach
-    kernels = kernels.flatten(0, 1)
-    rows = derivatives.flatten(1, 2).transpose(0, 1)  # (T R, P, U)
-    band = kernels.new_zeros(count, reach, len(u))
-    right = kernels.new_zeros(count, *rows.shape[1:])
-    for i in range(reach):
-        right.index_add_(0, base + i, kernels[:, i, None].conj() * rows)
-        for d in range(reach - i):
-            band[:, d].index_add_(0, base + i, kernels[:, i + d].conj() * kernels[:, i])
-    band[:, 0] += _RIDGE * band[:, 0].real.amax()
-    solution = solve_banded(band, right)
-    for i in range(reach):
-        rows = rows - kernels[:, i, None] * solution[base + i]
-    residual: Tensor = rows.transpose(0, 1).unflatten(1, place.first.shape)
-    return residual
+    by_parameter = zip(recording.axes, sensitivity, strict=True)
+    return torch.stack([(slope[..., None] * by_component[axis]).sum(-2) for axis, slope in by_parameter])
 
 
 def _shown_twice(recording: Recording) -> Tensor:

@@ -4,6 +4,9 @@ Elimination of one row after the other factors ``A = U^H D U`` with a unit upper
 
     d_j = A[j, j],   U[j, k] = A[j, k] / d_j,   A[i, k] -= A[i, j] U[j, k]   for i, k = j + 1 ... j + b.
 
+A matrix of K rows is given as both sides of its band, row by row: skewed (K + b, 2 b + 1, S) with ``[k, b + d] =
+A[k, k + d]``, whose last b rows are 0. The batch S comes last, so that each step works on contiguous memory.
+
 Forward substitution solves ``U^H D y = g``, back substitution ``U x = y``. Every step is one operation for the whole
 batch of matrices.
 
@@ -92,7 +95,7 @@ class _Triangle:
 
 
 def _eliminated(skewed: Tensor, steps: int) -> _Triangle:
-    """Eliminate the first rows of matrices (K + b, 2 b + 1, S) as from ``skew_band``, in their own memory."""
+    """Eliminate the first rows of skewed matrices (K + b, 2 b + 1, S), in their own memory."""
     width, (line, entry, _) = skewed.shape[1] // 2, skewed.stride()
     first = skewed.storage_offset() + line
     pivots, upper = skewed[:steps, width], skewed[: len(skewed) - width, width + 1 :]
@@ -109,7 +112,7 @@ def _eliminated(skewed: Tensor, steps: int) -> _Triangle:
 
 
 def from_both_ends(skewed: Tensor) -> Tensor:
-    """The two halves (H + b, 2 b + 1, 2, ...) of systems (K + b, 2 b + 1, ...) as from ``skew_band``.
+    """The two halves (H + b, 2 b + 1, 2, ...) of skewed systems (K + b, 2 b + 1, ...).
 
     The first one has the rows 0 ... H - 1, the second one the rows K - 1 ... K - H in reverse order. Entries between
     the middle rows, which both contain, are in the first one only.
@@ -198,22 +201,6 @@ def factor_banded(halves: Tensor, count: int) -> BandedFactor:
     return BandedFactor(ends, upper.movedim(0, -1).contiguous(), inverse)
 
 
-def skew_band(band: Tensor) -> Tensor:
-    """Both sides (K + b, 2 b + 1, S), ``[k, b + d] = A[k, k + d]``, of Hermitian bands, row by row.
-
-    The lower band is (K, b + 1, S), ``band[k, d] = A[k + d, k]``; entries below the last row are not read. It is real
-    or complex; the batch S comes last, so that each step works on contiguous memory.
-    """
-    count, diagonals, size = band.shape
-    width = diagonals - 1
-    skewed = band.new_zeros(count + width, 2 * width + 1, size)
-    skewed[:count, width] = band[:, 0].real if band.is_complex() else band[:, 0]
-    for d in range(1, min(diagonals, count)):
-        skewed[d:count, width - d] = band[: count - d, d]
-        skewed[: count - d, width + d] = band[: count - d, d].conj()
-    return skewed
-
-
 class _Solve(torch.autograd.Function):
     """Solve; the gradients of ``x = A^-1 g`` are ``A^-1 dx`` for g and ``-(A^-1 dx) x^H`` for A."""
 
@@ -254,20 +241,6 @@ def solve_halves(system: Tensor | BandedFactor, right_side: Tensor) -> Tensor:
     """
     solution: Tensor = _Solve.apply(system, right_side)  # type: ignore[no-untyped-call]
     return solution
-
-
-def solve_banded(band: Tensor, right_side: Tensor) -> Tensor:
-    """Solutions (K, M, *S) of Hermitian positive definite banded systems, differentiable, for M right sides per matrix.
-
-    The lower band is (K, b + 1, *S), ``band[k, d] = A[k + d, k]``; the imaginary part of the diagonal is ignored.
-
-    Example:
-        >>> band = torch.tensor([[2.0, 1.0], [2.0, 1.0], [2.0, 0.0]])
-        >>> solve_banded(band, torch.tensor([[3.0], [4.0], [3.0]])).flatten().round(decimals=4)
-        tensor([1., 1., 1.])
-    """
-    halves = from_both_ends(skew_band(band.reshape(*band.shape[:2], -1))).flatten(2)
-    return solve_halves(halves, right_side.reshape(*right_side.shape[:2], -1)).reshape(right_side.shape)
 
 
 def node_frequencies(count: int, step: float, device: torch.device) -> Tensor:
