@@ -1,8 +1,8 @@
 """B-spline interpolation on a unit grid, correlation with short filters, and Gauss-Legendre quadrature."""
 
 from collections.abc import Iterator
-from fractions import Fraction
-from functools import cache
+from functools import cache, partial
+from math import comb, factorial
 
 import numpy as np
 import torch
@@ -73,19 +73,18 @@ def spread_taps(cells: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 def _polynomials(degree: int) -> tuple[tuple[float, ...], ...]:
     """Coefficients of the weights as polynomials of the fraction: one row of all taps per power, highest power first.
 
-    They follow from the Cox-de Boor recursion in rational numbers.
+    ``sum_j (-1)^j binomial(n + 1, j) max(x - j, 0)^n / n!`` is the B-spline of degree n on the knots 0 ... n + 1; tap k
+    is at ``x = fraction + n - k``.
     """
-    taps = [[Fraction(1)]]  # for each tap, lowest power first
-    for order in range(1, degree + 1):
-        before, taps = taps, [[Fraction(0)] * (order + 1) for _ in range(order + 1)]
-        for tap, weight in enumerate(before):
-            # cells from the first knot of this tap's spline to the cell of the position
-            distance = order - 1 - tap
-            for power, value in enumerate(weight):
-                for which, at_zero, slope in ((tap, order - distance, -1), (tap + 1, distance, 1)):
-                    taps[which][power] += value * at_zero / order
-                    taps[which][power + 1] += value * slope / order
-    return tuple(tuple(float(weight[power]) for weight in taps) for power in reversed(range(degree + 1)))
+
+    def coefficient(tap: int, power: int) -> float:
+        terms = (
+            (-1) ** j * comb(degree + 1, j) * (degree - tap - j) ** (degree - power) for j in range(degree - tap + 1)
+        )
+        return float(comb(degree, power) * sum(terms) / factorial(degree))
+
+    taps = range(degree + 1)
+    return tuple(tuple(coefficient(tap, power) for tap in taps) for power in reversed(taps))
 
 
 _PREFILTERS: dict[tuple[int, bool], tuple[float, ...]] = {}
@@ -160,16 +159,9 @@ def bspline_coefficients(samples: Tensor, degree: int, dim: int) -> Tensor:
 
 def bspline_coefficients_adjoint(values: Tensor, degree: int, dim: int) -> Tensor:
     """Adjoint (transpose) of ``bspline_coefficients``."""
-    if degree == 1:
-        return values
-    taps = _prefilter_taps(degree, values.dtype in (torch.float64, torch.complex128))
-    length, reach = values.shape[dim], len(taps) - 1
-    shape = list(values.shape)
-    shape[dim] = 2 * reach
-    edge = values.new_zeros(shape)
-    spread = correlated(torch.cat([edge, values, edge], dim), _symmetric(taps, values)[None], dim)[0]
-    index = mirrored(torch.arange(-reach, length + reach, device=values.device), length)
-    return torch.zeros_like(values).index_add(dim, index, spread)
+    adjoint = torch.func.vjp(partial(bspline_coefficients, degree=degree, dim=dim), torch.zeros_like(values))[1]
+    spread: Tensor = adjoint(values)[0]
+    return spread
 
 
 def _toeplitz(kernels: Tensor, rows: int, step: int = 1) -> Tensor:

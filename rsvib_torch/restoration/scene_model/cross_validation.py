@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.numerics.banded_solver import factor_banded
-from rsvib_torch.numerics.fourier import waves
+from rsvib_torch.numerics.fourier import squared_modulus, waves
 from rsvib_torch.numerics.tables import table, tables
 from rsvib_torch.restoration.scene_model.observation import Observation, RowKernels
 from rsvib_torch.restoration.scene_model.scene_prior import RowPrior
@@ -42,22 +42,22 @@ class SampledRows:
         slabs, members = observation.num_scenes // scenes, spectra.shape[1]
         # 1. One system for each prior, slab and frequency. Those with a prior that is stronger by a factor s give the
         # degrees of freedom n - d log det A / d log s: a difference quotient.
-        step = 1.2
-        products = torch.cat([*precisions, *(step * precisions)], 2).repeat_interleave(slabs, 2)
+        products, step = torch.cat([*precisions], 2).repeat_interleave(slabs, 2), 1.2
         normal = observation.normal(len(products) - 1)
-        repeated = replace(normal, left=normal.left.repeat(1, 1, 2 * number, 1))
-        halves = repeated.in_windows([slice(0, observation.count)]).at(observation.u, products)
-        factor = factor_banded(halves, observation.count)
-        first, other = factor.log_determinant().view(2, number, scenes, slabs, frequencies).sum(3)
-        freedom = observation.count * slabs - (other - first) / math.log(step)
+        repeated = replace(normal, left=normal.left.repeat(1, 1, number, 1)).in_windows([slice(0, observation.count)])
+        factor, stronger = (
+            factor_banded(repeated.at(observation.u, times * products), observation.count) for times in (1.0, step)
+        )
+        growth = (stronger.log_determinant() - factor.log_determinant()).view(number, scenes, slabs, frequencies)
+        freedom = observation.count * slabs - growth.sum(2) / math.log(step)
         # 2. The residuals of the rows with each prior, which are channels of the scenes that are fitted.
         whole = slice(0, frequencies)
-        fitted = factor.solve(observation.adjoint(spectra, whole).flatten(2).repeat(1, 1, 2 * number))
-        fitted = fitted.unflatten(2, (2 * number, observation.num_scenes, frequencies))[:, :, :number]
+        fitted = factor.solve(observation.adjoint(spectra, whole).flatten(2).repeat(1, 1, number))
+        fitted = fitted.unflatten(2, (number, observation.num_scenes, frequencies))
         predicted = observation.forward(fitted.flatten(1, 2), whole).unflatten(2, (-1, number))
         weight = observation.kernels.weight.unflatten(0, (-1, members))  # (S n, M, R)
-        residual = (spectra[:, :, :, None] - predicted).abs().double().square()
-        power = torch.einsum("smr,smcnrf->nsf", weight, residual) / self.energy
+        residual = squared_modulus(spectra[:, :, :, None] - predicted)
+        power = torch.einsum("smr,smcnrf->nsf", weight.to(residual.dtype), residual) / self.energy
         counted = (weight > 0).double().sum((1, 2)).view(scenes, slabs).sum(1)
         return Explained(*tables(power.unflatten(1, (scenes, slabs)).sum(2), freedom, counted))
 
@@ -77,12 +77,11 @@ def sample_rows(
     images, kernels = images[..., : slabs * height, :], kernels.rows(0, slabs * height)
     # spectra of the rows, minus the mean of the image, with the phase of each row's middle taken off
     taper = np.hanning(width + 2)[1:-1]
-    tapered = torch.from_numpy(taper).to(images)
     u = torch.from_numpy(chosen / width)
-    transform = waves(torch.arange(width, dtype=torch.float64), u).to(images.device, images.dtype.to_complex())
-    deviations = (images - images.mean((-2, -1), keepdim=True)) * tapered
-    phases = waves(-kernels.middle, u.to(images.device)).to(transform.dtype)
-    spectra = (deviations.to(transform.dtype) @ transform) * phases.unflatten(0, (scenes, members))[:, :, None]
+    deviations = (images - images.mean((-2, -1), keepdim=True)) * torch.from_numpy(taper).to(images)
+    spectra = torch.fft.rfft(deviations)[..., torch.from_numpy(chosen).to(images.device)]
+    phases = waves(-kernels.middle, u.to(images.device)).to(spectra.dtype)
+    spectra = spectra * phases.unflatten(0, (scenes, members))[:, :, None]
 
     def in_slabs(values: Tensor) -> Tensor:
         """(S M, n height, ...) as (S n M, height, ...)."""
@@ -101,6 +100,7 @@ def sample_rows(
 
 
 _STRENGTHS = (2.0, 1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # factors on the prior, from strong to weak
+_TRIED = 4  # of them, first
 _FREQUENCIES = 24  # at which rows are sampled
 _ROWS = 512  # sampled, from the middle of the frames
 
@@ -141,25 +141,28 @@ def prior_strengths(
             for values in (prior.power, prior.reflections, prior.interpolation_power)
         )
     )
-    explained = sample.explain(
-        torch.stack([at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS])
-    )
-    # 2. ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel from
-    # all others. The sum over the frequencies is dominated by those with the largest errors; the geometric mean gives
-    # all the same weight.
-    residual_freedom = explained.count[:, None] - explained.freedom
-    with np.errstate(divide="ignore", invalid="ignore"):
-        of_sum = np.log(explained.power.sum(-1)) - 2 * np.log(residual_freedom.sum(-1))
-        geometric = (np.log(explained.power) - 2 * np.log(residual_freedom)).mean(-1)
+    precisions = torch.stack([at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS])
+    # 2. A stronger prior is allowed only if the noise level is certain, and can be distinguished from the interpolation
+    # error of the kernel. The strongest priors are tried first, and all only if the weakest of them is selected.
     strengths = np.array(_STRENGTHS)
+    above = table(noise_power)[:, 0] > 200.0 * table(prior.interpolation_power.mean((1, 2)))
+    allowed = (above & certain) | (strengths[:, None] <= 1.0)
     octaves = np.log2(strengths)[:, None]
     # strength 1 follows from the noise level: another must reduce the logarithm by this much per octave, weaker or
     # stronger
-    handicap = np.maximum(-0.014 * octaves, 0.002 * octaves)
-    # 3. A stronger prior is allowed only if the noise level is certain, and can be distinguished from the interpolation
-    # error of the kernel. The weaker of the two selected priors is used, as one that is too weak has the smaller error.
-    above = table(noise_power)[:, 0] > 200.0 * table(prior.interpolation_power.mean((1, 2)))
-    allowed = (above & certain) | (strengths[:, None] <= 1.0)
-    criteria = [np.where(allowed, criterion + handicap, np.inf) for criterion in (of_sum, geometric)]
-    selected: NDArray[np.float64] = strengths[np.maximum(*(criterion.argmin(0) for criterion in criteria))]
-    return selected
+    handicap = np.where(allowed, np.maximum(-0.014 * octaves, 0.002 * octaves), np.inf)
+    selected = np.full(len(images), _TRIED - 1)
+    for tried in (_TRIED, len(_STRENGTHS)):
+        if (selected < _TRIED - 1).all():
+            break
+        # ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel
+        # from all others. The sum over the frequencies is dominated by those with the largest errors; the geometric
+        # mean gives all the same weight. The weaker of the two selected priors is used, as it has the smaller error.
+        explained = sample.explain(precisions[:tried])
+        rest = explained.count[:, None] - explained.freedom
+        with np.errstate(divide="ignore", invalid="ignore"):
+            of_sum = np.log(explained.power.sum(-1)) - 2 * np.log(rest.sum(-1))
+            geometric = (np.log(explained.power) - 2 * np.log(rest)).mean(-1)
+        selected = np.maximum(*((criterion + handicap[:tried]).argmin(0) for criterion in (of_sum, geometric)))
+    result: NDArray[np.float64] = strengths[selected]
+    return result

@@ -34,7 +34,7 @@ class RowPrior:
     """
 
     power: Tensor  # (N, U) variance of a coefficient over the number of columns: that of white noise of variance 1 is 1
-    reflections: Tensor  # (p, N, U) partial correlations, within -1 ... 1
+    reflections: Tensor  # (2, N, U) partial correlations, within -1 ... 1
     # (N, T, U) power of the interpolation error between rows, which counts as noise, of each frame
     interpolation_power: Tensor
 
@@ -50,11 +50,8 @@ class RowPrior:
         The precision of interior rows at distance d is the sum over k. The first and the last rows are predicted from
         fewer rows: for row j it is the sum of the first j + 1 products.
         """
-        first, *others = self.reflections
-        a = torch.stack([torch.ones_like(first), -first])
-        for reflection in others:
-            padded = functional.pad(a, (0, 0, 0, 0, 0, 1))
-            a = padded - reflection * padded.flip(0)
+        first, second = self.reflections
+        a = torch.stack([torch.ones_like(first), -first * (1 - second), -second])
         later = functional.pad(a, (0, 0, 0, 0, 0, ORDER)).unfold(0, len(a), 1)  # a_(k + d), (d, N, U, k)
         return a * later.movedim(-1, 1)
 
@@ -83,22 +80,6 @@ class RowPrior:
 
 
 Table = Any  # a tensor, or an array of NumPy: operators that both have
-
-
-def _levinson(moments: Sequence[Table]) -> tuple[list[Table], list[Table], Table]:
-    """Levinson recursion for p + 1 autocovariances (N, U): partial correlations, filter, variance of the innovation."""
-    variance = moments[0].clip(_TINY, None)
-    filter_, reflections = [variance / variance], []
-    for lag in range(1, len(moments)):
-        error = moments[lag]
-        for k in range(1, lag):
-            error = error + filter_[k] * moments[lag - k]
-        reflection = (error / variance).clip(-0.9995, 0.9995)
-        inner = [filter_[k] - reflection * filter_[lag - k] for k in range(1, lag)]
-        filter_ = [filter_[0], *inner, -reflection]
-        variance = variance - variance * reflection * reflection
-        reflections.append(reflection)
-    return reflections, filter_, variance
 
 
 def _mixing(count: int, weights: Sequence[float], fold: Callable[[Array], Array]) -> Array:
@@ -154,21 +135,22 @@ def _expectation_maximisation(
     scene = excess.clip(0.002 * noise_power, None) * transfer / (transfer * transfer + 1e-2)
     through = transfer * observed
     for _ in range(iterations):
-        # the model of the expected spectrum of the scene
-        lags = pooling @ (scene @ cosine)
-        moments = [lags[..., lag] for lag in range(ORDER + 1)]
-        reflections, filter_, innovation = _levinson(moments)
+        # the model of the expected spectrum of the scene: Levinson recursion for its autocovariances
+        moments = pooling @ (scene @ cosine)
+        power = moments[..., 0].clip(_TINY, None)
+        first = (moments[..., 1] / power).clip(-0.9995, 0.9995)
+        variance = power * (1 - first * first)
+        second = ((moments[..., 2] - first * moments[..., 1]) / variance).clip(-0.9995, 0.9995)
+        innovation = variance * (1 - second * second)
         # squared modulus of the filter, whose terms are of order 1: at least their rounding error
-        modulus: Table = 0.0
-        for lag in range(ORDER + 1):
-            product = sum(first * second for first, second in zip(filter_, filter_[lag:], strict=False))
-            modulus = modulus + ((2.0 if lag else 1.0) * product)[..., None] * cosine[:, lag]
+        a1, a2 = (-first * (1 - second))[..., None], -second[..., None]
+        modulus = 1 + a1 * a1 + a2 * a2 + 2 * a1 * (1 + a2) * cosine[:, 1] + 2 * a2 * cosine[:, 2]
         penalty = modulus.clip(1e-14, None) * (noise_power / innovation[..., None])
         # the expected spectrum for this model: variance and square of the Wiener estimate
         gain = 1.0 / (penalty + transfer)
         scene = gain * noise_power + gain * gain * through
     interpolation = (scene[:, None] * aliases).mean(-1)
-    return moments[0].clip(_TINY, None), reflections, interpolation.clip(_TINY, None)
+    return power, [first, second], interpolation.clip(_TINY, None)
 
 
 def brightness(frames: Tensor) -> Tensor:
