@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import tifffile
 import torch
 from torch import Tensor
@@ -14,13 +13,10 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.validation import Count
 from rsvib_torch.checks.values import check_single
 from rsvib_torch.files.atomic import whole_folder
-from rsvib_torch.frames.orientation import offsets_from_row_order
-from rsvib_torch.motion.field import ColumnMotion
 from rsvib_torch.motion.motion import Motion
-from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import StmapConvention
-from rsvib_torch.restoration.frame_motion import frame_motion
+from rsvib_torch.restoration.frame_motion import recorded_places
 
 Size = tuple[Count, Count]  # (height, width) of the frames in px
 
@@ -66,17 +62,8 @@ def sampling_map(motion: Motion, timing: SensorTiming, size: Size, num_frames: C
 
 def _maps(motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int) -> Iterator[Tensor]:
     """Positions (H, W, 2) for each frame."""
-    rows = num_rows_of(motion, timing, size)
-    columns = size[0] * size[1] // rows
-    row_timing = timing.in_row_order()
-    bounding: Motion = motion.to_row_order(timing).detached().expanded(1)
-    shift = offsets_from_row_order(frame_motion(bounding, row_timing, num_frames, rows).shift, timing)[0]
-    if not motion.same_for_all_columns:
-        ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (columns - 1)
-        bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, rows)
-    frame_motion(bounding, row_timing, num_frames, rows).check_fits(columns)
-    for frame in range(num_frames):
-        places = source_map(motion.detached(), timing, size, frame, shift[frame], np.float64)
+    num_rows_of(motion, timing, size)
+    for places, _ in recorded_places(motion, timing, size, num_frames):
         yield torch.from_numpy(places).movedim(0, -1)
 
 

@@ -41,8 +41,8 @@ def recorded_offsets(
     count, length = (height, width) if along == 1 else (width, height)
     nodes = 1 if motion.same_for_all_columns else _NODES if motion.camera is None else _NODES_WITH_CAMERA
     columns, weights = _interpolation(length, min(nodes, length))
-    pixels = torch.empty(2, count, len(columns), dtype=torch.float64)
-    pixels[along] = torch.arange(count)[:, None]
+    pixels = torch.empty(2, count, len(columns), dtype=torch.float64, device="cpu")
+    pixels[along] = torch.arange(count, device="cpu")[:, None]
     pixels[across] = torch.from_numpy(columns)
     still = pixels if shift is None else pixels - shift[:2, None, None].cpu()
     x, y = still[0] - 0.5 * (width - 1), still[1] - 0.5 * (height - 1)

@@ -8,7 +8,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,11 +21,12 @@ from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.values import check_whole_number
 from rsvib_torch.files.free_memory import check_fits
 from rsvib_torch.frames.column_strips import ColumnStrips
-from rsvib_torch.frames.orientation import frames_from_row_order, offsets_from_row_order
+from rsvib_torch.frames.orientation import offsets_from_row_order
 from rsvib_torch.frames.prepare import PreparedFrames
 from rsvib_torch.imaging.trajectory import exposure_trajectory, rows_and_displacement
 from rsvib_torch.motion.field import ColumnMotion, largest_in_frame, largest_slope
 from rsvib_torch.motion.motion import Motion
+from rsvib_torch.motion.sampling import source_map
 from rsvib_torch.motion.timing import MAX_ROWS, RowTiming, SensorTiming
 
 
@@ -171,25 +172,35 @@ def visible_pixels(
     if vibration.device.type == "cpu":
         needed = 25 * math.prod(batch) * num_frames * height * width  # float64 columns, their comparisons, masks
         check_fits(f"masks of num_frames={num_frames} frames of {height} x {width} px", needed, "pass fewer frames")
-    height, width = (height, width) if timing.scan_axis == -2 else (width, height)
-    rowwise, row_timing = vibration.to_row_order(timing), timing.in_row_order()
+    limits = np.array([width, height])[:, None, None] - 1
+    found = [
+        (((places >= 0) & (places <= limits)).all(0), shift)
+        for one in ([vibration[stack] for stack in range(batch[0])] if batch else [vibration])
+        for places, shift in recorded_places(one, timing, (height, width), num_frames)
+    ]
+    mask = torch.from_numpy(np.stack([visible for visible, _ in found])).to(vibration.device)
+    shift = torch.stack([shift for _, shift in found])
+    return mask.view(*batch, num_frames, height, width), shift.view(*batch, num_frames, 2)
+
+
+def recorded_places(
+    motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int
+) -> Iterator[tuple[NDArray[np.float64], Tensor]]:
+    """The place (2, H, W) in a frame where each pixel of the restored frame was recorded, and its shift (2,), by frame.
+
+    Places and shifts are in px, (x, y) in image axes. The motion is one in image axes, not a batch.
+    """
+    height, width = size if timing.scan_axis == -2 else size[::-1]
+    motion, row_timing = motion.detached(), timing.in_row_order()
     row_timing.check_rows(height)
-    rowwise = rowwise if batch else rowwise.expanded(1)
-    strips = ColumnStrips.of(width, max_pitch=width if rowwise.same_for_all_columns else 16, margin=0)
-    parts = []
-    for first, last, column in zip(strips.edges[:-1], strips.edges[1:], strips.columns, strict=True):
-        of_column = rowwise
-        if not rowwise.same_for_all_columns:
-            of_column = ColumnMotion.of_columns(rowwise, column[None], row_timing, num_frames, height)
-        motion = frame_motion(of_column, row_timing, num_frames, height)
-        motion.check_fits(width)
-        rows, moved = motion.frame_rows(torch.arange(height, dtype=torch.float64, device=vibration.device))
-        columns = torch.arange(first, last, device=vibration.device) + moved[..., :1]
-        visible_rows = ((rows >= 0) & (rows <= height - 1))[..., None]
-        parts.append(visible_rows & (columns >= 0) & (columns <= width - 1))
-    mask = frames_from_row_order(torch.cat(parts, -1), timing)
-    shift = offsets_from_row_order(motion.shift, timing)
-    return (mask, shift) if batch else (mask[0], shift[0])
+    bounding: Motion = motion.to_row_order(timing).expanded(1)
+    shift = offsets_from_row_order(frame_motion(bounding, row_timing, num_frames, height).shift, timing)[0, :, :2]
+    if not motion.same_for_all_columns:
+        ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (width - 1)
+        bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, height)
+    frame_motion(bounding, row_timing, num_frames, height).check_fits(width)
+    for frame in range(num_frames):
+        yield source_map(motion, timing, size, frame, shift[frame], np.float64), shift[frame]
 
 
 def joint_groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:
