@@ -282,10 +282,10 @@ def _warn_if_worse(frames: PreparedFrames, restored: Tensor, motion: FrameMotion
     if frames.images.shape[1] < 2:
         return
     moves = {stack: [bound > 0 for bound in bounds] for stack, bounds in enumerate(motion.bounds) if any(bounds)}
-    verdicts = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=2, columns=160, least="partly")
+    verdicts = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=2, columns=160)
     for stack, verdict in zip(moves, verdicts, strict=True):
         # frames that share no scene cannot be compared
-        if isinstance(verdict, RestorationVerdict):
+        if isinstance(verdict, RestorationVerdict) and verdict.overall in ("partly", "worse"):
             where = f"stack {stack}: " if len(restored) > 1 else ""
             warn_of_restoration(f"{where}{verdict.sentence}")
 

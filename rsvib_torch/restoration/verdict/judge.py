@@ -8,8 +8,6 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -132,20 +130,13 @@ def _mean_square(difference: Tensor) -> Tensor:
     return difference.square().mean((1, 2, 3), dtype=torch.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class _PairVerdicts:
-    """Verdicts on one pair of frames of each of B stacks, in row order; the fields of ``RestorationVerdict``."""
+def _judge_pairs(
+    pair: FramePairs, moves: list[list[bool]], shared: int, *, max_missing: float = 0.5
+) -> tuple[Array, Array, list[tuple[Outcome, tuple[Reason, ...]]]]:
+    """Verdict on one pair of each of B stacks, in row order; not judged if more than ``max_missing`` is missing.
 
-    levels: Array  # (5, B) before, after, noise, chi_square, predicted_gain
-    displacements: Array  # (3, B, 2) misfit_before, misfit_after, resolution
-    outcomes: list[Outcome]  # outcome of each stack
-    reasons: list[tuple[Reason, ...]]  # reasons for each outcome
-
-
-def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_missing: float = 0.5) -> _PairVerdicts:
-    """Verdict on one pair of each stack; not judged if more than ``max_missing`` is missing.
-
-    ``moves`` are the axes with motion of each stack, ``shared`` the frames from which one image is restored.
+    ``moves`` are the axes with motion of each stack, ``shared`` the frames from which one image is restored. The result
+    is ``LEVELS`` (5, B), ``DISPLACEMENTS`` (3, B, 2), and the outcome of each stack with its reasons.
     """
     # Noise of the raw frames; frames that differ in brightness are made equal.
     raw = torch.stack([pair.earlier, pair.later], 1)
@@ -184,8 +175,7 @@ def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_
     # Outcome of each pair.
     displacements = np.stack([misfit_before, misfit_after, resolution])
     figures = np.column_stack([*displacements, *offset, gain, missing])
-    outcomes: list[Outcome] = []
-    reasons: list[tuple[Reason, ...]] = []
+    outcomes: list[tuple[Outcome, tuple[Reason, ...]]] = []
     contradicted = []
     one_image = pair.restored_later is None
     for (*axes, level, share), moving in zip(figures.tolist(), moves, strict=True):
@@ -193,11 +183,10 @@ def _judge_pairs(pair: FramePairs, moves: list[list[bool]], shared: int, *, max_
         contradicted.append((outcome == "worse" and level > 0) or (outcome in ("helps", "partly") and level < 0))
         if share > max_missing:
             outcome, why = "unknown", (Reason("pixels_missing", None, share, max_missing),)
-        outcomes.append(outcome)
-        reasons.append(why)
+        outcomes.append((outcome, why))
     gain = np.where(contradicted, math.nan, gain)
     levels = np.stack([np.sqrt(before), np.sqrt(after), np.sqrt(noise), unexplained / noise, gain])
-    return _PairVerdicts(levels, displacements, outcomes, reasons)
+    return levels, displacements, outcomes
 
 
 @checks_arguments
@@ -330,7 +319,6 @@ def judge_prepared(
     (verdict,) = judge_stacks(frames, restored, motion, moves, joint=joint, most_pairs=most_pairs)
     if isinstance(verdict, TooLittleInCommonError):
         raise verdict
-    assert verdict is not None, "verdicts of all concerns are made"
     return verdict
 
 
@@ -344,13 +332,11 @@ def judge_stacks(
     joint: bool | int = False,
     most_pairs: int | None = None,
     columns: int | None = None,
-    least: Outcome = "helps",
-) -> list[RestorationVerdict | TooLittleInCommonError | None]:
+) -> list[RestorationVerdict | TooLittleInCommonError]:
     """Verdicts on stacks of a batch, which are judged together, or errors if two frames have too little in common.
 
     Restored frames (B, T, C, H, W), or (B, 1, C, H, W), are in row order, verdicts in image axes. ``moves`` has the
-    stacks to judge with their axes with motion. Only the ``columns`` with the most detail are used. Verdicts of less
-    concern than ``least`` are None.
+    stacks to judge with their axes with motion. Only the ``columns`` with the most detail are used.
     """
     limit = None if most_pairs is None else check_whole_number("most_pairs", most_pairs, at_least=1)
     dtype = torch.promote_types(frames.images.dtype, restored.dtype)
@@ -362,91 +348,77 @@ def judge_stacks(
     numbers = sorted({frame for pair in pairs for frame in pair})
     if len(numbers) < count:
         every = every.of(list(range(len(raw))), numbers)
-    task = _Task(
-        [(numbers.index(earlier), numbers.index(later)) for earlier, later in pairs],
-        numbers,
-        len(joint_groups(count, joint)[0][0]),
-        columns,
-        frames.image_timing,
-        steps(len(moves), "stacks"),
-        least,
-    )
+    compared = [(numbers.index(earlier), numbers.index(later)) for earlier, later in pairs]
+    shared = len(joint_groups(count, joint)[0][0])  # frames from which one image is restored
+    advance = steps(len(moves), "stacks")
 
     # as many stacks at a time as the memory allows
     pixels = raw.shape[2] * raw.shape[3] * min(columns or raw.shape[4], raw.shape[4])
     together = at_once(16 * pixels, raw.device, cpu_bytes=2**26)
-    verdicts: list[RestorationVerdict | TooLittleInCommonError | None] = []
+    verdicts: list[RestorationVerdict | TooLittleInCommonError] = []
     for chosen in (list(moves)[part] for part in runs(len(moves), together)):
         some = every if len(chosen) == len(raw) else every.of(chosen)  # all are judged without a copy
-        verdicts += _judge_batch(_judged_strip(some), [moves[stack] for stack in chosen], task)
+        moving = [moves[stack] for stack in chosen]
+        verdicts += _judge_batch(_judged_strip(some), moving, compared, numbers, shared, columns, frames.image_timing)
+        advance(len(chosen))
     return verdicts
 
 
-@dataclass(frozen=True)
-class _Task:
-    """What the verdicts on the stacks of a batch have in common."""
-
-    pairs: list[tuple[int, int]]  # frames to compare, counted among those
-    numbers: list[int]  # of these frames in the stack
-    shared: int  # frames from which one image is restored
-    columns: int | None  # judge on so many columns only, those with the most detail; None for all
-    timing: SensorTiming  # the sensor in image orientation
-    advance: Callable[[int], None]  # to be called with the number of stacks that were judged
-    least: Outcome  # the least concern of which verdicts are made
-
-
 def _judge_batch(
-    frames: ComparedFrames, moves: list[list[bool]], task: _Task
-) -> list[RestorationVerdict | TooLittleInCommonError | None]:
-    """Verdicts on all stacks of a batch, whose displacement depends on the row only."""
+    frames: ComparedFrames,
+    moves: list[list[bool]],
+    pairs: list[tuple[int, int]],
+    numbers: list[int],
+    shared: int,
+    columns: int | None,
+    timing: SensorTiming,
+) -> list[RestorationVerdict | TooLittleInCommonError]:
+    """Verdicts on all stacks of a batch, whose displacement depends on the row only.
+
+    The ``pairs`` are counted among the frames that are compared, which have ``numbers`` in the stack. One image is
+    restored from ``shared`` frames. The timing is in image orientation; ``columns`` as in ``judge_stacks``.
+    """
     # What the frames of each pair have in common. Stacks with too little are not judged; stacks whose parts of one size
     # would be too small are judged one by one.
-    stacks, size = range(len(frames.raw)), (frames.raw.shape[-2], frames.raw.shape[-1])
-    common = overlaps(frames, task.pairs)
-    errors = [_too_little(of_stack, task, size) for of_stack in common]
-    shared = [Overlap.of_all([of_stack[pair] for of_stack in common]) for pair in range(len(task.pairs))]
-    if any(errors) or not all(one.is_enough(size) for one in shared):
-        results: list[RestorationVerdict | TooLittleInCommonError | None] = []
-        for stack, error in enumerate(errors):
-            results += [error] if error else _judge_batch(frames.of([stack]), [moves[stack]], task)
+    size = frames.raw.shape[-2], frames.raw.shape[-1]
+    common = overlaps(frames, pairs)
+    small = [[not overlap.is_enough(size) for overlap in of_stack] for of_stack in common]
+    smallest = [Overlap.of_all([of_stack[pair] for of_stack in common]) for pair in range(len(pairs))]
+    if not all(one.is_enough(size) for one in smallest):
+        results: list[RestorationVerdict | TooLittleInCommonError] = []
+        for stack, of_stack in enumerate(common):
+            if any(small[stack]):
+                (y, x), pair = (values[small[stack].index(True)] for values in ([one.step for one in of_stack], pairs))
+                earlier, later = (numbers[frame] for frame in pair)
+                apart = f"they lie ({x}, {y}) px apart"
+                results.append(
+                    TooLittleInCommonError(
+                        f"frames {earlier} and {later} have nothing in common, or too little: {apart}"
+                    )
+                )
+            else:
+                alone = frames.of([stack])
+                results += _judge_batch(alone, [moves[stack]], pairs, numbers, shared, columns, timing)
         return results
 
     # The verdict on each pair of frames, of all stacks.
-    verdicts = []
-    for number, pair in enumerate(task.pairs):
-        of_stacks = [of_stack[number] for of_stack in common]
-        part = shared_part(frames, pair, of_stacks, task.columns)
-        verdicts.append(_judge_pairs(part, moves, task.shared))
-    task.advance(len(stacks))
-
-    # One result for each stack, in image axes.
-    levels = np.stack([verdict.levels for verdict in verdicts], -1)  # (5, B, P)
-    displacements = np.stack([verdict.displacements for verdict in verdicts], -2)  # (3, B, P, 2)
-    if task.timing.scan_axis == -1:
-        displacements = displacements[..., ::-1].copy()
-    levels_of, displacements_of = (
-        torch.from_numpy(values).to(frames.raw.device).flatten(0, 1).unbind() for values in (levels, displacements)
-    )
-    concerns = [max(OUTCOMES.index(verdict.outcomes[stack]) for verdict in verdicts) for stack in stacks]
-    return [
-        None
-        if concern < OUTCOMES.index(task.least)
-        else RestorationVerdict(
-            **dict(zip(LEVELS, levels_of[stack :: len(stacks)], strict=True)),
-            **dict(zip(DISPLACEMENTS, displacements_of[stack :: len(stacks)], strict=True)),
-            outcome=tuple(verdict.outcomes[stack] for verdict in verdicts),
-            findings=tuple(reasons_from_row_order(verdict.reasons[stack], task.timing) for verdict in verdicts),
-        )
-        for stack, concern in enumerate(concerns)
+    verdicts = [
+        _judge_pairs(shared_part(frames, pair, [of_stack[number] for of_stack in common], columns), moves, shared)
+        for number, pair in enumerate(pairs)
     ]
 
-
-def _too_little(common: list[Overlap], task: _Task, size: tuple[int, int]) -> TooLittleInCommonError | None:
-    """An error for the first pair of frames with too little in common."""
-    for overlap, pair in zip(common, task.pairs, strict=True):
-        if not overlap.is_enough(size):
-            (y, x), (earlier, later) = overlap.step, (task.numbers[frame] for frame in pair)
-            return TooLittleInCommonError(
-                f"frames {earlier} and {later} have nothing in common, or too little: they lie ({x}, {y}) px apart"
-            )
-    return None
+    # One result for each stack, in image axes.
+    levels = np.stack([levels for levels, *_ in verdicts], -1)  # (5, B, P)
+    displacements = np.stack([displacements for _, displacements, _ in verdicts], -2)  # (3, B, P, 2)
+    if timing.scan_axis == -1:
+        displacements = displacements[..., ::-1].copy()
+    of_levels, of_displacements = (torch.from_numpy(values).to(frames.raw.device) for values in (levels, displacements))
+    return [
+        RestorationVerdict(
+            **dict(zip(LEVELS, of_levels[:, stack], strict=True)),
+            **dict(zip(DISPLACEMENTS, of_displacements[:, stack], strict=True)),
+            outcome=tuple(outcomes[stack][0] for *_, outcomes in verdicts),
+            findings=tuple(reasons_from_row_order(outcomes[stack][1], timing) for *_, outcomes in verdicts),
+        )
+        for stack in range(len(common))
+    ]
