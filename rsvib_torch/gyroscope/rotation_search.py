@@ -9,6 +9,7 @@ import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -86,7 +87,15 @@ def search_orientations(
     of_moved = torch.einsum("min,mi->n", orthogonal, moved)
     energy = moved.square().sum() - of_moved.square().sum()
     products, squares = [], []
-    angles = _Angles(rates, step)
+    # integrals of the rates at equally spaced times, interpolated linearly: 20 times faster than the spline
+    knots = np.arange(rates.start, rates.end + step, min(0.5 / rates.sample_rate, step))
+    integrals = rates.rotation(
+        torch.full((len(knots),), rates.start, dtype=torch.float64, device="cpu"), torch.from_numpy(knots)
+    )
+
+    def angles(at: Tensor) -> Tensor:
+        return torch.from_numpy(np.stack([np.interp(at.numpy(), knots, axis) for axis in integrals.mT.numpy()], -1))
+
     for part in grid.split(256):
         turned = angles(part[:, None] + times[:, 1]) - angles(part[:, None] + times[:, 0])  # (offset, corner, axis)
         both = (turned[..., :, None] * turned[..., None, :]).flatten(2)
@@ -126,20 +135,3 @@ def search_orientations(
     return OrientationSearch(
         tuple(starts), tuple(others), mirrored.orientation if mirrored.cost < 0.5 * starts[0].cost else None
     )
-
-
-class _Angles:
-    """Integrals of the rates at equally spaced times, interpolated linearly: 20 times faster than the spline."""
-
-    def __init__(self, rates: AngularRates, step: float) -> None:
-        step = min(0.5 / rates.sample_rate, step)
-        count = math.ceil((rates.end - rates.start) / step) + 2
-        times = rates.start + step * torch.arange(count, dtype=torch.float64)
-        self.start, self.step = rates.start, step
-        self.values = rates.rotation(torch.full_like(times, rates.start), times)
-
-    def __call__(self, times: Tensor) -> Tensor:
-        place = ((times - self.start) / self.step).clamp(0, len(self.values) - 2)
-        index = place.floor()
-        share, index = (place - index)[..., None], index.long()
-        return torch.lerp(self.values[index], self.values[index + 1], share)
