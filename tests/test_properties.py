@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsvib_torch import FreeMotion, SensorTiming, Vibration, row_psf
+from rsvib_torch import SensorTiming, Vibration, row_psf
 from rsvib_torch.imaging import blur_rows, blur_rows_adjoint
 
 few = settings(max_examples=20, deadline=None, derandomize=True, database=None)
@@ -36,14 +36,6 @@ def vibrations(draw, largest=4.0):
 
 
 @st.composite
-def motions(draw):
-    tones = draw(vibrations())
-    if draw(st.booleans()):
-        return tones
-    return FreeMotion(random_tensor(draw(seeds), 2, draw(st.integers(4, 12))), -0.01, 5e-3, tones)
-
-
-@st.composite
 def timings(draw):
     return SensorTiming(
         row_time=draw(numbers(1e-5, 1e-4)),
@@ -56,18 +48,6 @@ def timings(draw):
 
 def random_tensor(seed, *shape):
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-@settings(few, max_examples=8)
-@given(motions(), timings(), numbers(0.0, 0.05))
-def test_offset_is_later_minus_earlier_and_changes_sign_with_the_order(motion, timing, start):
-    starts = torch.linspace(start, start + 0.02, 9, dtype=torch.float64)
-    later = starts + timing.frame_period
-    offset = motion.offset(starts, later, timing.exposure_time)
-    torch.testing.assert_close(offset, -motion.offset(later, starts, timing.exposure_time), rtol=0, atol=1e-12)
-    nodes = (torch.arange(400, dtype=torch.float64) + 0.5) / 400 * timing.exposure_time
-    means = [motion.displacement(times[:, None] + nodes).mean(1) for times in (starts, later)]
-    torch.testing.assert_close(offset, means[1] - means[0], rtol=0, atol=2e-3)
 
 
 @few

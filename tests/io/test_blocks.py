@@ -77,8 +77,7 @@ def test_channels_last_in_chunks_of_several_frames(tmp_path):
     reader.close()
 
 
-@pytest.mark.parametrize("axes", ["CTYX", "TXY", "CTXY"])
-@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize(("axes", "compression"), [("CTYX", None), ("TXY", "zlib"), ("CTXY", "zlib")])
 def test_pages_and_axes_in_any_order(tmp_path, axes, compression):
     counts, names = (COLOUR, "TCYX") if "C" in axes else (COUNTS, "TYX")
     write_tiff(tmp_path / "a.tif", axes, counts, names, bigtiff=True, byteorder=">", compression=compression)

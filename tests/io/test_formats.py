@@ -27,8 +27,7 @@ COUNTS.flat[0] = 4095
 
 
 @pytest.mark.parametrize("ending", [".h5", ".zarr", ".raw"])
-@pytest.mark.parametrize("shape", [(3, 9, 7), (2, 3, 9, 7), (1, 5, 9, 7)])
-@pytest.mark.parametrize("dtype", ["uint8", "uint16", "int32", "float32", "float64"])
+@pytest.mark.parametrize(("shape", "dtype"), [((3, 9, 7), "uint8"), ((2, 3, 9, 7), "int32"), ((1, 5, 9, 7), "float64")])
 def test_stacks_are_read_as_written(tmp_path, ending, shape, dtype):
     path = tmp_path / f"frames{ending}"
     stored = np.random.default_rng(3).integers(0, 256, shape) / 255
@@ -53,8 +52,7 @@ def test_files_can_be_read_by_other_libraries(tmp_path):
     np.testing.assert_array_equal(np.fromfile(tmp_path / "a.raw", "<u2").reshape(3, 9, 7), COUNTS)
 
 
-@pytest.mark.parametrize("compression", ["zlib", "lzma", "lzw", "zstd"])
-@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize(("compression", "big"), [("zlib", True), ("lzma", False), ("lzw", False), ("zstd", True)])
 def test_compressed_tiff_of_other_programs_is_read(tmp_path, compression, big):
     path = tmp_path / "frames.tif"
     tifffile.imwrite(

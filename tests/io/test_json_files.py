@@ -4,21 +4,12 @@ import json
 from dataclasses import replace
 
 import pytest
-import torch
-from detections import detection_of
 
-from rsvib_torch.motion.detected_vibration import DetectedVibration
 from rsvib_torch.motion.timing import SensorTiming
-from rsvib_torch.motion.vibration import Vibration
 from rsvib_torch.report.results import check_same_timing
-from rsvib_torch.results.presentation import plain_values
-from rsvib_torch.results.result_files import decode
 from rsvib_torch.stacks import read_manifest
 
 TIMING = SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=104)
-VIBRATION = Vibration(
-    [[2.0, 0.5], [1.0, 0.0]], [[60.0, 145.1], [1 / 3, 0.0]], 0.3, [20.0, 0.0], [0.0, -3.0], [1.5, 0.0]
-)
 WINDOW = {
     "window": 0,
     "first": 0,
@@ -44,28 +35,6 @@ MANIFEST = {
     "bad_frames": {},
     "windows": [WINDOW, WINDOW | {"window": 1}],
 }
-
-
-def stored(value):
-    return json.loads(json.dumps(plain_values(value)))
-
-
-def test_detection_is_read_back_exactly():
-    detection = detection_of(VIBRATION, reasons=(("blind",), ()))
-    detection.std.frequency[1, 1] = torch.inf
-    back = decode(DetectedVibration, stored(detection), "detection")
-    for name, values in vars(VIBRATION).items():
-        if isinstance(values, torch.Tensor):
-            torch.testing.assert_close(getattr(back.vibration, name), values, rtol=0, atol=0)
-    torch.testing.assert_close(back.std.frequency, detection.std.frequency, rtol=0, atol=0)
-    assert (back.reliable.tolist(), back.reasons) == ([True, True], (("blind",), ()))
-
-
-def test_different_numbers_of_tones_are_refused():
-    data = stored(detection_of(VIBRATION))
-    data["std"]["phase"] = [[0.1], [0.1]]
-    with pytest.raises(ValueError, match=r"^detection\.std: phase must have shape .* K = 2, got \(2, 1\)"):
-        decode(DetectedVibration, data, "detection")
 
 
 @pytest.mark.parametrize(

@@ -44,13 +44,6 @@ def test_hdf5_times_of_other_files_are_not_read(tmp_path):
     assert read_stack_info(tmp_path / "a.h5").frame_times is None
 
 
-def test_start_times_of_many_frames_are_a_valid_configuration(tmp_path):
-    times = ", ".join(f"{0.01 * n:.4f}" for n in range(5000))
-    camera = f"[sensor] # with points ......\nrow_time = 1e-4\nexposure_rows = 6\nframe_rows = 90\n# {'.' * 200}\n"
-    (tmp_path / "a.toml").write_text(f"{camera}frame_start_times = [{times}]\n")
-    assert len(read_config(tmp_path / "a.toml").timing.frame_start_times) == 5000
-
-
 @pytest.mark.parametrize("several", [False, True])
 def test_stack_that_does_not_fit_is_refused_before_it_is_read(tmp_path, set_free, several):
     path = tmp_path / "a.npy"

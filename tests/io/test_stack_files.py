@@ -15,12 +15,18 @@ def draw_counts(shape, largest, dtype="uint16"):
     return values.astype(dtype)
 
 
-COUNTS = [("uint8", 255), ("uint8", 63), ("uint16", 4095), ("uint16", 65535), ("uint16", 1000)]
-SHAPES = [(1, 9, 7), (3, 9, 7), (2, 3, 9, 7), (2, 4, 9, 7), (1, 3, 9, 7)]
+STACKS = [
+    ((1, 9, 7), "uint8", 255),
+    ((3, 9, 7), "uint16", 4095),
+    ((2, 3, 9, 7), "uint8", 63),
+    ((2, 4, 9, 7), "uint16", 65535),
+    ((1, 3, 9, 7), "uint16", 1000),
+]
 
 
-@pytest.mark.parametrize("shape", [*SHAPES, (2, 2, 9, 7), (2, 5, 9, 7)])
-@pytest.mark.parametrize(("dtype", "largest"), [*COUNTS, ("int16", 4095), ("uint32", 100000)])
+@pytest.mark.parametrize(
+    ("shape", "dtype", "largest"), [*STACKS, ((2, 2, 9, 7), "int16", 4095), ((2, 5, 9, 7), "uint32", 100000)]
+)
 def test_tiff_round_trip_keeps_counts_and_full_scale(tmp_path, shape, dtype, largest):
     stored = draw_counts(shape, largest, dtype)
     path = tmp_path / "frames.tif"
@@ -38,8 +44,7 @@ def test_tiff_round_trip_keeps_counts_and_full_scale(tmp_path, shape, dtype, lar
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "again.tif"), tifffile.imread(path))
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(("dtype", "largest"), COUNTS)
+@pytest.mark.parametrize(("shape", "dtype", "largest"), STACKS)
 def test_png_folder_round_trip_keeps_counts_and_full_scale(tmp_path, shape, dtype, largest):
     stored = draw_counts(shape, largest, dtype)
     path = tmp_path / "frames"

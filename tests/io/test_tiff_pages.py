@@ -48,8 +48,10 @@ def check_frames(path, expected):
     reader.close()
 
 
-@pytest.mark.parametrize("case", GREY_PAGES)
-@pytest.mark.parametrize("file_options", [{}, {"bigtiff": True, "byteorder": ">"}])
+@pytest.mark.parametrize(
+    ("case", "file_options"),
+    [*((case, {}) for case in GREY_PAGES), ("some zlib, no metadata", {"bigtiff": True, "byteorder": ">"})],
+)
 def test_grey_pages_are_one_stack(tmp_path, case, file_options):
     write_pages(tmp_path / "a.tif", GREY, GREY_PAGES[case], **file_options)
     check_frames(tmp_path / "a.tif", GREY)
@@ -98,8 +100,7 @@ def test_thumbnails_masks_and_pyramids_are_not_frames(tmp_path):
     check_frames(tmp_path / "only.tif", GREY)
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 9])
-@pytest.mark.parametrize("metadata", [None, {}])
+@pytest.mark.parametrize(("number", "metadata"), [(1, None), (3, {}), (9, None)])
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [

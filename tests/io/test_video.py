@@ -11,13 +11,12 @@ import torch
 from program import rsvib
 from refusals import refuses
 from small_stack import CAMERA, STILL
-from small_video import PERIOD, draw_frames, sound_of, write_clip, write_video
+from small_video import PERIOD, sound_of, write_clip, write_video
 from truth import decibel
 
 from rsvib_torch.io import FrameError, StackInfo, open_stack, read_stack, read_stack_info, write_stack
 
 TIMES = np.arange(6) / 30
-VARIABLE = np.cumsum([0, 1, 1.31, 1, 1, 1.17, 1, 1]) * PERIOD
 DROPPED = np.array([0, 1, 2, 4, 5, 9, 10, 11]) * PERIOD
 
 
@@ -32,11 +31,10 @@ def write_config(tmp_path):
     return tmp_path
 
 
-GREY = [(8, "gray", None), *((bits, f"gray{bits}le", None) for bits in (10, 12, 14, 16))]
-COLOUR = [(8, "rgb24", "bgr0"), *((bits, f"gbrp{bits}le", None) for bits in (10, 12, 16))]
-
-
-@pytest.mark.parametrize(("bits", "layout", "encoded"), GREY + COLOUR)
+@pytest.mark.parametrize(
+    ("bits", "layout", "encoded"),
+    [(8, "gray", None), (10, "gray10le", None), (16, "gray16le", None), (8, "rgb24", "bgr0"), (12, "gbrp12le", None)],
+)
 def test_videos_keep_their_depth(tmp_path, bits, layout, encoded):
     counts = noise(bits, *(() if "gray" in layout else (3,)))
     write_video(tmp_path / "a.mkv", counts, TIMES, layout=layout, encoded=encoded, unit=Fraction(1, 30))
@@ -61,7 +59,7 @@ def test_ten_bits_of_a_yuv_video_are_not_reduced_to_eight(tmp_path):
     np.testing.assert_allclose(frames[1, 1, 20], ramp / 65535, atol=1.2e-3)  # one step of 10 bits
 
 
-@pytest.mark.parametrize("full_scale", [200, 4000, 40000])
+@pytest.mark.parametrize("full_scale", [200, 4000])
 def test_other_full_scales_are_scaled_to_the_depth_of_the_video(tmp_path, full_scale):
     frames = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(1))
     dtype = "uint8" if full_scale < 256 else "uint16"
@@ -113,20 +111,14 @@ def test_a_rotated_video_is_read_as_stored_and_restored_in_the_same_orientation(
     assert min(decibel(frame, STILL, 12) for frame in frames) > 34
 
 
-@pytest.mark.parametrize(("command", "times"), [("run", VARIABLE), ("restore", DROPPED)])
-def test_time_stamps_are_used_and_kept_with_the_sound(place, command, times):
-    write_clip(place / "clip.mp4", times)
-    config = ("--config", place / "camera.toml")
-    if command == "run":
-        assert rsvib("run", place / "clip.mp4", place / "out", *config, "--output", "restored.mp4") == 0
-        restored = place / "out" / "restored.mp4"
-    else:
-        restored = place / "restored.mp4"
-        assert rsvib("detect", place / "clip.mp4", *config, "--out", place / "found") == 0
-        found = json.loads((place / "found" / "vibration.json").read_text())
-        assert found["timing"]["frame_start_times"] == pytest.approx(times, abs=2e-5)
-        vibration = ("--vibration", place / "found" / "vibration.json")
-        assert rsvib("restore", place / "clip.mp4", restored, *config, *vibration) == 0
+def test_time_stamps_are_used_and_kept_with_the_sound(place):
+    write_clip(place / "clip.mp4", DROPPED)
+    config, restored = ("--config", place / "camera.toml"), place / "restored.mp4"
+    assert rsvib("detect", place / "clip.mp4", *config, "--out", place / "found") == 0
+    found = json.loads((place / "found" / "vibration.json").read_text())
+    assert found["timing"]["frame_start_times"] == pytest.approx(DROPPED, abs=2e-5)
+    vibration = ("--vibration", place / "found" / "vibration.json")
+    assert rsvib("restore", place / "clip.mp4", restored, *config, *vibration) == 0
     frames = read_stack(restored).mean(1).numpy()
     assert min(decibel(frame, STILL, 12) for frame in frames) > 34
     assert read_stack_info(restored).frame_times == read_stack_info(place / "clip.mp4").frame_times
@@ -144,14 +136,6 @@ def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
     assert read_stack_info(place / "out" / "restored.mp4").frame_times == pytest.approx(np.arange(8) / 25)
 
 
-def test_a_stack_without_times_is_written_with_the_frame_rate_of_the_sensor(place):
-    counts = draw_frames(np.arange(4) * PERIOD)
-    np.save(place / "frames.npy", counts)
-    arguments = ("--config", place / "camera.toml", "--output", "restored.mp4")
-    assert rsvib("run", place / "frames.npy", place / "out", *arguments) == 0
-    assert read_stack_info(place / "out" / "restored.mp4").frame_times == pytest.approx(np.arange(4) * PERIOD, abs=2e-5)
-
-
 def test_frames_can_be_read_in_any_order(tmp_path):
     """H.264 stores frames in another order than it presents them."""
     times = np.arange(12) / 30
@@ -161,21 +145,6 @@ def test_frames_can_be_read_in_any_order(tmp_path):
     for index in (7, 3, 11, 0, 0, 5):
         assert reader.frame(index).mean() == pytest.approx(20 * index, abs=3)
     reader.close()
-
-
-def test_damage_does_not_affect_other_frames(tmp_path):
-    path = tmp_path / "a.mkv"
-    frames = torch.from_numpy(noise(8) / np.float32(255))
-    write_stack(path, frames, dtype="uint8", like=StackInfo((6, 48, 64), "uint8", 255.0, frame_rate=25.0))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 600] = bytes(600)
-    path.write_bytes(data)
-    reader = open_stack(path)
-    start, taken = reader.info.frame_times[0], []
-    for index, time in enumerate(reader.info.frame_times):
-        taken.append(np.array_equal(reader.frame(index), noise(8)[round((time - start) * 25)]))
-    reader.close()
-    assert sum(taken) >= 4
 
 
 @pytest.mark.parametrize(

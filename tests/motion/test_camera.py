@@ -90,15 +90,6 @@ def test_motion_in_row_order_displaces_turned_images_alike(scan_axis, direction)
     assert rowwise.from_row_order(timing).camera == LENS
 
 
-def test_attitude_is_the_rotation_of_the_camera():
-    motion = rsv.Vibration((2.0, 1.0, 1e-3), (50.0, 40.0, 30.0), (0.5, 0.7, 0.9), camera=rsv.Camera(800.0))
-    times = torch.linspace(0, 0.1, 5, dtype=torch.float64)
-    x, y, theta = motion.displacement(times).unbind(-1)
-    torch.testing.assert_close(motion.attitude(times), torch.stack([y / 800, -x / 800, -theta], -1))
-    with pytest.raises(ValueError, match="requires a motion with a camera"):
-        rsv.Vibration(2.0, 50.0).attitude(times)
-
-
 def test_simulated_frames_equal_a_scene_sampled_through_the_lens():
     camera, height, width, margin = rsv.Camera(300.0, (6.5, 9.5), (-0.12, 0.05, 1e-3, -2e-3, 0.01)), 120, 160, 40
     scene = gaussian_filter(city_and_fields(height + 2 * margin, width + 2 * margin, seed=3).double().numpy(), 1.0)

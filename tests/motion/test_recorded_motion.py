@@ -38,12 +38,6 @@ def test_rates_are_integrated_and_times_scaled(tmp_path):
     assert np.allclose(found[:, 1] - found[:, 1].mean(), 1000 * (y - y.mean()), atol=0.02)
 
 
-def test_pixels_are_not_scaled(tmp_path):
-    path = write(tmp_path / "a.csv", (CLOCK, np.sin(9 * CLOCK), CLOCK))
-    found = read_motion(path, unit="px").displacement(torch.from_numpy(CLOCK)).numpy()
-    assert np.allclose(found[:, 1], CLOCK - CLOCK.mean(), atol=1e-6)
-
-
 def changed(place, time):
     clock = CLOCK.copy()
     clock[place] = time

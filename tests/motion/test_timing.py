@@ -41,12 +41,6 @@ def test_scan_axis_names(given, kept):
     assert in_rows.frame_period == timing.frame_period
 
 
-@pytest.mark.parametrize("name", GOOD)
-def test_times_have_no_defaults(name):
-    with pytest.raises(TypeError, match=name):
-        SensorTiming(**{key: value for key, value in GOOD.items() if key != name})
-
-
 @pytest.mark.parametrize(
     ("values", "error", "message"),
     [

@@ -58,17 +58,6 @@ def test_tones_are_sorted_by_amplitude():
         assert torch.equal(getattr(mixed, name), getattr(vibration(), name))
 
 
-def test_shapes_and_defaults():
-    one = Vibration(2.0, 50.0)
-    assert one.amplitude.tolist() == [[2.0], [2.0]]
-    assert one.phase.tolist() == [[0.0], [0.0]]
-    assert one.image_motion.tolist() == [0.0, 0.0]
-    assert one.period.tolist() == [[0.02], [0.02]]
-    assert one.amplitude.dtype == torch.float64
-    assert Vibration.still().displacement(torch.linspace(0, 1, 5)).abs().max() == 0
-    assert math.isinf(Vibration.still().period[0, 0])
-
-
 def test_batch_equals_singles():
     amplitude = torch.rand(3, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     batch = Vibration(amplitude, torch.from_numpy(FREQUENCY), torch.from_numpy(PHASE), MOTION)
