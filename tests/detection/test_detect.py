@@ -53,9 +53,8 @@ def pairs(paper_camera):
 
 
 @pytest.mark.parametrize("registration", METHODS)
-@pytest.mark.parametrize("case", range(2))
-def test_paper_pair(pairs, paper_camera, registration, case):
-    frames, motion = pairs[case]
+def test_paper_pair(pairs, paper_camera, registration):
+    frames, motion = pairs[0]
     result = detect_bands(frames, paper_camera, registration=registration)
     check(result, motion, *LIMITS[registration])
     assert result.vibration.amplitude.shape == (2, 1)
@@ -71,22 +70,20 @@ def test_paper_pair(pairs, paper_camera, registration, case):
     assert bool((result.residual < 0.06 * size).all())
 
 
-@pytest.mark.parametrize("registration", METHODS)
-def test_image_motion_is_separated(paper_camera, registration):
+def test_image_motion_is_separated(paper_camera):
     motion = Motion(phase=random_phase(5), image_motion=(500.0, -240.0))
-    frames = recorded((2048, 704), paper_camera, motion, 2, NOISE, seed=5, margin=60)
-    result = detect_bands(frames, paper_camera, registration=registration)
-    check(result, motion, *LIMITS[registration])
+    frames = recorded((2048, 384), paper_camera, motion, 2, NOISE, seed=5, margin=60)
+    result = detect_bands(frames, paper_camera)
+    check(result, motion, *LIMITS["ncc"])
     assert result.vibration.image_motion.tolist() == pytest.approx([500.0, -240.0], abs=3.0)
     assert bool(result.reliable.all())
 
 
-@pytest.mark.parametrize("registration", METHODS)
-def test_no_tone_is_detected_without_vibration(paper_camera, registration):
+def test_no_tone_is_detected_without_vibration(paper_camera):
     image_motion = (300.0, 150.0)
     motion = Motion(amplitude=(0.0, 0.0), image_motion=image_motion)
     frames = recorded((2048, 384), paper_camera, motion, 2, NOISE, seed=4, margin=60)
-    result = detect_bands(frames, paper_camera, registration=registration)
+    result = detect_bands(frames, paper_camera)
     assert bool((result.vibration.amplitude == 0).all())
     assert result.reliable.tolist() == [False, False]
     assert all("no_tone" in {reason.code for reason in of_axis} for of_axis in result.findings)
@@ -108,18 +105,17 @@ def test_number_of_tones_can_be_set(pairs, paper_camera):
     assert bool((result.vibration.amplitude[:, 1] < 0.1 * result.vibration.amplitude[:, 0]).all())
 
 
-@pytest.mark.parametrize("registration", METHODS)
-def test_batch_equals_single_stacks(paper_camera, registration):
+def test_batch_equals_single_stacks():
     timing = SensorTiming(row_time=40e-6, exposure_rows=10, frame_rows=1100)
     stacks = []
     for seed in (1, 2):
         motion = Motion(phase=random_phase(seed), frequency=(61.0, 47.0 + seed))
         grey = recorded((640, 256), timing, motion, 2, NOISE, seed=seed)
         stacks.append(torch.stack([grey, 0.5 * grey, 0.2 + grey], dim=1))
-    together = detect_bands(torch.stack(stacks), timing, registration=registration)
+    together = detect_bands(torch.stack(stacks), timing)
     assert together.vibration.batch_shape == (2,)
     for index, stack in enumerate(stacks):
-        alone = detect_bands(stack, timing, registration=registration)
+        alone = detect_bands(stack, timing)
         one = together[index]
         for name in ("amplitude", "frequency", "phase", "image_motion"):
             torch.testing.assert_close(
@@ -132,9 +128,9 @@ def test_batch_equals_single_stacks(paper_camera, registration):
         assert one.reliable.tolist() == alone.reliable.tolist()
 
 
-@pytest.mark.parametrize("distance", [60, 110])  # px of 150
-def test_frames_with_little_overlap_do_not_affect_the_other_stacks_of_a_batch(distance):
+def test_frames_with_little_overlap_do_not_affect_the_other_stacks_of_a_batch():
     timing, motion = SensorTiming(row_time=40e-6, exposure_rows=20, frame_rows=300), Motion(frequency=(110.0, 90.0))
+    distance = 110  # px of 150
     wide = recorded((280, 150 + distance), timing, motion, 2, NOISE, seed=5)
     apart = torch.stack([wide[0, :, :150], wide[1, :, distance:]])
     together = detect_vibration(torch.stack([apart, wide[:, :, :150]])[:, :, None], timing, search=8)
@@ -144,7 +140,7 @@ def test_frames_with_little_overlap_do_not_affect_the_other_stacks_of_a_batch(di
     torch.testing.assert_close(amplitude, alone.vibration.amplitude, rtol=0, atol=0.02)  # px
 
 
-@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "forward"), (-1, "reverse")])
+@pytest.mark.parametrize(("scan_axis", "direction"), [(-2, "reverse"), (-1, "reverse")])
 def test_orientation(pairs, paper_camera, scan_axis, direction):
     """The result for transposed or flipped frames is the transposed or flipped result."""
     frames, motion = pairs[0]
@@ -190,25 +186,23 @@ def test_standard_deviations_from_frames_agree_with_errors(paper_camera):
     assert 0.1 < spread < 2
 
 
-@pytest.mark.parametrize("method", ["bands", "direct"])
-def test_columns_with_detail_are_selected(pairs, paper_camera, method):
+def test_columns_with_detail_are_selected(pairs, paper_camera):
     """Each stack has detail in different columns, the others are constant; also for a transposed stack."""
     (first, _), (second, _) = pairs
     flat = torch.full_like(first[..., :80], 0.5)
     left, right = torch.cat([first[..., :192], flat, flat], -1), torch.cat([flat, second[..., :192], flat], -1)
     noise = 0.001 * torch.randn(right.shape, generator=torch.Generator().manual_seed(1))
     batch = torch.stack([left, right])[:, :, None] + noise[:, None]
-    found = detect_vibration(batch, paper_camera, method=method, columns=160)
+    found = detect_vibration(batch, paper_camera, columns=160)
     for index, frames in enumerate((left + noise, right + noise)):
-        alone = detect_vibration(frames, paper_camera, method=method, columns=160)
+        alone = detect_vibration(frames, paper_camera, columns=160)
         torch.testing.assert_close(found[index].vibration.amplitude, alone.vibration.amplitude, rtol=1e-4, atol=0)
         assert alone.reliable.all()
         motion = pairs[index][1]
         assert errors(alone, motion)[1] < 1.0
     sideways = replace(paper_camera, scan_axis=-1)
-    turned = detect_vibration(
-        (left + noise).transpose(-2, -1).contiguous(), sideways, method=method, columns=160
-    ).vibration.amplitude
+    sideways_frames = (left + noise).transpose(-2, -1).contiguous()
+    turned = detect_vibration(sideways_frames, sideways, columns=160).vibration.amplitude
     torch.testing.assert_close(turned.flip(0), found[0].vibration.amplitude, rtol=1e-4, atol=0)
 
 

@@ -30,7 +30,6 @@ def check(result, motion, period, amplitude, phase):
 
 CASES = {
     "paper": (Motion(phase=(-2.1, 0.3)), 0.005, (0.01, 0.15, 0.001)),
-    "paper, noisy": (Motion(phase=(1.9, -1.1)), 0.02, (0.03, 0.6, 0.003)),
     "small": (Motion((0.2, 0.13), (155.0, 155.0), (0.8, -2.6)), 0.005, (0.1, 1.0, 0.01)),
     "push-scan": (Motion((1.2, 0.8), (83.0, 110.0), (2.7, 0.2), (500.0, 0.0)), 0.005, (0.03, 0.2, 0.002)),
 }
@@ -45,18 +44,6 @@ def test_direct_at_the_limit(paper_camera, name):
     check(result, motion, *limits)
 
 
-def test_direct_is_more_accurate_than_bands(paper_camera):
-    motion = Motion(phase=(0.9, 2.2))
-    frames = recorded((2048, 512), paper_camera, motion, 2, 0.005, seed=42)
-    bands, direct = (detect_vibration(frames, paper_camera, method=method) for method in ("bands", "direct"))
-    error_of_bands = 100 * bands.std.amplitude[:, 0] / bands.vibration.amplitude[:, 0]
-    assert bool((errors(direct.vibration, motion)[1] < 0.5 * error_of_bands).all())
-    assert bool((direct.std.amplitude < bands.std.amplitude).all())
-    # the offsets are those of the rows that the vibration was fitted to, not those of the bands
-    assert bool((direct.residual < 0.5 * bands.residual).all())
-    assert direct.offsets.rows.diff().tolist() == [8.0] * (len(direct.offsets.rows) - 1)
-
-
 def test_fast_tone_along_the_scan_in_many_frames():
     """Bands that move by pixels within their height contain twice its frequency, seven times the frame rate."""
     timing = SensorTiming(row_time=6e-5, exposure_rows=2, frame_rows=270)
@@ -66,8 +53,7 @@ def test_fast_tone_along_the_scan_in_many_frames():
     check(detect_vibration(torch.from_numpy(frames).float(), timing), motion, 0.01, 0.1, 0.001)
 
 
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("num_frames", [2, 10])  # 10 frames are compared in two groups
+@pytest.mark.parametrize(("num_frames", "turned"), [(2, False), (10, True)])  # 10 frames are compared in two groups
 def test_offsets_of_the_direct_method_are_its_measurements(num_frames, turned):
     """They differ from the true offsets, and from the fitted ones, by their standard deviations."""
     timing = SensorTiming(row_time=4e-5, exposure_rows=12, frame_rows=300)
@@ -114,7 +100,6 @@ def test_outliers_among_the_measured_offsets_have_quality_0():
     ("exposure_rows", "size", "seed", "phase", "noise"),
     [
         (400, (2048, 512), 7, (-1.386, -1.422), 0.001),
-        (200, (2048, 256), 66, (2.5, 0.4), 0.005),  # different blur in each frame
         (400, (1024, 1024), 66, (-1.39, -1.42), 0.005),  # one period of x and less of y, all rows blurred
     ],
 )
@@ -157,11 +142,10 @@ def test_residual_tones_do_not_make_the_true_tone_unreliable(paper_camera):
 def test_almost_blind_tone_does_not_displace_frames(paper_camera):
     """Seven times the frame rate is 166.55 Hz: x is almost blind; y is detected."""
     motion = Motion((0.57, 0.53), (166.9, 191.5), (0.4, -1.0))
-    for seed in (1, 2):
-        found = detect_vibration(*tall_frames(paper_camera, 150, motion, seed, 384, 2))
-        assert not found.reliable[0]
-        assert found.reliable[1], found.reasons
-        assert float(found.vibration.amplitude[0].max()) < 5.0
+    found = detect_vibration(*tall_frames(paper_camera, 150, motion, 1, 384, 2))
+    assert not found.reliable[0]
+    assert found.reliable[1], found.reasons
+    assert float(found.vibration.amplitude[0].max()) < 5.0
 
 
 def test_alias_on_the_other_side_of_a_blind_frequency_is_corrected(paper_camera):
@@ -202,12 +186,11 @@ def test_two_tones_over_four_frames_are_detected(paper_camera):
         assert (found.amplitude[:, k] / truth.amplitude[:, 0] - 1).abs().max() < 5e-3
 
 
-@pytest.mark.parametrize("num_frames", [8, 10])
-def test_standard_deviations_of_groups_of_unequal_size(num_frames):
+def test_standard_deviations_of_groups_of_unequal_size():
     """Ten frames make groups of five and six: the frame that the smaller group lacks is not an error."""
     camera = SensorTiming(row_time=163e-6, exposure_rows=3, frame_rows=256)
     motion = Motion(phase=(0.4, -1.9))
-    frames = recorded((256, 192), camera, motion, num_frames, 0.01, seed=44)
+    frames = recorded((256, 192), camera, motion, 10, 0.01, seed=44)
     found = detect_vibration(frames, camera, tones=1)
     wrong = (found.vibration.amplitude - motion.vibration().amplitude).abs()
     assert bool((found.std.amplitude < 0.005).all()), found.std.amplitude
@@ -226,7 +209,6 @@ def test_still_camera_and_blind_frequency_are_refused(paper_camera):
     assert result.vibration.frequency[1, 0].item() == pytest.approx(90.0, rel=2e-3)
 
 
-MIDDLING = Motion((1.2, 0.8), (83.0, 110.0), (2.7, 0.2))
 SMALL = Motion((0.2, 0.13), (155.0, 155.0), (0.8, -2.6))
 
 
@@ -261,31 +243,26 @@ BAD = np.random.default_rng(60).random((2048, 320)) < 0.02
 
 
 @pytest.fixture(scope="module")
-def clean_pairs(paper_camera):
-    return {
-        motion: take_frames(draw_scene(2128, 400, seed), paper_camera, motion, 2)
-        for motion, seed in ((MIDDLING, 51), (SMALL, 52))
-    }
+def clean_pair(paper_camera):
+    return take_frames(draw_scene(2128, 400, 52), paper_camera, SMALL, 2)
 
 
-@pytest.mark.parametrize("motion", [MIDDLING, SMALL], ids=["middling", "small"])
 @pytest.mark.parametrize("name", DISTURBANCES)
-def test_disturbed_frames(clean_pairs, paper_camera, name, motion):
+def test_disturbed_frames(clean_pair, paper_camera, name):
     random = np.random.default_rng(60)
-    frames = DISTURBANCES[name](clean_pairs[motion], random)
+    frames = DISTURBANCES[name](clean_pair, random)
     frames = torch.from_numpy(frames + 0.003 * random.standard_normal(frames.shape)).float()
     result = detect_vibration(frames, paper_camera, ignore=BAD if name == "ignored pixels" else None)
     assert result.vibration.amplitude.shape == (2, 1)
-    check(result, motion, 0.1, 1.0, 0.01)
+    check(result, SMALL, 0.1, 1.0, 0.01)
 
 
-@pytest.mark.parametrize("method", ["direct", "bands"])
-def test_side_tones_of_a_blind_tone_are_not_reported_as_tones(paper_camera, method):
+def test_side_tones_of_a_blind_tone_are_not_reported_as_tones(paper_camera):
     """Motion along the scan axis makes a blind tone visible at its frequency plus and minus that of the motion."""
     blind = 3 / paper_camera.frame_period
     motion = Motion((1.6, 5.2), (blind, 30.0), (0.4, 1.3))
     frames = recorded((2048, 256), paper_camera, motion, 2, 0.005, seed=64)
-    result = detect_vibration(frames, paper_camera, method=method)
+    result = detect_vibration(frames, paper_camera)
     assert result.reliable.tolist() == [False, True]
     (reason,) = (reason for reason in result.findings[0] if reason.code == "tone_blind")
     assert reason.value < reason.limit == 0.3  # two frames
@@ -300,10 +277,9 @@ def test_weak_tone_at_the_frequency_of_a_side_tone_is_detected(paper_camera):
     check(result, motion, 0.3, 5.0, 1.0)
 
 
-@pytest.mark.parametrize(("top", "move"), [(120, (-4, -6)), (1610, (2, 7))])
-def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera, top, move):
-    """Slow tones are measured on the other rows, for every position and motion of the cloud."""
-    motion = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1))
+def test_moving_cloud_over_a_fifth_of_the_rows(paper_camera):
+    """Slow tones are measured on the other rows."""
+    motion, top, move = Motion((3.1, 5.2), (50.0, 30.0), (0.7, 2.1)), 120, (-4, -6)
     frames = take_frames(draw_scene(2128, 336, 61), paper_camera, motion, 2)
     tall, wide = frames.shape[-2] // 5, frames.shape[-1]
     cloud = draw_scene(tall + 20, wide + 20, 62)
@@ -361,7 +337,7 @@ def test_harmonics_share_a_frequency(paper_camera):
 def test_accelerated_image_motion(paper_camera):
     steady = Motion(phase=(0.7, 2.1), image_motion=(200.0, -300.0))
     motion = Curve(lambda t: steady.displacement(t) + np.array([450.0, -750.0]) * t[..., None] ** 2)
-    scene = draw_scene(2048 + 200, 256 + 200, 56)
+    scene = draw_scene(1024 + 200, 192 + 200, 56)
     frames = take_frames(scene, paper_camera, motion, 4, 0.005, seed=6, margin=100)
     frames = torch.from_numpy(frames).float()
     result = detect_vibration(frames, paper_camera, image_acceleration=True)
@@ -372,7 +348,7 @@ def test_accelerated_image_motion(paper_camera):
     assert (found.amplitude[:, 0] / torch.tensor([3.1, 5.2]) - 1).abs().max() < 0.005
     # without an acceleration, a slow tone of uncertain amplitude takes its place; the displacement is known
     slow = detect_vibration(frames, paper_camera)
-    starts = paper_camera.row_starts(4, 2048)
+    starts = paper_camera.row_starts(4, 1024)
     shown, true = (v.mean_displacement(starts, paper_camera.exposure_time) for v in (slow.vibration, found))
     error = shown - true - (shown - true).mean((0, 1))
     assert (error.square().mean((0, 1)).sqrt() < 5 * slow.std.displacement + 0.05).all()
@@ -415,15 +391,9 @@ def test_one_tone_of_each_axis_is_tried_where_the_rows_contradict_the_bands():
     check(detect_vibration(torch.from_numpy(frames).float(), timing), motion, 0.1, 0.2, 0.01)
 
 
-@pytest.mark.parametrize(
-    ("seed", "motion"),
-    [
-        (2, Motion((1.154, 1.246), (76.996, 26.434), (0.601, 1.371))),
-        (7, Motion((2.063, 2.743), (74.298, 35.765), (-1.199, 2.241))),
-    ],
-)
-def test_amplitudes_in_encoded_video_are_within_their_standard_deviations(tmp_path, seed, motion):
+def test_amplitudes_in_encoded_video_are_within_their_standard_deviations(tmp_path):
     """H.264 makes them smaller by up to 0.02 px, 4 to 5 standard deviations of independent errors of the rows."""
+    seed, motion = 2, Motion((1.154, 1.246), (76.996, 26.434), (0.601, 1.371))
     timing = SensorTiming(row_time=1e-4, exposure_rows=5, frame_rows=330)
     clean = take_frames(draw_scene(400, 400, seed), timing, motion, 8, 0.005, seed=seed)
     levels = np.repeat((255 * clean).clip(0, 255).round().astype(np.uint8)[..., None], 3, -1)

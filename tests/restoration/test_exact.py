@@ -34,7 +34,7 @@ def with_noise(frames, noise, seed=5, dtype=torch.float32):
     return as_tensor(frames + noise * np.random.default_rng(seed).standard_normal(frames.shape), dtype)
 
 
-@pytest.mark.parametrize(("noise", "one", "two"), [(0.0, 64.0, 67.5), (0.005, 47.0, 49.2), (0.02, 38.0, 40.0)])
+@pytest.mark.parametrize(("noise", "one", "two"), [(0.0, 64.0, 67.5), (0.02, 38.0, 40.0)])
 def test_psnr_of_restored_frames(short, noise, one, two):
     truth, frames, motion = short
     frames = with_noise(frames, noise)
@@ -207,8 +207,7 @@ def test_boundary_extensions_are_filled_at_the_ends_of_the_rows_only():
     torch.testing.assert_close(solved(model)[0], solved(inner)[0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("joint", [False, 2])
-@pytest.mark.parametrize("rows", [20, 75])
+@pytest.mark.parametrize(("rows", "joint"), [(20, 2), (75, False)])
 def test_a_batch_equals_single_stacks(rows, joint):
     """Two stacks of three frames of one period, one with a missing pixel."""
     timing = SensorTiming(row_time=1e-4, exposure_rows=rows, frame_rows=200)

@@ -11,7 +11,6 @@ from finer_truth import (
     SHAKE,
     TIMING,
     VIBRATION,
-    Shake,
     after_optics,
     check_gradient,
     closed,
@@ -104,12 +103,9 @@ def test_one_frame_is_not_worse_than_demosaicing(scene, frames):
 
 def test_patterns(scene, clean):
     truth = still(scene)[:, :40, :40]
-    red, other = (
-        decibel(restored(raw(clean[:2, :, :40, :40], name), mosaic=name)[0], truth, 8) for name in ("RGGB", "GBRG")
-    )
-    wrong = decibel(restored(raw(clean[:2, :, :40, :40], "GBRG"))[0], truth, 8)
-    assert other > red - 2
-    assert wrong < red - 4
+    taken = raw(clean[:2, :, :40, :40], "GBRG")
+    right, wrong = (decibel(restored(taken, mosaic=name)[0], truth, 8) for name in ("GBRG", "RGGB"))
+    assert right > wrong + 4
 
 
 def test_units_and_constant_scenes(frames):
@@ -119,9 +115,9 @@ def test_units_and_constant_scenes(frames):
 
 
 def test_orientations_and_channel_axes(frames):
-    two = frames[:2, :40, :36]
+    two = frames[:2, :32, :28]
     expected = restored(two, scale=2)
-    assert expected.shape == (1, 3, 80, 72)
+    assert expected.shape == (1, 3, 64, 56)
     turned = rsv.SensorTiming(20.52e-6, 20, 571, scan_axis="x")
     swapped = rsv.Vibration([5.2, 3.1], [61.0, 90.0], [1.3, 0.4])
     across = restored(two.mT[:, None], swapped, turned, scale=2)
@@ -135,16 +131,16 @@ def test_orientations_and_channel_axes(frames):
 
 
 def test_batches_and_groups_of_frames(frames):
-    part = frames[:3, :32, :32]
+    part = frames[:2, :24, :24]
     groups = restored(part, joint=2)
-    assert groups.shape == (3, 3, 32, 32)
+    assert groups.shape == (2, 3, 24, 24)
     batch = restored(torch.stack([part.flip(0), part])[:, :, None], joint=2)
     assert torch.allclose(batch[1], groups, atol=1e-4)
     assert not torch.allclose(batch[0], groups, atol=1e-2)
 
 
 def test_missing_and_saturated_pixels(scene, frames):
-    part, truth, level = frames[:4], still(scene), 0.7
+    part, truth, level = frames[:3, :48, :48], still(scene)[:, :48, :48], 0.66
 
     def quality(images, most=1.0, **options):
         image = restored(images, **options)[0].clamp(max=most)
@@ -156,16 +152,6 @@ def test_missing_and_saturated_pixels(scene, frames):
     clipped = part.clamp(max=level)
     assert float((clipped == level).double().mean()) > 0.02
     assert quality(clipped, level, saturation=level) > quality(clipped, level)
-
-
-def test_image_motion(scene):
-    moving = Shake(SHAKE.amplitude, SHAKE.frequency, SHAKE.phase, np.array([300.0, 0.0]))
-    vibration = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.4, 1.3], [300.0, 0.0])
-    _, shift = rsv.visible_pixels(TIMING, vibration, (SIZE, SIZE), 4)
-    offset = (0, FINER * int(shift[2, 0]))
-    truth = np.stack([still_image(part, (SIZE, SIZE), 1, offset) for part in scene])
-    four = raw(coloured(scene, 4, shake=moving))
-    assert decibel(restored(four, vibration)[0], truth, 14) > decibel(restored(four[2:3], vibration)[0], truth, 14) + 3
 
 
 def test_gradient_of_the_least_squares_solution():
@@ -186,14 +172,6 @@ def test_gradient_of_the_least_squares_solution():
         torch.rand(2, 3, 24, 32, generator=generator, dtype=torch.float64),
         rel=1e-3,
     )
-
-
-def test_gradients_reach_the_measured_pixels(frames):
-    values = frames[:2, :32, :32].double().requires_grad_()
-    (gradient,) = torch.autograd.grad(restored(values, noise=0.01).sum(), values)
-    assert torch.isfinite(gradient).all()
-    # pixels that are all brighter by one make the image brighter by one
-    assert float(gradient.sum()) == pytest.approx(3 * 32 * 32, rel=0.1)
 
 
 def test_detection_in_raw_frames():
@@ -226,7 +204,7 @@ def test_the_check_compares_mosaics(frames):
 
 
 def test_frames_that_do_not_fit_are_reported(frames):
-    part = frames[:3, :40, :40]
+    part = frames[:2, :40, :40]
     wrong = rsv.Vibration([3.1, 5.2], [90.0, 61.0], [0.6, 1.5])
     with pytest.warns(rsv.RestorationWarning, match="times the stated noise"):
         restored(part, wrong, noise=NOISE)

@@ -30,7 +30,7 @@ def levels(frames, motion):
     return noise_levels(torch.as_tensor(frames)[None, :, None], rowwise)[0]
 
 
-@pytest.mark.parametrize("shape", [(512, 512), (300, 64), (64, 64), (1300, 1500)])
+@pytest.mark.parametrize("shape", [(512, 512), (300, 64), (64, 64)])
 def test_white_noise_is_measured(shape):
     noise = 0.03 * torch.randn(16, *shape, generator=torch.Generator().manual_seed(0))
     assert estimate_noise(noise).square().mean().sqrt().item() == pytest.approx(0.03, rel=0.08)
@@ -63,7 +63,7 @@ def test_blocks_with_ignored_pixels_are_excluded(shape):
     assert estimate_noise(filled, torch.ones_like(hidden)).isnan().all()
 
 
-@pytest.mark.parametrize(("rows", "dead"), [(20, "black"), (100, "constant"), (100, "not measured")])
+@pytest.mark.parametrize(("rows", "dead"), [(20, "black"), (100, "not measured")])
 def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 3, 0.01)).float()[:, None]
@@ -73,14 +73,14 @@ def test_empty_frames_are_assigned_the_noise_of_the_others(rows, dead):
     if dead == "not measured":
         ignore = torch.zeros(frames.shape, dtype=torch.bool)
         ignore[1] = True
-    frames[1] = {"black": 0.0, "constant": 0.3, "not measured": 0.5}[dead]
+    frames[1] = {"black": 0.0, "not measured": 0.5}[dead]
     found = noise_levels(frames[None], motion, None if ignore is None else ignore[None])[0]
     torch.testing.assert_close(found[[0, 2]], whole[[0, 2]], rtol=0.1, atol=0)
     assert found[0].item() * 0.9 < found[1].item() < found[0].item() * 1.1
     assert (noise_levels(torch.zeros_like(frames[None]), motion) == 0).all()
 
 
-@pytest.mark.parametrize(("rows", "share"), [(20, 0.05), (100, 0.3), (20, 0.6)])
+@pytest.mark.parametrize(("rows", "share"), [(100, 0.3), (20, 0.6)])
 def test_missing_pixels_do_not_affect_the_level(rows, share):
     timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
     frames = torch.from_numpy(take_frames(draw_scene(336, 288, seed=12), timing, Motion(), 2, 0.01)).float()[:, None]
@@ -132,8 +132,7 @@ def floor_of(image):
     return noise_floor(image).sqrt().item()
 
 
-@pytest.mark.parametrize("level", [1e-4, 0.02])
-@pytest.mark.parametrize("shape", [(64, 64), (200, 90), (700, 500)])
+@pytest.mark.parametrize(("shape", "level"), [((64, 64), 0.02), ((200, 90), 1e-4), ((700, 500), 0.02)])
 def test_floor_of_white_noise(shape, level):
     noise = level * torch.randn(shape, generator=torch.Generator().manual_seed(2))
     assert floor_of(0.3 + noise) == pytest.approx(level, rel=0.1 if min(shape) > 64 else 0.3)
@@ -168,7 +167,7 @@ def blurred_frames(scene, rows, noise, count=1, motion=DEFAULT_MOTION):
 
 @pytest.mark.parametrize(
     ("rows", "noise", "texture_adds"),
-    [(400, 0.001, 2.0), (400, 0.002, 1.4), (100, 0.005, 1.25), (100, 0.02, 1.03), (400, 0.02, 1.02)],
+    [(400, 0.001, 2.0), (100, 0.005, 1.25), (400, 0.02, 1.02)],
 )
 def test_motion_blur_separates_dense_texture_from_noise(rows, noise, texture_adds):
     frames, motion = blurred_frames(texture(420, 0.7), rows, noise)

@@ -57,18 +57,14 @@ def test_reliable_detection_equals_its_vibration(scene_and_frames):
     torch.testing.assert_close(module(frames, found), from_detection, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_unreliable_axis_is_not_restored(scene_and_frames, axis):
+def test_unreliable_axis_is_not_restored(scene_and_frames):
     _, frames = scene_and_frames
-    reliable = [True, True]
-    reliable[axis] = False
-    reasons = [(), ()]
-    reasons[axis] = ("nearly blind", "too short")
-    uncertain = detection_of(MOTION.vibration(), reliable=reliable, reasons=tuple(reasons))
-    message = rf"{'xy'[axis]} is not restored: its vibration is not reliable \(nearly blind; too short\)"
+    reasons = (("nearly blind", "too short"), ())
+    uncertain = detection_of(MOTION.vibration(), reliable=(False, True), reasons=reasons)
+    message = r"x is not restored: its vibration is not reliable \(nearly blind; too short\)"
     with pytest.warns(RestorationWarning, match=message):
         found = restore(frames, TIMING, uncertain, check=False)
-    kept = Vibration([a * r for a, r in zip(MOTION.amplitude, reliable, strict=True)], MOTION.frequency, MOTION.phase)
+    kept = Vibration([0.0, MOTION.amplitude[1]], MOTION.frequency, MOTION.phase)
     torch.testing.assert_close(found, restore(frames, TIMING, kept, check=False), rtol=0, atol=0)
 
 
@@ -228,14 +224,13 @@ def test_saturation_reduces_errors_around_lamps(rows, better, largest):
     assert (known[:, truth > 0.9] > 0.75).all()  # no dark pixels in saturated areas
 
 
-@pytest.mark.parametrize("share", [0.25, 0.4])
-def test_saturated_pixels_do_not_lower_the_noise_level(share):
+def test_saturated_pixels_do_not_lower_the_noise_level():
     """They have no noise: with a quarter of the frame, the level was 0, and the others lost 4 dB."""
     scene = draw_scene(256 + 80, 192 + 80, seed=53, blur=1.0)
-    scene[: int(share * len(scene))] = 1.5
+    first = len(scene) // 4
+    scene[:first] = 1.5
     frames = torch.from_numpy(take_frames(scene, TIMING, MOTION, 2, 0.01)).float().clamp(max=1.0)
     truth, options = crop(scene), {"saturation": 1.0, "check": False}
-    first = int(share * len(scene))
     estimated, given = (
         decibel(restore(frames, TIMING, MOTION.vibration(), noise=noise, **options)[0, first:], truth[first:])
         for noise in ("auto", 0.01)
@@ -352,7 +347,7 @@ def test_strips_of_a_frame_are_solved_together_as_one_by_one():
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-@pytest.mark.parametrize("method", ["exact", "banded", "dewarp", "richardson-lucy"])
+@pytest.mark.parametrize("method", ["exact", "dewarp"])
 def test_transforms_that_are_not_supported_are_refused_in_one_line(method):
     frames = torch.rand(2, 64, 64, generator=torch.Generator().manual_seed(0))
     timing = rsv.SensorTiming(1e-4, 4, 100)

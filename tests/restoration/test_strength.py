@@ -36,10 +36,7 @@ SCENES = {
     ("name", "rows", "noise", "given", "joint", "least", "within"),
     [
         ("buildings", 20, 0.02, 2, False, -0.1, 0.3),
-        ("buildings", 100, 0.001, 2, True, -0.1, 0.3),
-        ("soft", 20, 0.005, 2, True, 0.2, 0.3),
         ("soft", 100, 0.05, 2, True, 1.0, 0.3),
-        ("dense texture", 100, 0.001, 2, False, -0.1, 0.3),
         ("dense texture", 100, 0.001, 1, False, -0.1, 0.5),
         ("dense texture", 20, 0.001, 2, True, -0.1, 0.3),
     ],
@@ -69,8 +66,7 @@ def test_power_of_pure_noise_is_close_to_zero(count):
     assert fit_prior((0.5 + 0.04 * noise)[None], motion, torch.full((1, count), 0.02), 576).power.mean() > 2 * 0.02**2
 
 
-@pytest.mark.parametrize(("across", "along"), [(0.2, 0.05), (0.02, 0.1)])
-@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize(("across", "along", "joint"), [(0.2, 0.05, True), (0.02, 0.1, False)])
 def test_regular_patterns_are_restored_up_to_the_boundaries(across, along, joint):
     rows, columns = np.mgrid[:336, :400]
     scene = 0.5 + 0.4 * np.sin(2 * np.pi * (across * rows + along * columns))
