@@ -5,7 +5,8 @@ from pathlib import Path
 import psutil
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backend_bases import FigureCanvasBase
+from PIL import Image
 from small_stack import FRAMES, WINDOWS, process_small, write_small
 
 from rsvib_torch import SensorTiming
@@ -13,7 +14,7 @@ from rsvib_torch.commands import terminal
 
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
-ARRANGED = {"report", "test_presentation.py", "test_gallery.py"}  # tests of figures, which are drawn as for users
+RENDERED = {"report", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
 LONGEST = (
     "test_tutorials.py",
     "test_direct.py",
@@ -58,16 +59,15 @@ def same_random_numbers():
 
 
 @pytest.fixture(autouse=True)
-def figures_are_not_arranged(request, monkeypatch):
-    """Draw figures coarsely and without arranging their parts, except in tests of figures: a fifth of the time."""
+def figures_are_not_rendered(request, monkeypatch):
+    """Write white images in place of figures, except in tests of figures: rendering is most of the time of a command."""
 
     def print_figure(canvas, file, **_):
-        canvas.figure.set_layout_engine("none")
-        canvas.figure.set_dpi(40)
-        canvas.print_png(file)
+        width, height = canvas.figure.get_size_inches() * 100
+        Image.new("RGB", (round(width), round(height)), "white").save(file, "png")
 
-    if not ARRANGED & set(request.path.parts):
-        monkeypatch.setattr(FigureCanvasAgg, "print_figure", print_figure)
+    if not RENDERED & set(request.path.parts):
+        monkeypatch.setattr(FigureCanvasBase, "print_figure", print_figure)
 
 
 @pytest.fixture(autouse=True)

@@ -19,11 +19,7 @@ from rsvib_torch.config import read_config
 MODELS = (
     ("iPhone 12", 3840, 2160, 59.94, 4.98),
     ("apple iphone 12 ultra wide", 1920, 1080, 24, 15.7),
-    ("Apple iPhone 15 Pro Max", 3840, 2160, 30, 4.7),
-    ("Sony a7S III", 3840, 2160, 23.976, 8.7),
-    ("FUJIFILM X-H2S", 3840, 2160, 25, 5.6),
     ("GoPro Hero6 Black", 2704, 2028, 29.97, 11.1),
-    ("Samsung S25 Ultra", 3840, 2160, 50, 14.5),
     ("Pixel 8", 2048, 1536, 24, 4.53),
 )
 

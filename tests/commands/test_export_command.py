@@ -49,18 +49,6 @@ def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
     )
 
 
-def test_stmap_by_size(place, tmp_path, capsys):
-    folder, detected, size = place
-    out = tmp_path / "maps"
-    options = ("--format", "stmap", "--size", f"{size[0]}x{size[1]}", "--num-frames", 2, "--convention", "opencv")
-    assert run(folder / "vibration.json", out, *options) == 0
-    assert "2 maps of" in capsys.readouterr().out
-    found = tifffile.imread(out / "stmap_0001.tif")
-    expected = rsv.sampling_map(detected.vibration, TIMING, size, 2)[1]
-    np.testing.assert_allclose(found[..., :2], expected.numpy(), atol=1e-4)
-    assert "--overwrite" in refused(capsys, "export", folder / "vibration.json", out, *options)
-
-
 def test_isd_of_the_second_frame(place, tmp_path, capsys):
     folder, _, size = place
     out = tmp_path / "frame.json"
@@ -100,6 +88,7 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     assert run(path, tmp_path / "forced", *options, "--force") == 0
     assert np.abs(tifffile.imread(tmp_path / "forced" / "stmap_0000.tif")[..., 1] - rows).max() > 1
     path.write_text(json.dumps(data | {"reliable": [False, False], "findings": [[blind], [blind]]}))
+    assert "--overwrite" in refused(capsys, "export", path, tmp_path / "maps", *options, "--force")
     assert "nothing to export" in refused(capsys, "export", path, tmp_path / "none", *options)
     assert not (tmp_path / "none").exists()
 

@@ -64,7 +64,6 @@ def test_restored_frames_are_those_of_the_part(place, tmp_path):
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("report", ("{}/page",)),
         ("motion", ("--out", "{}/m.csv", "--search", "6")),
         ("live", ("--out", "{}/live.mkv", "--window", "3")),
     ],

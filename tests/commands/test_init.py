@@ -56,10 +56,9 @@ def test_values_of_a_video_and_of_options(place, capsys):
     assert "rsvib run clip.mp4 results --config camera.toml --video" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("angle", [90, 180, 270])
-def test_rotated_video(place, angle):
+def test_rotated_video(place):
     """Frames are read as stored: the rows that the sensor reads first are the first rows at any rotation."""
-    write_clip(place / "clip.mp4", angle)
+    write_clip(place / "clip.mp4", 90)
     assert init("clip.mp4", *TIMES) == 0
     sensor = tomllib.loads((place / "camera.toml").read_text())["sensor"]
     assert (sensor["scan_axis"], sensor["readout_direction"]) == ("y", "forward")

@@ -28,8 +28,8 @@ def test_every_edge_of_the_chart_is_found_and_measures_the_optics():
     assert len(kinds) == 8
 
 
-@pytest.mark.parametrize("turn", [-8.0])
-def test_rotated_and_noisy_chart(turn):
+def test_rotated_and_noisy_chart():
+    turn = -8.0  # degrees
     chart = rotate(resolution_chart(512, 512).numpy(), turn, reshape=False, order=3, mode="nearest")
     chart = torch.from_numpy(chart + 0.01 * np.random.default_rng(0).standard_normal(chart.shape).astype(np.float32))
     longest = [edge for edge in rsv.find_slanted_edges(chart, min_length=45) if edge.contrast < 0.56]

