@@ -14,7 +14,7 @@ from rsvib_torch.commands import terminal
 
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
-RENDERED = {"report", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
+RENDERED = {"test_results.py", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
 LONGEST = (
     "test_tutorials.py",
     "test_direct.py",
@@ -60,7 +60,7 @@ def same_random_numbers():
 
 @pytest.fixture(autouse=True)
 def figures_are_not_rendered(request, monkeypatch):
-    """Write white images in place of figures, except in tests of figures: rendering is most of the time of a command."""
+    """Write white images in place of figures, except in tests of figures: rendering takes most of a command's time."""
 
     def print_figure(canvas, file, **_):
         width, height = canvas.figure.get_size_inches() * 100

@@ -47,13 +47,6 @@ def test_every_public_name_is_in_the_reference(docs):
     assert sorted(path.rsplit(".", 1)[1] for path in paths) == sorted(rsv.__all__)
 
 
-def test_reference_begins_with_the_main_function(docs):
-    first = {"detection": "detect_vibration", "restoration": "restore", "imaging": "simulate_frames"}
-    for package, name in {**first, "motion": "SensorTiming"}.items():
-        page = docs["reference_page"](package, docs["public_names"]()[package])
-        assert re.findall(r"^::: .*\.(\w+)$", page, flags=re.MULTILINE)[0] == name
-
-
 def test_reference_pages_are_up_to_date():
     pytest.importorskip("griffe")
     for path, text in runpy.run_path(str(ROOT / "scripts" / "reference_pages.py"))["pages"]().items():

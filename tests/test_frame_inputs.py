@@ -127,15 +127,12 @@ def test_channels_last_keeps_masks_and_comes_back(scan_axis, batch):
     ("shape", "channels"),
     [
         ((2, 3, 48, 64), None),
-        ((2, 1, 48, 64), "first"),
         ((2, 8, 48, 64), "first"),  # eight bands
         ((2, 48, 64, 8), "last"),
         ((2, 3, 48, 4), None),  # few columns
         ((2, 3, 4, 5), "last"),  # few rows
         ((2, 8, 64, 4), "first"),  # appears to be channels last
         ((2, 48, 64), "last"),  # no channels
-        ((9, 64, 3), "first"),
-        ((4, 64, 3), None),
         ((3, 2, 3, 48, 64), None),
     ],
 )
@@ -150,13 +147,11 @@ def test_valid_shapes_are_accepted(shape, channels):
     ("shape", "channels", "message"),
     [
         ((2, 48, 64, 1), None, r"pass channels=\"last\" or frames.permute\(0, 3, 1, 2\), or channels=\"first\" if"),
-        ((3, 2, 48, 64, 4), None, r"frames.permute\(0, 1, 4, 2, 3\)"),
         ((48, 64, 3), "last", r"one image \(H, W, C\): pass frames\[None\] with channels=\"last\""),
         ((48, 64, 1), None, r"or channels=\"first\" if these are 48 frames of 64 x 1 px"),
         ((2, 3, 48, 64), "last", r"appear to have their channels before the image axes: omit channels=\"last\""),
         ((8, 2, 48, 64), None, r"appear to be a batch \(B, T, H, W\): pass frames\[:, :, None\]"),
         ((2, 48, 64, 3), "Last", "channels must be one of None, 'first', 'last'; got 'Last'"),
-        ((64, 3), "last", r"frames must have shape \(T, H, W\)"),
     ],
 )
 def test_shapes_that_are_refused(shape, channels, message):
@@ -248,8 +243,6 @@ def test_half_precision_is_accurate_to_its_quantisation(grey, dtype, scale):
 @pytest.mark.parametrize(
     ("shape", "order"),
     [
-        ((48, 64, 2), (2, 0, 1)),
-        ((48, 64, 10), (2, 0, 1)),
         ((48, 64, 3, 10), (3, 2, 0, 1)),
         ((2, 3, 10, 48, 64), (0, 2, 1, 3, 4)),
     ],

@@ -149,13 +149,10 @@ def test_modules_that_use_a_displacement_per_row_state_the_invariant():
     ("source", "module"),
     [
         ("from rsvib_torch.imaging import blur_rows", "rsvib_torch.motion.vibration"),
-        ("import rsvib_torch.commands.main", "rsvib_torch.io.formats"),
-        ("import rsvib_torch", "rsvib_torch.motion.timing"),
         ("from ..restoration import restore", "rsvib_torch.detection.result"),
         ("def late():\n    from rsvib_torch.evaluation import psnr", "rsvib_torch.restoration.restore"),
         ("if TYPE_CHECKING:\n    import rsvib_torch.registration", "rsvib_torch.imaging.simulate"),
         ("try:\n    from rsvib_torch import report\nexcept ImportError:\n    pass", "rsvib_torch.stacks.job"),
-        ("module = importlib.import_module('rsvib_torch.config')", "rsvib_torch.evaluation.quality"),
         ("module = importlib.import_module(NAME)", "rsvib_torch.results.presentation"),
         (
             "FORM = packaged_format('a', ('.a',), 'rsvib_torch.stacks.run_folder', 'RunFolder')",

@@ -72,8 +72,6 @@ WORK = {
     "detect": lambda images, timing: rsv.detect_vibration(images, timing).vibration,
     "detect, long exposures": lambda images, timing: rsv.detect_vibration(images, timing).vibration,
     "detect, bands": lambda images, timing: rsv.detect_vibration(images, timing, method="bands").vibration,
-    "detect, columns": lambda images, timing: rsv.detect_vibration(images, timing, columns=100).vibration,
-    "projection": lambda images, timing: rsv.register_bands(images, timing, method="projection"),
     "phase": lambda images, timing: rsv.register_bands(images, timing, method="phase"),
     "detect, holes": lambda images, timing: rsv.detect_vibration(with_missing(images), timing).vibration,
     "detect, batch": lambda images, timing: (
@@ -88,8 +86,6 @@ WORK = {
     "edges": lambda images, timing: rsv.restore(images, timing, SHAKE, prior="edges"),
     "holes": lambda images, timing: rsv.restore(with_missing(images), timing, SHAKE),
     "saturated": lambda images, timing: rsv.restore(images.clamp(max=0.6), timing, SHAKE, saturation=0.6),
-    "colour, batch": lambda images, timing: rsv.restore(images[None, :, None].expand(2, -1, 3, -1, -1), timing, SHAKE),
-    "across columns": lambda images, timing: rsv.restore(images, replace(timing, scan_axis=-1), SHAKE),
     "dewarp": lambda images, timing: rsv.restore(images, timing, SHAKE, method="dewarp"),
     "richardson-lucy": lambda frames, timing: rsv.restore(
         frames, timing, SHAKE, method="richardson-lucy", iterations=5

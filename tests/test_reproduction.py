@@ -12,13 +12,9 @@ from benchmarks.reproduction import (
     PERIOD,
     RESTORED,
     crossing,
-    detection_values,
-    shake_of,
     straight_edge_mtf,
 )
 from edge_truth import draw_edge, gaussian, through_pixels
-
-import rsvib_torch as rsv
 
 
 @pytest.mark.parametrize("angle", [-6.0, 5.0])
@@ -33,20 +29,6 @@ def test_straight_edge_mtf(angle):
     bent = np.stack([np.roll(row, round(3 * math.sin(i / 12))) for i, row in enumerate(roi)])
     assert straight_edge_mtf(bent, frequency)[25] < 0.7 * truth[25]
     assert math.isnan(crossing(frequency, np.ones(51)))
-
-
-def test_errors_are_signed_and_phases_wrapped():
-    shake = shake_of(4)
-    phase = shake.phase[:, 0]
-    found = rsv.Vibration([3.1 * 1.02, 5.2 * 0.99], [50.0 / 1.001, 30.0], phase + np.array([0.02, -2.01]) * np.pi)
-    result = type("Result", (), {"vibration": found, "reliable": [True, False]})()
-    values = detection_values(result, shake)
-    assert values["x"]["amplitude_error"] == pytest.approx(2.0)
-    assert values["x"]["period_error"] == pytest.approx(0.1)
-    assert values["x"]["phase_error"] == pytest.approx(0.02)
-    assert values["y"]["amplitude_error"] == pytest.approx(-1.0)
-    assert values["y"]["phase_error"] == pytest.approx(-0.01)
-    assert (values["x"]["reliable"], values["y"]["reliable"]) == (True, False)
 
 
 def test_percentages_of_the_paper_agree_with_its_values():

@@ -1,6 +1,5 @@
 """``rsvib export``: files for other programs from a vibration.json."""
 
-import csv
 import json
 
 import numpy as np
@@ -62,19 +61,6 @@ def test_isd_of_the_second_frame(place, tmp_path, capsys):
     assert json.loads(out.read_text())["name_model"] == "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"  # not replaced
 
 
-def test_offsets_before_and_after(place, tmp_path, capsys):
-    folder, detected, _ = place
-    out = tmp_path / "offsets.csv"
-    assert run(folder / "vibration.json", out) == 0
-    assert "px before, 0.0" in capsys.readouterr().out
-    with out.open() as file:
-        lines = list(csv.DictReader(file))
-    assert len(lines) == detected.offsets.times.numel()
-    after = [float(line["residual_y_px"]) for line in lines if line["residual_y_px"]]
-    before = [float(line["offset_y_px"]) for line in lines if line["offset_y_px"]]
-    assert np.std(after) < 0.2 * np.std(before)
-
-
 def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     folder, _, size = place
     data = json.loads((folder / "vibration.json").read_text())
@@ -101,8 +87,6 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
         (("vibration.json", "camera.json", "--isd", "camera.json"), "it is the same file as the input camera.json"),
         (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
         (("vibration.json", "frame.json"), "give --isd FILE"),
-        (("vibration.json", "clip.gcsv", "--size", "300", "--num-frames", "2"), "--size must be HEIGHTxWIDTH"),
-        (("vibration.json", "no/clip.gcsv"), "does not exist"),
     ],
 )
 def test_errors_are_one_line(place, monkeypatch, capsys, arguments, message):

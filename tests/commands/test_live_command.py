@@ -72,8 +72,6 @@ def test_a_file_at_its_own_rate(clip, capsys):
     ("arguments", "message"),
     [
         (("-",), "--size WIDTHxHEIGHT is required for raw frames on standard input"),
-        (("-", "--size", "12"), "--size must be WIDTHxHEIGHT in px such as 1024x768, got '12'"),
-        (("0", "--size", "4x4"), "--size goes with frames on standard input (-), not with 0"),
         (("0", "--realtime"), "--realtime goes with a file, not with 0"),
         (("none.mp4",), "none.mp4: no such file; a camera is a number or a URL"),
         (("CLIP", "--out", "still.gif"), "a live video is written to .mp4, .mov, .m4v or .mkv"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 from program import refused, rsvib
-from small_stack import CAMERA, HEIGHT, WIDTH, write_small
+from small_stack import CAMERA, HEIGHT, write_small
 
 from rsvib_torch import read_stack_info, write_stack
 from rsvib_torch.datasets import example_frames
@@ -118,25 +118,12 @@ def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypa
     assert (out / "manifest.json").read_bytes() == (place / "out" / "manifest.json").read_bytes()
 
 
-def test_bad_frames_are_reported(place, tmp_path, capsys):
-    counts = tifffile.imread(place / "frames.tif")
-    counts[4] = 0
-    np.save(tmp_path / "frames.npy", counts)
-    arguments = ("run", tmp_path / "frames.npy", tmp_path / "out", "--config", place / "camera.toml")
-    assert rsvib(*arguments, "--bad-frames", "skip") == 0
-    assert "warning: 1 frame could not be used: see manifest.json" in capsys.readouterr().err
-    assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (FRAMES - 1, HEIGHT, WIDTH)
-    assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())["bad_frames"]) == ["4"]
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--memory", "much"), "memory must be like '2GB' or '500MB', got 'much'"),
         (("--memory", "100MB"), "memory of 100 MB is too little: a window of 4 frames of 96 x 64 px takes about"),
         (("--output", "../restored.tif"), "--output must be a file name without a folder, got '../restored.tif'"),
-        (("--output", "restored.webm"), "wmv files can only be read"),
-        (("--compression", "jpeg"), "compression must be one of 'zlib', 'lzma'; got 'jpeg'"),
         (("--scheduler", "nonsense://x"), "no Dask scheduler answers at nonsense://x"),
     ],
 )

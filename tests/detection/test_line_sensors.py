@@ -1,6 +1,5 @@
 """Push-broom parallax pairs: two lines record the same ground with a delay shorter than the image."""
 
-import numpy as np
 import pytest
 import torch
 from truth import MARGIN, Motion, crop, decibel, draw_scene, take_frames
@@ -33,24 +32,3 @@ def test_jitter_is_measured_and_removed(ground, delay_lines):
     assert found.vibration.phase[:, 0].tolist() == pytest.approx(JITTER.phase, abs=0.06)
     restored = rsv.restore(taken, timing, found, joint=True)
     assert decibel(restored.numpy(), crop(ground)) > decibel(taken.numpy(), crop(ground)) + 12
-
-
-def test_jitter_without_a_sinusoid(ground):
-    class Settling(Motion):
-        def displacement(self, times):
-            x = 4 * np.exp(-times / 0.03) * np.cos(2 * np.pi * 40 * times)
-            return np.stack([x, 1.5 * np.tanh((times - 0.05) / 0.01)], -1)
-
-    timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, 100 * LINE_TIME], LINES, 4)
-    found = rsv.detect_motion(images(ground, 100, Settling()), timing)
-    error = found.displacement.numpy() - Settling().displacement(found.times.numpy())
-    error -= error.mean((0, 1))
-    assert np.sqrt(np.mean(np.square(error[1] - error[0]), axis=0)).max() < 0.05
-    assert found.reliable.all()
-
-
-def test_delay_of_one_period_is_blind(ground):
-    delay = 1 / 31.0
-    timing = rsv.SensorTiming.line_sensors(LINE_TIME, [0.0, delay], LINES, 4)
-    found = rsv.detect_vibration(images(ground, delay / LINE_TIME), timing)
-    assert not found.reliable[0]

@@ -115,16 +115,6 @@ def test_line_scan_with_one_quaternion_per_row(tmp_path, time):
     assert nothing > 2.0
 
 
-def test_line_scan_between_pixel_centres(tmp_path):
-    still = still_isd(FAST)
-    _, sensor, _ = written(tmp_path / "frame.json", FAST.vibration(), TIMING, still)
-    ray = FAST.rest_ray(77.3, 201.8)
-    x, y = FAST.place(ray, moving=False)
-    centre, direction = FrameModel(still).ray(y + 0.5, x + 0.5)
-    line, sample = sensor.image(centre + 9e5 * direction)
-    np.testing.assert_allclose((sample - 0.5, line - 0.5), FAST.place(ray), rtol=0, atol=LIMIT)
-
-
 @pytest.mark.parametrize("distortion", [(-0.2, 0.3, 0.0, 0.0, 0.0), (-0.1, 0.02, 1e-3, -2e-3, 0.01)])
 def test_lens_distortion_and_principal_point(tmp_path, distortion):
     """A lens of 1.4 degrees, written as radtan: jitter keeps it, a line scanner has it along its line."""
@@ -196,8 +186,6 @@ def test_models_are_refused_with_their_errors(tmp_path):
     [
         (SLOW, lambda motion: motion.expanded(2), {}, {}, r"batch of shape \(2,\): pass one of them"),
         (SLOW, None, {"scan_axis": "x"}, {}, "scan_axis must be -2"),
-        (SLOW, None, {}, {"detector_center": {}}, r"isd: detector_center\.line: missing key"),
-        (SLOW, None, {}, {"image_lines": 0}, "image_lines"),
         (SLOW, None, {}, {"image_lines": 1000}, "frame_rows=320 is less than"),
         (FAST, None, {}, {"optical_distortion": {"transverse": {}}}, "'transverse' is not supported"),
         (FAST, None, {}, {"instrument_pointing": {"quaternions": 3}}, r"instrument_pointing\.quaternions"),

@@ -91,16 +91,6 @@ def test_sampling_with_opencv_is_dewarp(tmp_path, axes, convention):
         assert nothing > 10 * error
 
 
-def test_a_still_camera_has_the_map_that_changes_nothing(tmp_path):
-    timing = rsv.SensorTiming(2e-5, 10, 40)
-    still = rsv.Vibration((0.0, 0.0), (10.0, 10.0))
-    (path,) = rsv.write_stmap(tmp_path, still, timing, (32, 48), 1)
-    red, green, inside = cv2.split(tifffile.imread(path))
-    np.testing.assert_allclose(red[0], (np.arange(48) + 0.5) / 48, atol=1e-6)
-    np.testing.assert_allclose(green[:, 0], 1 - (np.arange(32) + 0.5) / 32, atol=1e-6)
-    assert inside.all()
-
-
 def test_uniform_image_motion_keeps_the_shift_of_restoration():
     """Content stays where restore leaves it: moved by the whole-pixel shift of each frame."""
     timing = rsv.SensorTiming(2e-5, 10, 100)

@@ -39,12 +39,6 @@ def test_round_trip(shape, scan_axis, direction, dtype):
     assert torch.equal(back, frames)
 
 
-def test_finer_and_joint_images_return_to_the_same_layout():
-    prepared = prepare_frames(torch.rand(3, 5, 7), sensor(-1))
-    finer = torch.nn.functional.interpolate(prepared.images[:, :1, 0], scale_factor=2)[:, :, None]
-    assert prepared.from_row_order(finer).shape == (1, 10, 14)
-
-
 def test_masks_follow_the_frames():
     """NaN, ignored and saturated pixels, in counts and floats, turned with the frames."""
     frames = torch.full((2, 3, 4, 6), 0.5)
@@ -86,15 +80,11 @@ def test_masks_that_broadcast(shape):
     [
         ({"ignore": torch.zeros(5, 5, dtype=torch.bool)}, ValueError, r"ignore \(5, 5\) does not fit .* \(2, 4, 6\)"),
         ({"ignore": torch.zeros(4, 6)}, TypeError, "ignore must be a bool tensor, got torch.float32"),
-        ({"ignore": torch.ones(4, 6, dtype=torch.bool)}, ValueError, "no pixel with data"),
         ({"frames": torch.full((2, 4, 6), math.nan)}, ValueError, "no pixel with data"),
         ({"frames": torch.full((2, 4, 6), math.nan), "allow_missing": False}, ValueError, r"pixel \(0, 0, 0\) is nan"),
-        ({"frames": torch.full((2, 4, 6), -math.inf)}, ValueError, r"pixel \(0, 0, 0\) is -inf"),
         ({"frames": torch.rand(2, 3000, 6)}, ValueError, "frame_rows=2048 is less than the 3000 rows"),
-        ({"saturation": -1.0}, ValueError, "saturation must be larger than 0"),
         ({"saturation": 1e-9}, ValueError, "every pixel is saturated"),
         ({"timing": "camera"}, TypeError, "timing must be a SensorTiming, got str"),
-        ({"frames": object(), "name": "restored"}, TypeError, "restored must be a tensor or array of numbers"),
     ],
 )
 def test_bad_input(options, error, message):
@@ -124,15 +114,10 @@ def test_integer_frames_are_scaled():
     ("frames", "options", "error", "message"),
     [
         (torch.zeros(2, 4, 4, dtype=torch.uint16), {}, ValueError, "full scale of uint16 frames unknown: pass full_sc"),
-        (torch.zeros(2, 4, 4, dtype=torch.int64), {}, ValueError, "full scale of int64 frames unknown: pass full_sc"),
         (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": 0}, ValueError, "full_scale must be larger than 0"),
-        (torch.zeros(2, 4, 4, dtype=torch.uint8), {"full_scale": "12 bit"}, TypeError, "full_scale must be a number"),
         (torch.zeros(4, 4), {}, ValueError, r"frames must have shape .* got \(4, 4\)"),
-        (torch.zeros(2, 0, 4), {}, ValueError, "frames must not be empty"),
         (torch.zeros(2, 4, 4, dtype=torch.complex64), {}, TypeError, "frames must be real numbers"),
-        ("frames.tif", {}, TypeError, "frames must be a tensor or array of numbers, got str"),
         (torch.zeros(1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
-        (torch.zeros(3, 1, 1, 4, 4), {"minimum_frames": 2}, ValueError, "at least 2 frames are needed, got 1"),
         (torch.tensor([[[0.0, torch.nan]]]), {}, ValueError, r"pixel \(0, 0, 1\) is nan"),
     ],
 )

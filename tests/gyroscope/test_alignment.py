@@ -196,21 +196,3 @@ def test_axes_are_those_of_the_image(frames):
     other = rsv.check_motion(frames.flip(-2).transpose(-2, -1), timing, turned)
     assert torch.allclose(other.before, straight.before.flip(0), rtol=1e-3)
     assert (other.after < 0.1).all()
-
-
-def test_missing_pixels_do_not_change_the_result(frames, gyroscope):
-    hole = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    hole[10:200, 60:85] = True
-    dirty = torch.where(hole, 0.5 + 0.5 * torch.rand(HEIGHT, WIDTH), frames)
-    recorded = rsv.read_motion(gyroscope, unit="rad/s", focal_length=FOCAL_LENGTH)
-    found = rsv.align_motion(dirty, TIMING, recorded, ignore=hole)
-    assert found.offset == pytest.approx(CLOCK, abs=5e-5)
-    assert found.reliable
-
-
-@pytest.mark.parametrize("function", [rsv.align_motion, rsv.check_motion])
-def test_batches_are_refused(frames, function):
-    recorded = at(np.arange(-0.01, 0.1, 5e-4))
-    refuses(lambda: function(frames[None, :, None], TIMING, recorded), "takes one")
-    with pytest.raises(ValueError, match=r"recorded is a batch of shape \(2,\)|motion is a batch of shape \(2,\)"):
-        function(frames, TIMING, recorded.expanded(2))

@@ -94,10 +94,7 @@ def test_gopro_gyroscope_that_starts_late_and_ends_early(tmp_path):
     [
         (lambda path: gcsv(path, rows=["0,1,2,3", "5,x,2,3"]), "line 9: gx must be a number, got 'x'"),
         (lambda path: gcsv(path, orientation="XXZ"), "orientation must have x, y and z once each"),
-        (lambda path: gcsv(path, columns="t,ax,ay,az"), "columns t, gx, gy and gz expected"),
-        (lambda path: path.write_text("GYROFLOW IMU LOG\nversion,1.3\n"), "without a line of column names"),
         (lambda path: path.write_text("time,gx,gy,gz\n" + "0,0,0,0\n" * 5), "the unit of the rates is not stated"),
-        (lambda path: path.write_text("time,gx_dps,gy_rad_s,gz_dps\n"), "the first line states deg/s, rad/s"),
         (lambda path: path.write_text("time,gx,rate_x,gy,gz\n"), "could both be x"),
         (lambda path: path.write_text("time,x_dps,y_dps,z_dps\n" + "7" * 200_000), "a line of more than 65536"),
         (
@@ -105,7 +102,6 @@ def test_gopro_gyroscope_that_starts_late_and_ends_early(tmp_path):
             "times must increase, but sample 1 at 1 s",
         ),
         (lambda path: mp4(path, [b"\0\0\0\1"] * 3, kind=b"tmcd"), "a video without a GPMF track"),
-        (lambda path: mp4(path, packets_of(), count=2**31), "damaged MP4 file"),
         (lambda path: mp4(path, packets_of(), offsets=[2**31] * 3), "a video without a GPMF track"),
         (lambda path: mp4(path, [packets_of()[0][:-40]] * 3), "damaged MP4 file: a GPMF entry"),
         (lambda path: path.write_bytes(box(b"ftyp", b"mp41") + b"\xff\xff\xff\xffmdat"), "damaged MP4 file"),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rsvib_torch import RowVaryingBlur, SensorTiming, Vibration, row_psf
-from rsvib_torch.imaging import RowPSF, blur_rows, blur_rows_adjoint, exposure_nodes, exposure_trajectory
+from rsvib_torch.imaging import RowPSF, blur_rows, blur_rows_adjoint, exposure_nodes
 
 PAPER = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 LONG = SensorTiming(row_time=20e-6, exposure_rows=400, frame_rows=2048)
@@ -64,15 +64,6 @@ def test_centroid_is_the_mean_displacement(interpolation, quadrature, timing):
     assert (psf.centroid() - expected).abs().max() < limit
     assert (psf.weights.sum((-2, -1)) - 1).abs().max() < 1e-12
     assert bool((psf.weights >= -1e-15).all())
-
-
-def test_gauss_requires_fewer_nodes():
-    long, weights = exposure_trajectory(MOTION, LONG.row_starts(1, 8), LONG, "gauss")
-    assert len(weights) < 30
-    assert long.shape == (1, 8, len(weights), 2)
-    midpoint = row_psf(MOTION, PAPER.row_starts(1, 256), PAPER, interpolation="cubic", num_nodes=400)
-    gauss = row_psf(MOTION, PAPER.row_starts(1, 256), PAPER, interpolation="cubic", quadrature="gauss", num_nodes=6)
-    assert (midpoint.dense()[0] - gauss.dense()[0]).abs().max() < 1e-4
 
 
 @pytest.mark.parametrize("quadrature", ["midpoint", "gauss"])

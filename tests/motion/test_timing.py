@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 
 import pytest
@@ -48,18 +47,11 @@ def test_scan_axis_names(given, kept):
         ({"row_time": 20.52}, ValueError, "row_time is in seconds"),
         ({"row_time": 5e-3, "frame_rows": 2048}, ValueError, "frame period of 10.24 s, longer than 10 s"),
         ({"row_time": 0.0}, ValueError, "row_time must be larger than 0"),
-        ({"row_time": math.nan}, ValueError, "row_time must be finite"),
         ({"row_time": "20us"}, TypeError, "row_time must be a number, got '20us'"),
-        ({"row_time": True}, TypeError, "row_time must be a number, got True"),
-        ({"exposure_rows": 0}, ValueError, "exposure_rows must be larger than 0"),
         ({"exposure_rows": 2049}, ValueError, "exposure_rows=2049 exceeds the frame period"),
-        ({"frame_rows": 0}, ValueError, "frame_rows must be larger than 0"),
-        ({"frame_rows": math.inf}, ValueError, "frame_rows must be finite"),
         ({"scan_axis": 0}, ValueError, r"scan_axis must be -2 \('y'\) or -1 \('x'\), got 0"),
-        ({"scan_axis": "rows"}, ValueError, "scan_axis must be .* got 'rows'"),
         ({"readout_direction": "up"}, ValueError, "readout_direction must be one of 'forward', 'reverse'; got 'up'"),
         ({"frame_start_times": [0.0, 0.2, 0.1]}, ValueError, "frame_start_times must be strictly increasing"),
-        ({"frame_start_times": [0.0, math.nan]}, ValueError, "frame_start_times must be finite"),
     ],
 )
 def test_bad_values(values, error, message):
@@ -92,8 +84,6 @@ def test_timing_in_seconds_is_that_in_rows():
         (lambda: SensorTiming.from_seconds(**SECONDS | {"exposure_time": 0}), "exposure_time must be larger than 0"),
         (lambda: SensorTiming.from_seconds(**SECONDS | {"exposure_time": 410}), "exposure 410 s, .*; 410 us is 410us"),
         (lambda: SensorTiming.line_sensors(1e-4, [0.0], 900), r"delays must have at least two entries, got \[0.0\]"),
-        (lambda: SensorTiming.line_sensors(1e-4, [0.0, 0.0], 900), "strictly increasing"),
-        (lambda: SensorTiming.line_sensors(0.1, [0.0, 1.0], 900), "longer than 10 ms"),
     ],
 )
 def test_times_that_contradict_each_other_are_refused(build, message):

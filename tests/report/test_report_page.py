@@ -316,34 +316,6 @@ def test_page_without_restoration_has_no_pairs_but_what_was_tried(tmp_path):
     assert len(sources) == 1 + 2 + sum(name.endswith(".png") for name in files)  # frame, frames in turn, figures
 
 
-def colours(block):
-    """Red, green and blue of each colour variable."""
-    found = re.findall(r"--([a-z]+): #([0-9a-f]+)", block)
-    whole = {name: digits if len(digits) == 6 else "".join(2 * digit for digit in digits) for name, digits in found}
-    return {name: [int(digits[at : at + 2], 16) for at in (0, 2, 4)] for name, digits in whole.items()}
-
-
-def contrast(first, second):
-    """Ratio of contrast of the Web Content Accessibility Guidelines."""
-    linear = [
-        [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in np.array(colour) / 255]
-        for colour in (first, second)
-    ]
-    low, high = sorted(float(np.dot(colour, (0.2126, 0.7152, 0.0722))) for colour in linear)
-    return (high + 0.05) / (low + 0.05)
-
-
-@pytest.mark.parametrize("dark", [False, True])
-def test_text_has_enough_contrast(page, dark):
-    style = (page[0] / "report.html").read_text(encoding="utf-8").split("<style>")[1].split("</style>")[0]
-    light_block, dark_block = style.split("prefers-color-scheme: dark")[:2]
-    palette = colours(light_block) | (colours(dark_block.split("}")[0]) if dark else {})
-    assert (sum(palette["paper"]) < 100) == dark
-    for paper in ("paper", "panel"):
-        for ink in ("ink", "faint", "accent", "good", "bad", "doubt"):
-            assert contrast(palette[ink], palette[paper]) >= 4.5, (ink, paper)
-
-
 def script_results(page, motion="motion"):
     """What the script of a page did with the events that page_dom.js sends."""
     node = shutil.which("node")

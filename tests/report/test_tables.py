@@ -144,15 +144,5 @@ def test_restored_frames_in_zarr_are_opened_by_xarray(tmp_path):
     assert rsv.read_stack_info(tmp_path / "a.zarr").frame_times == (0.0, 0.1, 0.2)
 
 
-@pytest.mark.parametrize(("method", "package"), [("to_pandas", "pandas"), ("to_xarray", "xarray")])
-def test_missing_package_is_named_with_the_extra(monkeypatch, method, package):
-    def without(name):
-        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-    monkeypatch.setattr("rsvib_torch.checks.values.import_module", without)
-    with pytest.raises(ModuleNotFoundError, match=rf"{method} needs the package {package}: pip install .*\[tables\]"):
-        getattr(detection_of(TWO_TONES), method)()
-
-
 def test_results_without_a_table_name_what_they_have():
     refuses(TWO_TONES.table, r"Vibration has no table: use to_xarray\(\), which all results have", TypeError)

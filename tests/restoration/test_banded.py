@@ -3,7 +3,7 @@ import torch
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
-from rsvib_torch.restoration import restore, visible_pixels
+from rsvib_torch.restoration import restore
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 NOISE = 0.003
@@ -52,18 +52,3 @@ def test_boundaries_are_not_periodic():
     assert (restored[:, 40:, -16:] - 0.2).abs().max() < 1e-3
     assert (restored[:, -16:, 40:] - 0.2).abs().max() < 1e-3
     assert restored.amax() > 0.8
-
-
-def test_push_scan_frames_are_restored_in_their_own_coordinates():
-    motion = Motion(amplitude=(1.5, 2.0), image_motion=(900.0, 400.0))  # 38 and 17 px from frame to frame
-    margin = 160
-    scene = draw_scene(160 + 2 * margin, 160 + 2 * margin, seed=31)
-    frames = take_frames(scene, TIMING, motion, 3, NOISE, margin=margin)
-    restored = restore(as_tensor(frames), TIMING, motion.vibration(), method="banded")
-    mask, shift = visible_pixels(TIMING, motion.vibration(), (160, 160), 3)
-    assert shift[2].abs().min() > 30
-    for frame, good, seen, (x, y) in zip(frames, restored, mask, shift.to(int).tolist(), strict=True):
-        truth = scene[margin - y : margin - y + 160, margin - x : margin - x + 160]
-        assert decibel(good, truth, 16) > max(decibel(frame, truth, 16) + 12, 46)
-        error = (good.numpy() - truth)[seen.numpy()]
-        assert (error**2).mean() ** 0.5 < 0.012

@@ -15,11 +15,6 @@ from rsvib_torch.restoration.noise import (
     noise_levels,
     noise_of_blurred_frames,
 )
-from rsvib_torch.restoration.scene_model.observation import (
-    kernel_spectrum,
-    kernel_weights,
-    scene_weights,
-)
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
 DEFAULT_MOTION = Motion()
@@ -190,22 +185,3 @@ def test_motion_blur_measures_every_frame_independently():
 def test_motion_blur_does_not_apply_without_blur_or_to_small_frames(rows, size):
     frames, motion = blurred_frames(texture(size, 0.7), rows, 0.004)
     assert noise_of_blurred_frames((frames)[None], motion)[0].isnan().all()
-
-
-def test_kernel_between_rows():
-    weights = kernel_weights(torch.linspace(0, 1, 21, dtype=torch.float64))
-    assert (weights.sum(-1) - 1).abs().max() < 6e-4
-    frequencies = torch.tensor([0.05, 0.2, 0.35], dtype=torch.float64)
-    rows = np.arange(-40, 41)
-    cycles = torch.tensor([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
-    aliases = kernel_spectrum(frequencies[:, None] + cycles).square().sum(-1)
-    for frequency, response, alias in zip(frequencies, kernel_spectrum(frequencies), aliases, strict=True):
-        wave = np.exp(2j * np.pi * frequency.item() * rows)
-        fractions = (np.arange(400) + 0.5) / 400
-        taps = kernel_weights(torch.from_numpy(fractions)).numpy()
-        seen = taps @ wave[38:44] * np.exp(-2j * np.pi * frequency.item() * fractions)
-        assert abs(seen - seen.mean()).std() ** 2 <= alias.item() * 1.01 + 1e-12
-        assert (abs(seen - seen.mean()) ** 2).mean() == pytest.approx(alias.item(), rel=0.02)
-        assert seen.mean() == pytest.approx(response.item(), abs=1e-5)
-        # the kernel of a scene row is the mean of the kernels of the two neighbouring frame rows
-        assert np.array(scene_weights()) @ wave[35:46] == pytest.approx(response.item(), rel=4e-3)

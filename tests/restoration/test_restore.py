@@ -309,18 +309,6 @@ def test_orientation(scene_and_frames, method, scan_axis, direction):
     torch.testing.assert_close(restore(frames, timing, Vibration(*axes), **common), expected, rtol=0, atol=2e-5)
 
 
-def test_unreliable_axes_along_columns(scene_and_frames):
-    _, frames = scene_and_frames
-    turned = replace(TIMING, scan_axis=-1)
-    vibration = Vibration(MOTION.amplitude[::-1], MOTION.frequency[::-1], MOTION.phase[::-1])
-    half = detection_of(vibration, reliable=(True, False), reasons=((), ("blind",)))
-    with pytest.warns(RestorationWarning, match="y is not restored"):
-        found = restore(frames.transpose(-2, -1), turned, half, method="dewarp", check=False)
-    only_y = Vibration([0.0, 3.2], MOTION.frequency, MOTION.phase)
-    expected = restore(frames, TIMING, only_y, method="dewarp", check=False)
-    torch.testing.assert_close(found.transpose(-2, -1), expected, rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     "build",
     [
