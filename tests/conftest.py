@@ -14,7 +14,7 @@ from rsvib_torch.commands import terminal
 
 TESTS = Path(__file__).parent
 ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_imports.py")
-RENDERED = {"test_results.py", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
+RENDERED = {"report", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
 LONGEST = (
     "test_tutorials.py",
     "test_direct.py",

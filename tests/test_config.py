@@ -37,30 +37,12 @@ def test_the_timing_of_a_file_has_the_errors_of_its_sensor(tmp_path):
         assert str(of_timing.value) == str(of_config.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "amplitude", "frequency", "image_motion", "num_frames"),
-    [
-        ("iso12233", [3.1, 5.2], [50, 30], [0, 0], 2),
-        ("in_orbit", [0.2, 0.13], [155, 155], [0, 0], 2),
-        ("push_scan", [1.2, 0.8], [83, 110], [500, 0], 4),
-    ],
-)
-def test_shipped_configs(name, amplitude, frequency, image_motion, num_frames):
+@pytest.mark.parametrize("name", ["iso12233", "in_orbit", "push_scan"])
+def test_shipped_configs_have_the_camera_of_the_paper_and_a_visible_vibration(name):
     config = read_config(CONFIGS / f"{name}.toml")
     assert config.timing == SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-    assert config.full_scale == 4095
-    simulation = config.simulation
-    assert simulation is not None
-    vibration = simulation.vibration.to_vibration()
-    assert vibration.amplitude[:, 0].tolist() == amplitude
-    assert vibration.frequency[:, 0].tolist() == frequency
-    assert vibration.image_motion.tolist() == image_motion
-    assert simulation.num_frames == num_frames
-    assert simulation.noise is not None
-    assert simulation.noise.read_noise == 0.003
+    vibration = config.simulation.vibration.to_vibration()
     assert vibration.gain(config.timing.frame_period).abs().min() > 0.5
-    assert set(config.detection) <= {"method", "registration", "tones", "band_rows", "band_step", "search"}
-    assert config.restoration == {"method": "exact"}
 
 
 def test_only_the_sensor_is_required_and_missing_options_are_not_filled_in(tmp_path):
@@ -101,15 +83,6 @@ def test_presets_are_part_of_the_package():
     files = {path.stem: path.read_text(encoding="utf-8") for path in CONFIGS.iterdir()}
     assert presets() == files
     assert list(presets()) == ["in_orbit", "iso12233", "push_scan"]
-
-
-def test_two_tones_per_axis(tmp_path):
-    text = "[simulation.vibration]\namplitude = [[1, 0.5], [2, 0]]\nfrequency = [[40, 90], [55, 0]]\n"
-    simulation = read(tmp_path, SENSOR + text).simulation
-    assert simulation is not None
-    assert simulation.vibration.to_vibration().amplitude.tolist() == [[1.0, 0.5], [2.0, 0.0]]
-    assert simulation.noise is None
-    assert simulation.frame_size is None
 
 
 VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"

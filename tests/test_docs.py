@@ -88,13 +88,6 @@ def test_drawings_are_files_of_the_documentation(tmp_path):
     assert all(f"](drawings/{name})" in used for name in drawn)
 
 
-def test_links_to_files_outside_the_site_are_plain_text(docs, tmp_path):
-    (tmp_path / "method.md").touch()
-    text = "[configs](configs) [the method](method.md#signs) [web](https://example.org) [lost](nowhere.md)"
-    expected = "configs [the method](method.md#signs) [web](https://example.org) [lost](nowhere.md)"
-    assert docs["without_outer_links"](text, tmp_path) == expected
-
-
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is not None, reason="MkDocs is installed")
 def test_missing_builder_is_named(docs, capsys):
     with pytest.raises(SystemExit, match="2"):

@@ -26,13 +26,6 @@ def test_third_line_makes_a_blind_frequency_measurable(capsys):
     assert blind > taken + 2
 
 
-@pytest.mark.parametrize("script", sorted(path.name for path in EXAMPLES.glob("*.py")))
-def test_help_is_the_docstring(script, capsys):
-    with pytest.raises(SystemExit, match="0"):
-        run(script, ["--help"], capsys)
-    assert "Printed:" in capsys.readouterr().out
-
-
 def test_recordings_that_are_missing_are_named(capsys, tmp_path):
     """The recordings are not part of the project."""
     assert runpy.run_path(str(ROOT / "scripts" / "recordings.py"))["main"]([str(tmp_path), "--only", "eye"]) == 2

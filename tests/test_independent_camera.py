@@ -10,10 +10,15 @@ IMAGE_MOTION = (40.0, -30.0)
 PERIOD, MARGIN = 0.012, (24, 20)
 
 
-@pytest.mark.parametrize("exposure", [8e-4, 11e-3])
-@pytest.mark.parametrize("row_time", [2e-4, 0.0])
-@pytest.mark.parametrize(("points", "options"), [(1, {}), (2, {"between": 4})])
-@pytest.mark.parametrize("wave", [(7, 0), (0, 9), (-11, 20)])
+@pytest.mark.parametrize(
+    ("wave", "points", "options", "row_time", "exposure"),
+    [
+        ((7, 0), 1, {}, 2e-4, 11e-3),
+        ((0, 9), 2, {"between": 4}, 2e-4, 8e-4),
+        ((-11, 20), 1, {}, 2e-4, 8e-4),
+        ((-11, 20), 2, {"between": 4}, 0.0, 11e-3),
+    ],
+)
 def test_frames_equal_the_integral_of_a_wave(wave, points, options, row_time, exposure):
     size = (48, 40)
     whole = [points * (s + 2 * m) for s, m in zip(size, MARGIN, strict=True)]

@@ -28,17 +28,6 @@ def test_links_of_the_long_description_are_absolute():
     assert f"{base}/docs/before_after.png?raw=true" in targets
 
 
-def test_long_description_without_a_repository_has_no_dead_links():
-    text = SETUP["long_description"](README + "[article](https://doi.org/x) [here](#limits)", None)
-    assert LINK.findall(text) == ["https://doi.org/x", "#limits"]
-    assert "Quick start" in text
-
-
-def test_addresses():
-    assert SETUP["links"](None) == {"Article": "https://doi.org/10.3390/s23135953"}
-    assert SETUP["links"]("https://host.example/o/n")["Changelog"] == "https://host.example/o/n/blob/main/CHANGELOG.md"
-
-
 def test_files_that_are_not_modules_are_package_data():
     patterns = PROJECT["tool"]["setuptools"]["package-data"]["rsvib_torch"]
     package = Path(rsv.__file__).parent

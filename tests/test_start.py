@@ -43,8 +43,20 @@ def loaded(code, names, folder):
     return done.stderr.splitlines()[-1].split()
 
 
-def run_code(*arguments):
-    return f"from rsvib_torch.commands.main import run_command\nrun_command({arguments!r})"
+def command(arguments):
+    return f"run_command({arguments.split()!r})"
+
+
+COMMANDS = (  # help, lists, and what is refused before anything is computed
+    "--help",
+    "known --help",
+    "export vibration.json clip.unknown",
+    "run frames.tif out --config none.toml",
+    "detect frames.tif --out out --config bad.toml",
+    "detect frames.tif --out out --config camera.toml --exposure 1",
+    "init --list-presets",
+    "cameras iphone 12",
+)
 
 
 @pytest.mark.parametrize(
@@ -53,15 +65,7 @@ def run_code(*arguments):
         ("import rsvib_torch", ("torch", "numpy", "pydantic", "typer", "rich", *LIBRARIES)),
         ("import torch, rsvib_torch as rsv\nrsv.SensorTiming, rsv.Vibration, rsv.io, rsv.restoration", LIBRARIES),
         ("from rsvib_torch.config import read_config\nread_config('camera.toml')", PROGRAM),
-        (run_code("--help"), PROGRAM),
-        (run_code("run", "--help"), PROGRAM),
-        (run_code("known", "--help"), PROGRAM),
-        (run_code("export", "vibration.json", "clip.unknown"), PROGRAM),
-        (run_code("run", "frames.tif", "out", "--config", "none.toml"), PROGRAM),
-        (run_code("detect", "frames.tif", "--out", "out", "--config", "bad.toml"), PROGRAM),
-        (run_code("detect", "frames.tif", "--out", "out", "--config", "camera.toml", "--exposure", "1"), PROGRAM),
-        (run_code("init", "--list-presets"), PROGRAM),
-        (run_code("cameras", "iphone", "12"), PROGRAM),
+        ("from rsvib_torch.commands.main import run_command\n" + "\n".join(map(command, COMMANDS)), PROGRAM),
     ],
 )
 def test_libraries_are_imported_when_they_are_used(tmp_path, code, names):

@@ -1,17 +1,12 @@
 """Every command ends with its answer, as text, as JSON or not at all; help, completion, progress, existing results."""
 
-import contextlib
-import fcntl
 import inspect
 import json
 import os
-import pty
 import re
 import shlex
-import struct
 import subprocess
 import sys
-import termios
 from pathlib import Path
 
 import cv2
@@ -242,23 +237,6 @@ def test_shell_completion():
     assert done.stdout.split() == ["restore", "report"]
 
 
-def in_terminal(arguments, columns):
-    """What a program prints on a terminal with so many columns, without control sequences."""
-    descriptor, terminal = pty.openpty()
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 30, columns, 0, 0))
-    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
-    environment |= {"TERM": "xterm"}
-    shown = b""
-    with subprocess.Popen(arguments, stdin=terminal, stdout=terminal, stderr=terminal, env=environment) as process:
-        os.close(terminal)
-        with contextlib.suppress(OSError):  # the program has ended
-            while part := os.read(descriptor, 65536):
-                shown += part
-    os.close(descriptor)
-    assert process.returncode == 0
-    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
-
-
 LOOPS = """
 import time
 from rsvib_torch.commands.terminal import current_output, working
@@ -280,14 +258,6 @@ with working("reading quietly"):
     steps(2, "frames")()
     time.sleep(0.3)
 """
-
-
-def test_progress_has_rate_and_remaining_time():
-    shown = in_terminal([sys.executable, "-c", LOOPS], 80)
-    assert re.search(r"restoring \S* 0 of 4 frames", shown)
-    assert re.search(r"restoring \S* 3 of 4 frames  \d[\d.]*/s  0:00:00 left", shown)
-    assert re.search(r"restoring frames.tif \S* 20 of 100 frames  \d[\d.]*/s  0:00:0\d left", shown)
-    assert "quietly" not in shown
 
 
 def test_progress_in_a_log_is_a_line_after_twice_the_time():
@@ -341,16 +311,6 @@ def test_long_operations_report_their_progress(place, tmp_path):
     assert found == {"stacks"}
     _, found = units(lambda: rsv.write_stack(tmp_path / "r.npy", restored))
     assert found == {"frames"}
-
-
-def test_answers_fit_the_terminal(place, config, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert rsvib("detect", place / "blind.tif", *config, "--out", tmp_path / "o") == 0
-    shown = capsys.readouterr().out
-    shown = shown[shown.index("Vibration in") : shown.index("Files")]
-    lines = [line.rstrip() for line in shown.splitlines() if line.strip()]
-    assert 64 < max(map(len, lines)) <= 80
-    assert all(line.startswith("  ") for line in lines[1:])
 
 
 def test_warnings_are_in_the_json_and_printed_quietly(place, config, tmp_path, capsys):

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from refusals import refuses
 from scipy.ndimage import gaussian_filter
 
 from rsvib_torch.datasets import city_and_fields, resolution_chart
@@ -86,10 +85,3 @@ def test_equal_seeds_give_equal_scenes():
     city_and_fields(64, 64, seed=1)
     resolution_chart(64, 64)
     assert torch.equal(random_state, torch.random.get_rng_state())
-
-
-@pytest.mark.parametrize("draw", [resolution_chart, lambda h, w, **k: city_and_fields(h, w, 0, **k)])
-def test_sizes_and_optics_are_checked(draw):
-    refuses(lambda: draw(63, 100), "height must be at least 64")
-    refuses(lambda: draw(100, 100.0), "width must be a whole number", TypeError)
-    refuses(lambda: draw(100, 100, sigma=0.1), r"sigma must be at least 0\.4")

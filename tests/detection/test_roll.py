@@ -83,10 +83,6 @@ def test_without_roll_the_result_is_the_same():
     assert torch.equal(found.std.frequency, without.std.frequency)
 
 
-def test_selected_columns_are_measured_without_roll(rolling):
-    assert detect_vibration(rolling[1], TIMING, columns=128).vibration.num_axes == 2
-
-
 def test_ignored_roll_is_named_as_the_reason(rolling):
     found = detect_vibration(rolling[1], TIMING, roll=False, zoom=False)
     assert not bool(found.reliable[0])

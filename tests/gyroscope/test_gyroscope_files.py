@@ -1,11 +1,10 @@
 """Angular rates from gyroflow logs, GPMF tracks and CSV files, written here byte by byte."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
-from gpmf_file import RATES, TIMES, box, mp4, packet, packets_of
+from gpmf_file import RATES, TIMES, box, mp4, packets_of
 from refusals import refuses
 
 import rsvib_torch as rsv
@@ -79,14 +78,6 @@ def test_gopro_times_are_those_of_the_video(tmp_path):
     packets = packets_of(stamp=stamp, first=lambda n: 5_000_000 + 100_000 * n)
     stamps = rsv.read_gyroscope(mp4(tmp_path / "stamp.mp4", packets, duration=100))
     assert stamps.times[[0, 20, 30, 40]].tolist() == pytest.approx([0.02, 0.12, 0.175, 0.23])
-
-
-def test_gopro_gyroscope_that_starts_late_and_ends_early(tmp_path):
-    # the first packet has 13 of 20 samples, the last one 4: their ends are those of the video nevertheless
-    counts = np.cumsum([0, 13, 20, 20, 4])
-    packets = [packet(RATES[a:b], total=b) for a, b in itertools.pairwise(counts)]
-    found = rsv.read_gyroscope(mp4(tmp_path / "late.mp4", packets, duration=100))
-    assert found.times[[0, 13, 33, 56]].tolist() == pytest.approx([0.035, 0.1, 0.2, 0.315])
 
 
 @pytest.mark.parametrize(

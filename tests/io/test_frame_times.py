@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from program import rsvib
 from small_stack import CAMERA, MOTION, STILL, TIMING, write_with_gaps
 from truth import decibel
@@ -15,7 +14,7 @@ from truth import decibel
 import rsvib_torch as rsv
 from rsvib_torch import StackInfo, read_stack_info
 from rsvib_torch.frames.prepare import prepare_frames
-from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame, write_stack
+from rsvib_torch.io import TimingWarning, describe_stack, exposure_times, timing_from_first_frame
 
 KEPT = [0, 1, 2, 4, 5, 9, 10]  # the other frames were dropped
 START = 100.25  # s
@@ -127,15 +126,6 @@ def test_exact_times_may_be_those_of_every_nth_frame():
     with pytest.warns(TimingWarning, match=r"128\.21 frames per second .* the times of the file are used"):
         used = timing_from_first_frame(TIMING, info_with(0.75 * TIMING.frame_period * np.arange(9), 0.0))
     assert used.frame_start_times[1] == pytest.approx(0.75 * TIMING.frame_period)
-
-
-def test_writing_keeps_times_resolution_and_channel_order(tmp_path):
-    like = StackInfo((2, 3, 9, 7), "uint16", 4095.0, (0.5, 0.75), (300.0, 300.0, "inch"), channels_last=True)
-    write_stack(tmp_path / "a.zarr", torch.rand(2, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)
-    info = read_stack_info(tmp_path / "a.zarr")
-    assert (info, info.channels_last) == (like, True)
-    write_stack(tmp_path / "b.zarr", torch.rand(1, 3, 9, 7), dtype="uint16", full_scale=4095, like=like)
-    assert read_stack_info(tmp_path / "b.zarr").frame_times is None
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import warnings
 
 import numpy as np
 import pytest
-import torch
 from detections import detection_of, result_of
 from refusals import refuses
 
@@ -129,19 +128,6 @@ def test_dataset_has_names_units_and_reads_back_from_zarr(tmp_path):
         dataset.to_zarr(tmp_path / "result.zarr")
     again = xarray.open_zarr(tmp_path / "result.zarr")
     np.testing.assert_array_equal(again.amplitude, dataset.amplitude)
-
-
-def test_restored_frames_in_zarr_are_opened_by_xarray(tmp_path):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("zarr")
-    frames = torch.rand(3, 2, 9, 7, generator=torch.Generator().manual_seed(0))
-    info = rsv.StackInfo((3, 2, 9, 7), "uint16", 4095, frame_times=(0.0, 0.1, 0.2))
-    rsv.write_stack(tmp_path / "a.zarr", frames, dtype="uint16", full_scale=4095, like=info)
-    dataset = xarray.open_zarr(tmp_path / "a.zarr")
-    assert dataset.frames.dims == ("frame", "channel", "y", "x")
-    np.testing.assert_allclose(dataset.frames / dataset.frames.attrs["full_scale"], frames, atol=0.5 / 4095)
-    assert dataset.time.values.tolist() == [0.0, 0.1, 0.2]
-    assert rsv.read_stack_info(tmp_path / "a.zarr").frame_times == (0.0, 0.1, 0.2)
 
 
 def test_results_without_a_table_name_what_they_have():

@@ -60,14 +60,6 @@ def test_long_exposures(rows, one, two):
     assert decibel(joint, crop(scene)) > two
 
 
-def test_noisier_frames_have_less_weight(short):
-    truth, frames, motion = short
-    frames = torch.cat([with_noise(frames[:1], 0.003), with_noise(frames[1:], 0.01, seed=6)])
-    alone = restore(frames[:1], TIMING, motion.vibration())
-    joint = restore(frames, TIMING, motion.vibration(), joint=True)
-    assert decibel(joint, truth) > decibel(alone, truth)
-
-
 def test_boundaries_are_not_periodic(short):
     _, frames, motion = short
     frames = as_tensor(frames)

@@ -23,7 +23,7 @@ def example(code):
 
 
 @pytest.mark.parametrize("code", REASONS)
-def test_every_text_names_what_is_compared(code):
+def test_every_text_names_what_is_compared_and_is_stored(code):
     """A reason with a limit states value, limit and unit; a reason without one compares nothing."""
     kind, reason = REASONS[code], example(code)
     assert bool(kind.compares) == (reason.value is not None) == (reason.limit is not None)
@@ -34,11 +34,6 @@ def test_every_text_names_what_is_compared(code):
             assert format(number, fields[name]) in str(reason)
     assert not any(mark in str(reason) for mark in "{}[]")
     assert kind.refuses
-
-
-@pytest.mark.parametrize("code", REASONS)
-def test_reasons_are_read_as_they_were_stored(code):
-    reason = example(code)
     stored = json.loads(json.dumps(reason.to_dict()))
     assert Reason.from_dict(stored) == reason
     assert stored["text"] == str(reason)

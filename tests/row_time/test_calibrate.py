@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from program import refused, rsvib
+from program import rsvib
 from refusals import refuses
 from truth import draw_scene
 
@@ -216,15 +216,3 @@ def test_command(tmp_path, capsys):
     assert timing.exposure_time == pytest.approx(65e-6, rel=0.05)
     assert timing.readout_direction == "reverse"
     assert timing.frame_rate == pytest.approx(29.97, rel=1e-6)
-
-
-def test_errors_on_the_command_line_are_one_line(tmp_path, capsys):
-    write_stack(tmp_path / "plain.png", torch.full((1, 64, 64), 0.5), dtype="uint8")
-    out = tmp_path / "sensor.toml"
-    for arguments, message in (
-        (("--frequency", 100, "--out", out), "no flicker found"),
-        ((), "give --frequency"),
-        (("--frequency", 20, "--frame-rate", 30), "slower than a frame"),
-    ):
-        assert message in refused(capsys, "calibrate", tmp_path / "plain.png", *arguments)
-    assert not out.exists()

@@ -19,7 +19,7 @@ ATTACKS = {
     "journals": (10, 0.0),
     "kills": (9, 1.0),
     "links": (8, 0.0),
-    "live_sessions": (2, 0.0),
+    "live_sessions": (1, 0.0),
     "power_losses": (9, 1.0),
 }
 

@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from truth import draw_scene
 
 from rsvib_torch import SensorTiming
-from rsvib_torch.registration.corners import CornerFollower, find_corners
+from rsvib_torch.registration.corners import CornerFollower
 from rsvib_torch.video.camera_path import camera_path, shake
 from rsvib_torch.video.steadying import largest_displacement, steady_shifts
 
@@ -112,17 +112,6 @@ def test_tones_that_sweep_are_followed():
             assert all(abs(tone.frequency - frequency - sweep * time) < 0.5 for tone in tones)
             turned = 2 * np.pi * (frequency + 0.5 * sweep * time) * time + phase - np.pi / 2
             assert abs(sum(tone.coefficient for tone in tones) - size * np.exp(1j * turned)) < 0.15  # px
-
-
-def test_corners_at_night_are_those_of_the_lights():
-    rng = np.random.default_rng(2)
-    frame = np.clip(np.round(6 + 4 * rng.normal(size=(HEIGHT, WIDTH))), 0, 255).astype(np.uint8)
-    places = [(40, 60), (120, 200), (180, 90)]
-    for row, column in places:
-        frame[row : row + 3, column : column + 3] = 200
-    found = find_corners(frame, most=256)
-    assert 3 <= len(found) <= 12
-    assert all(min(np.hypot(*(point - [column + 1, row + 1])) for row, column in places) < 5 for point in found)
 
 
 def test_a_few_lights_are_followed_beside_flakes_that_one_frame_shows():

@@ -44,7 +44,7 @@ def make_place(tmp_path_factory):
 def write_clip(path, frames):
     counts = np.repeat(np.clip(np.round(255 * frames.numpy()), 0, 255).astype(np.uint8)[..., None], 3, -1)
     encoder = {"codec": "libx264", "encoded": "yuv420p", "options": {"crf": "6", "threads": "1"}, "sound": "aac"}
-    write_video(path, counts, np.arange(COUNT) * TIMING.frame_period, layout="rgb24", rate=30, **encoder)
+    write_video(path, counts, np.arange(len(counts)) * TIMING.frame_period, layout="rgb24", rate=30, **encoder)
 
 
 def write_rates(path, rates):
@@ -80,7 +80,7 @@ def test_a_fisheye_lens(place, tmp_path, capsys):
     lens["distortion_coeffs"] = [-0.6, 0.2, 0.0, 0.0]  # moves the corners by 9 px
     profile = {"calib_dimension": {"w": 432, "h": 400}, "fisheye_params": lens}  # of frames that are twice as large
     (tmp_path / "lens.json").write_text(json.dumps(profile))
-    write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=COUNT, fisheye=np.array(lens["distortion_coeffs"])))
+    write_clip(tmp_path / "clip.mp4", take(TIMING, SHAKING, count=16, fisheye=np.array(lens["distortion_coeffs"])))
     steadied = ["run", str(tmp_path / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "0.333"]
     steadied += ["--method", "dewarp", "--device", "cpu", "--lens-profile", str(tmp_path / "lens.json")]
     assert run_command(steadied) == 2
@@ -115,6 +115,7 @@ def test_rates_of_another_camera_are_refused(place, tmp_path, capsys):
     smooth = np.stack([np.convolve(column, np.hanning(25) / 12, "same") for column in noise.T], -1)
     write_rates(tmp_path / "other.csv", rsv.AngularRates(rates.times, torch.from_numpy(0.3 * smooth)))
     arguments = ["run", str(place / "clip.mp4"), str(tmp_path / "out"), *CAMERA, "--video", "--steady", "1"]
+    arguments += ["--frames", "0:10"]
     assert run_command([*arguments, "--gyroscope", str(tmp_path / "other.csv"), "--device", "cpu"]) == 2
     printed = capsys.readouterr().err.strip()
     assert "does not fit the video" in printed
