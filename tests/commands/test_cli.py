@@ -301,6 +301,15 @@ def test_outputs_that_cannot_be_written(place, vibration_text, tmp_path, capsys,
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_simulated_noise_has_a_seed(place, tmp_path):
+    for name, seed in (("a", 5), ("b", 6)):
+        arguments = (place / "scene.png", tmp_path / f"{name}.tif", "--config", place / "camera.toml", "--seed", seed)
+        assert rsvib("simulate", *arguments) == 0
+    first, second = (tifffile.imread(tmp_path / f"{name}.tif").astype(float) for name in "ab")
+    assert (first == tifffile.imread(place / "frames.tif")).all()
+    assert np.std(first - second) == pytest.approx(0.003 * 4095 * 2**0.5, rel=0.05)
+
+
 def test_usage_errors(capsys, tmp_path):
     detect = ("detect", "f.tif", "--out", tmp_path)
     for arguments, message in (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 from program import refused, rsvib
-from small_stack import CAMERA, HEIGHT, write_small
+from small_stack import CAMERA, HEIGHT, WIDTH, write_small
 
 from rsvib_torch import read_stack_info, write_stack
 from rsvib_torch.datasets import example_frames
@@ -116,6 +116,17 @@ def test_interrupted_run_is_resumed_or_refused(place, tmp_path, capsys, monkeypa
         assert "windows complete before this run: 4" in capsys.readouterr().out
     assert (out / "restored.tif").read_bytes() == (place / "out" / "restored.tif").read_bytes()
     assert (out / "manifest.json").read_bytes() == (place / "out" / "manifest.json").read_bytes()
+
+
+def test_bad_frames_are_reported(place, tmp_path, capsys):
+    counts = tifffile.imread(place / "frames.tif")
+    counts[4] = 0
+    np.save(tmp_path / "frames.npy", counts)
+    arguments = ("run", tmp_path / "frames.npy", tmp_path / "out", "--config", place / "camera.toml")
+    assert rsvib(*arguments, "--bad-frames", "skip") == 0
+    assert "warning: 1 frame could not be used: see manifest.json" in capsys.readouterr().err
+    assert read_stack_info(tmp_path / "out" / "restored.tif").shape == (FRAMES - 1, HEIGHT, WIDTH)
+    assert list(json.loads((tmp_path / "out" / "manifest.json").read_text())["bad_frames"]) == ["4"]
 
 
 @pytest.mark.parametrize(
