@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from refusals import refuses
 
-from rsvib_torch.config import presets, read_config
+from rsvib_torch.config import read_config
 from rsvib_torch.motion.timing import SensorTiming
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -77,12 +77,6 @@ def test_keys_that_replace_those_of_the_file(tmp_path):
     assert alone.source == "the command line"
     with pytest.raises(ValueError, match="the command line: sensor: exposure_time or exposure_rows is missing"):
         read_config(None, sensor={"row_time": 2e-5, "frame_rate": 30.0})
-
-
-def test_presets_are_part_of_the_package():
-    files = {path.stem: path.read_text(encoding="utf-8") for path in CONFIGS.iterdir()}
-    assert presets() == files
-    assert list(presets()) == ["in_orbit", "iso12233", "push_scan"]
 
 
 VIBRATION = "[simulation.vibration]\namplitude = [1, 2]\nfrequency = [40, 30]\n"

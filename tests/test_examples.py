@@ -24,9 +24,3 @@ def test_third_line_makes_a_blind_frequency_measurable(capsys):
     taken, blind, seen = (float(re.search(r"(\S+) dB", line).group(1)) for line in (truth, two, three))
     assert seen > blind + 8
     assert blind > taken + 2
-
-
-def test_recordings_that_are_missing_are_named(capsys, tmp_path):
-    """The recordings are not part of the project."""
-    assert runpy.run_path(str(ROOT / "scripts" / "recordings.py"))["main"]([str(tmp_path), "--only", "eye"]) == 2
-    assert "revas missing" in capsys.readouterr().err

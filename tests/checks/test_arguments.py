@@ -197,13 +197,6 @@ def test_tensors_are_freed_without_garbage_collection():
         gc.enable()
 
 
-def test_optics_of_frames_of_16_bits():
-    optics = rsv.Optics(0.5, 0.4, 1.0)
-    image = optics.apply(FRAMES.to(torch.bfloat16))
-    assert image.dtype == torch.bfloat16
-    torch.testing.assert_close(image.float(), optics.apply(FRAMES), atol=0.01, rtol=0)
-
-
 def test_arrays_of_numpy_with_a_type_alias_are_known():
     """``NDArray`` is an alias from NumPy 2.5 on."""
     parameter = TypeVar("parameter", bound=np.generic)

@@ -153,15 +153,6 @@ def test_peak_at_the_edge_of_the_search_range_fails(method, axis):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_noise_lowers_quality(pair, paper_camera, method):
-    frames, _ = pair
-    noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
-    clean = register_bands(frames[:, :512], paper_camera, method=method).quality.mean()
-    noisy = register_bands((frames + 0.3 * noise)[:, :512], paper_camera, method=method).quality.mean()
-    assert noisy < 0.95 * clean
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_offsets_do_not_depend_on_brightness_and_contrast(pair, paper_camera, method):
     frames, _ = pair
     frames = frames[:, :768].double()

@@ -128,7 +128,3 @@ def test_dataset_has_names_units_and_reads_back_from_zarr(tmp_path):
         dataset.to_zarr(tmp_path / "result.zarr")
     again = xarray.open_zarr(tmp_path / "result.zarr")
     np.testing.assert_array_equal(again.amplitude, dataset.amplitude)
-
-
-def test_results_without_a_table_name_what_they_have():
-    refuses(TWO_TONES.table, r"Vibration has no table: use to_xarray\(\), which all results have", TypeError)

@@ -112,20 +112,6 @@ def test_push_scan_frames_are_joined_where_they_overlap():
     assert decibel(joint[0], truth, 8) > decibel(single[1], truth, 8) - 0.1
 
 
-def test_ignored_pixels_are_estimated_from_all_others(short):
-    truth, frames, motion = short
-    frames = with_noise(frames, 0.005)
-    ignore = torch.rand(frames.shape, generator=torch.Generator().manual_seed(2)) < 0.01
-    ignore[0, 100:104, 120:124] = True
-    incomplete = frames.masked_fill(ignore, float("nan"))
-    joint = restore(incomplete, TIMING, motion.vibration(), joint=True, ignore=ignore)
-    single = restore(incomplete, TIMING, motion.vibration(), ignore=ignore)
-    assert decibel(single, truth) > decibel(restore(frames, TIMING, motion.vibration()), truth) - 1.5
-    assert decibel(joint, truth) > decibel(restore(frames, TIMING, motion.vibration(), joint=True), truth) - 0.5
-    blind = restore(frames.masked_fill(ignore, 1.0), TIMING, motion.vibration())
-    assert decibel(blind, truth) < decibel(single, truth) - 10
-
-
 @pytest.mark.parametrize("joint", [False, True])
 def test_results_do_not_depend_on_segments(short, joint):
     _, frames, motion = short

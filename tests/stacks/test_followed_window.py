@@ -12,7 +12,7 @@ from refusals import refuses
 from truth import Curve, crop, decibel, draw_scene, take_frames
 
 import rsvib_torch as rsv
-from rsvib_torch.stacks import detect_stack, read_manifest
+from rsvib_torch.stacks import read_manifest
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=500)
 CAMERA = ["--row-time", "100us", "--exposure", "1.2ms", "--frame-rate", "20"]
@@ -112,8 +112,9 @@ def test_two_steady_tones_near_the_frame_rate_are_not_reliable_and_wrong():
 
 
 def test_windows_state_the_vibration_of_their_frames(place, tmp_path):
-    detect_stack(place / "frames.npy", tmp_path / "manifest.json", TIMING, follow=True, window=14)
-    manifest = read_manifest(tmp_path / "manifest.json")
+    options = ("--window", 14, "--follow", "--out", tmp_path / "found")
+    assert rsvib("detect", place / "frames.npy", *CAMERA, *options) == 0
+    manifest = read_manifest(tmp_path / "found" / "manifest.json")
     assert len(manifest.detections()) == FRAMES
     assert [frame for record in manifest.windows for frame in record.followed] == list(range(FRAMES))
     table = manifest.table()
