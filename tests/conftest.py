@@ -17,11 +17,13 @@ ALGORITHMS = ("detection", "registration", "restoration", "tracking", "test_impo
 RENDERED = {"report", "test_presentation.py", "test_gallery.py", "test_spectrum.py"}  # tests of figures
 LONGEST = (
     "test_tutorials.py",
-    "test_direct.py",
-    "test_answers.py",
-    "test_cli.py",
+    "test_followed_window.py",
     "test_start.py",
-    "test_slanted_edge.py",
+    "test_process_video.py",
+    "test_direct.py",
+    "test_mosaic.py",
+    "test_steady_by_gyroscope.py",
+    "test_rotation_alignment.py",
 )
 SLOWER_TESTS = [line for line in (TESTS / "slower_tests.txt").read_text().splitlines() if not line.startswith("#")]
 
