@@ -1,8 +1,8 @@
-"""Noise level of every frame of a stack: four estimators, and the order in which they are preferred.
+"""Noise level of every frame of a stack: three estimators, and the order in which they are preferred.
 
 ``noise_levels`` (at the end of the file) is the entry. ``estimate_noise`` measures single images and counts fine
-texture as noise; the estimators of the table ``ESTIMATORS`` separate noise from texture by motion blur, by a second
-frame, or by the floor of the power spectrum.
+texture as noise; the estimators of the table ``ESTIMATORS`` separate noise from texture by a second frame, or by the
+floor of the power spectrum.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rsvib_torch.execution.chunking import at_once, runs
-from rsvib_torch.execution.parallel import allowed_threads, in_parallel
 from rsvib_torch.frames.pixels import cut_parts
-from rsvib_torch.numerics.fourier import squared_modulus, waves
+from rsvib_torch.numerics.fourier import squared_modulus
 from rsvib_torch.numerics.tables import Array, constant, median, quantile, table, tables, valid_mean, without_nan
 from rsvib_torch.restoration.frame_motion import FrameMotion
 from rsvib_torch.restoration.scene_model.cross_validation import sample_rows
 from rsvib_torch.restoration.scene_model.observation import RowKernels
-from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, power_transfer, spread_starts, taper
+from rsvib_torch.restoration.scene_model.scene_prior import cut_pieces, spread_starts, taper
 
 # Squares for power spectra, and which parts of images count
 
@@ -124,155 +123,10 @@ def _differences(count: int, order: int) -> Array:
     return matrix
 
 
-def _row_weights(count: int) -> Array:
-    """Weights (count,) of the rows of a square under its window."""
-    window = np.hanning(2 * count + 1)[1::2] ** 2
-    weights: Array = window / window.sum()
-    return weights
-
-
-def _pooled_frequencies() -> Array:
-    """Moduli (U', V') of the pooled frequencies of squares in cycles per px."""
-    modulus = np.hypot(np.fft.rfftfreq(_SIDE)[:, None], np.fft.fftfreq(_SIDE))
-    return table(_pooled(torch.from_numpy(modulus)))
-
-
 def _correlation_area(order: int) -> float:
     """Sum of the squared autocorrelation of differenced white noise over all lags."""
     total = math.comb(2 * order, order)
     return sum((math.comb(2 * order, order + lag) / total) ** 2 for lag in range(-order, order + 1))
-
-
-# Motion blur: it attenuates the scene, row by row, and leaves noise as it is
-
-
-# px, range of the displacement during an exposure below which its blur attenuates no frequency along any direction by
-# ``max_transfer``: at 0.7 cycles per px, the power transfer of a sinusoid of this range is 0.13
-_LEAST_BLUR = 0.8
-
-
-@torch.no_grad()
-def noise_of_blurred_frames(
-    frames: Tensor,
-    motion: FrameMotion,
-    ignore: Tensor | None = None,
-    high_pass: Tensor | None = None,
-) -> Tensor:
-    """Noise power (B, T) of each frame from its motion blur.
-
-    At frequency k, square p of a frame has the power ``a_p T_pk S_k + noise``: T is the power transfer of the blur of
-    its rows, S the spectrum of the scene, and a the strength of the texture in the square. Where T is near zero, the
-    power is that of the noise, whatever the texture. Fisher scoring estimates a, S and the noise together, for powers
-    with exponential distributions about their means (Whittle 1953).
-
-    NaN for a frame with fewer than four usable squares, and for a stack whose blur blocks the scene at too few
-    frequencies. Arguments as above ``ESTIMATORS``.
-    """
-    min_frequency = 0.12  # cycles per px; below, scenes are too strong to be informative about noise
-    max_transfer = 0.05  # T, below which the blur blocks the scene
-    min_share = 0.02  # of the values of T that are below
-    row_step = 8  # rows, for one of which T is computed
-    num_stacks, num_frames = frames.shape[:2]
-    shape, device = frames.shape[-2:], frames.device
-    result = np.full((num_stacks, num_frames), math.nan)
-    if min(shape) < 2 * _SIDE or np.hypot(*motion.blur_lengths.max((0, 1))) < _LEAST_BLUR:
-        return torch.from_numpy(result).to(device)
-    # transfer of the blur of squares spread over the frame; the estimator needs frequencies that it blocks
-    counts = _square_counts(shape, min(max(256 // num_frames, 25), 64))
-    rows = torch.as_tensor(spread_starts(shape[0], _SIDE, counts[0])[:, None] + np.arange(_SIDE), device=device)
-    u = constant(np.fft.rfftfreq, _SIDE, dtype=torch.float64, device=device)
-    v = constant(np.fft.fftfreq, _SIDE, dtype=torch.float64, device=device)
-    used = constant(_pooled_frequencies, dtype=u.dtype, device=device) > min_frequency
-    displacement, node_weights = motion.exposures
-    of_squares = displacement[:, :, rows]  # (B, T, n, rows, N, 2)
-    of_rows = of_squares[:, :, :, row_step // 2 :: row_step]
-    weights = constant(_row_weights, of_rows.shape[3], dtype=u.dtype, device=device)
-    blur = (power_transfer(of_rows, node_weights, u, v) * weights[:, None, None]).sum(-3)
-    transfer = table(_pooled(blur)[..., used])
-    blocked = (transfer < max_transfer).mean((1, 2, 3)) >= min_share
-    stacks = blocked.nonzero()[0].tolist()
-    if not stacks:
-        return torch.from_numpy(result).to(device)
-    # power of the squares, mean over channels, with rows moved back by their displacement
-    squares = _tapered(_cut_squares(frames[stacks], counts))  # (S, T, C, n, m, rows, columns)
-    mean = (of_squares[stacks][..., 0] * node_weights).sum(-1)
-    unshift = waves(mean, -u).to(frames.dtype.to_complex())  # aligns neighbouring rows along the row axis
-    spectra = torch.fft.rfft(squares) * unshift[:, :, None, :, None]
-    powers = squared_modulus(torch.fft.fft(spectra, dim=-2)).mean(2)
-    power = table(_pooled(powers.transpose(-2, -1).to(torch.float64))[..., used])  # (S, T, n, m, K)
-    transfer = np.broadcast_to(transfer[stacks][:, :, :, None], power.shape)
-    power, transfer = (values.reshape(len(stacks) * num_frames, -1, power.shape[-1]) for values in (power, transfer))
-    # squares that count; frames with too few of them have no estimate
-    usable = np.any(power > 0, -1)
-    if ignore is not None:
-        missing = _cut_squares(ignore[stacks].any(2), counts).double().mean((-2, -1))
-        usable &= table(_mostly_measured(missing.flatten(2).flatten(0, 1), (-1,)))
-    enough = usable.sum(-1) >= min(4, usable.shape[-1])
-    noise = np.full(len(enough), math.nan)
-    if enough.any():
-        spectra_of = [values[enough] for values in (power, transfer, usable)]
-        parts = runs(enough.sum(), -(-enough.sum() // allowed_threads()))
-        fitted = in_parallel(
-            lambda part: fit_noise(*(values[part] for values in spectra_of)), parts, torch.device("cpu")
-        )
-        noise[enough] = np.concatenate(fitted)
-    result[stacks] = noise.reshape(-1, num_frames)
-    return torch.from_numpy(result).to(device)
-
-
-def fit_noise(power: Array, transfer: Array, usable: Array, *, iterations: int = 6, max_decrease: float = 0.5) -> Array:
-    """Noise power (T,) by Fisher scoring of ``texture_p transfer_pk scene_k + noise``.
-
-    ``power`` and ``transfer`` are (T, P, K) of P squares at K frequencies; squares that count are ``usable`` (T, P).
-    Each step is for scene and noise first, then for the texture: six reach the noise power of 60 to 0.1 to 0.4 %, which
-    has a standard deviation of about 1 %. ``max_decrease`` is the largest relative one of a parameter in a step; it
-    keeps the powers positive.
-    """
-    share = usable[:, None] / usable.sum(-1)[:, None, None]  # (T, 1, P)
-    mean_power = share @ power
-    noise = mean_power.min(-1, keepdims=True)
-    texture = np.ones_like(power[..., :1])
-    scene = np.maximum(mean_power - noise, 0.1 * noise) / (share @ transfer)
-    for _ in range(iterations):
-        # step of scene and noise
-        by_scene = texture * transfer  # derivative of the model with respect to the scene
-        model = by_scene * scene + noise
-        weight, residual = share.mT / np.square(model), power - model
-        weighted = by_scene * weight
-        curvature = (by_scene * weighted).sum(-2, keepdims=True)
-        gradient = (weighted * residual).sum(-2, keepdims=True)
-        mixed = weighted.sum(-2, keepdims=True)
-        # normal equations of scene and noise with the scene eliminated
-        gain = mixed / curvature
-        reduced = (weight * residual).sum((-2, -1), keepdims=True) - (gain * gradient).sum(-1, keepdims=True)
-        step = reduced / (weight.sum((-2, -1), keepdims=True) - (gain * mixed).sum(-1, keepdims=True))
-        step = np.clip(step, -max_decrease * noise, noise)
-        scene = np.maximum(scene + (gradient - mixed * step) / curvature, max_decrease * scene)
-        noise = noise + step
-        # step of the texture, whose mean is one by definition
-        by_texture = transfer * scene
-        model = texture * by_texture + noise
-        weighted = by_texture / np.square(model)
-        change = (weighted * (power - model)).sum(-1, keepdims=True) / (by_texture * weighted).sum(-1, keepdims=True)
-        texture = np.maximum(texture + change, max_decrease * texture)
-        typical = share @ texture
-        texture, scene = texture / typical, scene * typical
-    result: Array = noise[:, 0, 0]
-    return result
-
-
-def _square_counts(shape: torch.Size, most: int) -> list[int]:
-    """Squares along each axis, about ``most`` in all; they overlap by half if that is fewer."""
-    counts = [2 * extent // _SIDE - 1 for extent in shape]
-    excess = max(1.0, math.sqrt(math.prod(counts) / most))
-    return [max(1, round(count / excess)) for count in counts]
-
-
-def _pooled(values: Tensor) -> Tensor:
-    """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
-    inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
-    pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
-    return pooled
 
 
 # Two frames: the residual after the scene that explains both best is subtracted
@@ -385,6 +239,13 @@ def _residual_power(
 # One frame: noise is white, the spectrum of a scene falls
 
 _SECTORS = 6  # directions, with one power law each
+
+
+def _pooled(values: Tensor) -> Tensor:
+    """Mean over 2 x 2 neighbouring frequencies of (..., U, V), without the lowest and the highest u."""
+    inner = values[..., 1 : (values.shape[-2] - 2) // 2 * 2 + 1, :]
+    pooled: Tensor = inner.unflatten(-2, (-1, 2)).unflatten(-1, (-1, 2)).mean((-3, -1))
+    return pooled
 
 
 def noise_of_spectral_floor(
@@ -506,7 +367,6 @@ def _fit_floor(
 # another one.
 Estimator = Callable[[Tensor, FrameMotion, Tensor | None, Tensor], Tensor]
 ESTIMATORS: dict[str, Estimator] = {
-    "motion blur": noise_of_blurred_frames,
     "frame pair": noise_of_frame_pair,
     "spectral floor": noise_of_spectral_floor,
 }

@@ -13,11 +13,9 @@ from rsvib_torch.restoration.noise import (
     estimate_noise,
     noise_floor,
     noise_levels,
-    noise_of_blurred_frames,
 )
 
 TIMING = SensorTiming(row_time=20.52e-6, exposure_rows=20, frame_rows=2048)
-DEFAULT_MOTION = Motion()
 
 
 def levels(frames, motion):
@@ -145,43 +143,3 @@ def test_floor_is_below_texture(steepness, level, texture_adds):
 def test_floor_of_small_and_empty_images():
     assert noise_floor(torch.rand(2, 63, 200)).isnan().all()
     assert noise_floor(torch.zeros(64, 64)) == 0
-
-
-def texture(size, blur, seed=1):
-    noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((size, size)), blur, mode="wrap")
-    return np.clip(0.5 + 0.05 * noise / noise.std(), 0, 1)
-
-
-def blurred_frames(scene, rows, noise, count=1, motion=DEFAULT_MOTION):
-    timing = SensorTiming(row_time=20.52e-6, exposure_rows=rows, frame_rows=2048)
-    clean = take_frames(scene, timing, motion, count)
-    frames = clean + noise * np.random.default_rng(3).standard_normal(clean.shape)
-    moved = frame_motion(motion.vibration().expanded(1), timing, count, frames.shape[-2])
-    return torch.from_numpy(frames).float()[:, None], moved
-
-
-@pytest.mark.parametrize(
-    ("rows", "noise", "texture_adds"),
-    [(400, 0.001, 2.0), (100, 0.005, 1.25), (400, 0.02, 1.02)],
-)
-def test_motion_blur_separates_dense_texture_from_noise(rows, noise, texture_adds):
-    frames, motion = blurred_frames(texture(420, 0.7), rows, noise)
-    assert estimate_noise(frames[0])[0] > texture_adds * noise
-    assert noise_of_blurred_frames(frames[None], motion)[0, 0].sqrt().item() == pytest.approx(noise, rel=0.12)
-
-
-def test_motion_blur_measures_every_frame_independently():
-    frames, motion = blurred_frames(texture(420, 0.7), 400, 0.0, 2)
-    levels = torch.tensor([0.002, 0.006])
-    noise = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
-    frames = frames + levels[:, None, None, None] * noise
-    found = noise_of_blurred_frames((frames)[None], motion)[0].sqrt().float()
-    torch.testing.assert_close(found, levels, rtol=0.12, atol=0)
-    wrong = noise_of_blurred_frames((frames.flip(0))[None], motion)[0].sqrt().float().flip(0)
-    assert (wrong / levels - 1).abs().max() > 0.5
-
-
-@pytest.mark.parametrize(("rows", "size"), [(20, 420), (100, 180)])
-def test_motion_blur_does_not_apply_without_blur_or_to_small_frames(rows, size):
-    frames, motion = blurred_frames(texture(size, 0.7), rows, 0.004)
-    assert noise_of_blurred_frames((frames)[None], motion)[0].isnan().all()
