@@ -108,7 +108,7 @@ def write_stmap(
         >>> timing = SensorTiming(row_time=1e-4, exposure_rows=1, frame_rows=100)
         >>> vibration = Vibration((2.0, 0.0), (100.0, 0.0))
         >>> files = write_stmap(tempfile.mkdtemp(), vibration, timing, (80, 60), 1, convention="opencv")
-        >>> import cv2
+        >>> import cv2, numpy as np
         >>> map_x, map_y, inside = cv2.split(tifffile.imread(files[0]))
         >>> frame = np.tile(np.arange(60, dtype=np.float32), (80, 1))
         >>> round(float(cv2.remap(frame, map_x, map_y, cv2.INTER_LINEAR)[25, 30]), 2)  # a quarter of a period: X = 2 px

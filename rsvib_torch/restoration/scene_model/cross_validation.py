@@ -150,7 +150,7 @@ def prior_strengths(
     octaves = np.log2(strengths)[:, None]
     # strength 1 follows from the noise level: another must reduce the logarithm by this much per octave, weaker or
     # stronger
-    handicap = np.where(allowed, np.maximum(-0.014 * octaves, 0.002 * octaves), np.inf)
+    handicap = np.maximum(-0.014 * octaves, 0.002 * octaves)
     selected = np.full(len(images), _TRIED - 1)
     for tried in (_TRIED, len(_STRENGTHS)):
         if (selected < _TRIED - 1).all():
@@ -163,6 +163,7 @@ def prior_strengths(
         with np.errstate(divide="ignore", invalid="ignore"):
             of_sum = np.log(explained.power.sum(-1)) - 2 * np.log(rest.sum(-1))
             geometric = (np.log(explained.power) - 2 * np.log(rest)).mean(-1)
-        selected = np.maximum(*((criterion + handicap[:tried]).argmin(0) for criterion in (of_sum, geometric)))
+        criteria = (np.where(allowed[:tried], values + handicap[:tried], np.inf) for values in (of_sum, geometric))
+        selected = np.maximum(*(criterion.argmin(0) for criterion in criteria))
     result: NDArray[np.float64] = strengths[selected]
     return result
