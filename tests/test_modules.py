@@ -132,6 +132,27 @@ def test_compiled_models_have_one_graph_break(blur, vibration):
         assert torch.equal(torch.compile(model, backend="eager")(frames), model(frames))
 
 
+class Stacks(torch.utils.data.Dataset):
+    """Stacks that are detected and restored in the process that loads them."""
+
+    def __init__(self, frames):
+        self.frames = frames
+        self.detector = rsv.VibrationDetector(TIMING, method="bands", tones=1)
+        self.restorer = rsv.VibrationRestorer(TIMING, method="dewarp")
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __getitem__(self, index):
+        return self.restorer(self.frames[index], self.detector(self.frames[index]).vibration)
+
+
+def test_workers_equal_the_main_process(frames):
+    data = Stacks(frames)
+    loader = torch.utils.data.DataLoader(data, batch_size=2, num_workers=2)
+    torch.testing.assert_close(next(iter(loader)), torch.stack([data[0], data[1]]), rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("method", [*METHODS, "richardson-lucy"])
 def test_gradients_reach_frames_and_vibration(method):
     """Against central differences of the same loss, in float64."""
