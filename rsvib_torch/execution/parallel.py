@@ -1,5 +1,6 @@
 """Threads: one within operations on small images, several for independent work, and items that are made ahead."""
 
+import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -47,15 +48,15 @@ class ProcessSetting:
 
 
 @cache
-def _blas() -> ThreadpoolController:
-    """The BLAS of NumPy and that of SciPy, which have threads of their own."""
+def _blas(opencv: bool) -> ThreadpoolController:
+    """The BLAS of NumPy, of SciPy, and of OpenCV if it is loaded, which have threads of their own."""
     import_module("scipy.linalg")  # a library is found once it is loaded
     return ThreadpoolController()
 
 
 # Tables of fits are small, and threads of BLAS wait for each other after every product. Detection of three tones in 16
 # frames of 266 x 266 px beside four busy processes on two cores: 3.0 s, and 17.4 s with the threads of BLAS
-ONE_BLAS_THREAD = ProcessSetting(lambda: _blas().limit(limits=1, user_api="blas"))
+ONE_BLAS_THREAD = ProcessSetting(lambda: _blas("cv2" in sys.modules).limit(limits=1, user_api="blas"))
 
 
 def allowed_threads() -> int:
