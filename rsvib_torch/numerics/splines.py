@@ -203,13 +203,13 @@ def correlated(samples: Tensor, kernels: Tensor, dim: int, step: int = 1) -> Ten
 def _across(samples: Tensor, kernels: Tensor, step: int, length: int) -> Tensor:
     """``correlated`` across rows (..., n, W): (Q, ..., length, W), by batches of small matrices."""
     number, taps = kernels.shape
-    block = min(8 if samples.device.type == "cpu" else 256, length)
+    block = min(32 // step if samples.device.type == "cpu" else 256, length)
     span = (block - 1) * step + taps
     count = length // block
     matrix = _toeplitz(kernels, block, step)  # (Q, block, span)
     windows = samples.unfold(-2, span, block * step).mT  # (..., count, span, W)
     every = windows.reshape(-1, *windows.shape[-2:])
-    products = torch.bmm(matrix.view(1, -1, span).expand(len(every), -1, -1), every)
+    products = torch.bmm(matrix.reshape(1, -1, span).expand(len(every), -1, -1), every)
     blocks: Tensor = products.view(*windows.shape[:-2], number, block, -1).movedim(-3, 0).flatten(-3, -2)
     rest = length - count * block
     if not rest:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import convolution_matrix
 from torch import Tensor
 from torch.nn import functional
 
@@ -21,6 +20,7 @@ from rsvib_torch.imaging.trajectory import exposure_trajectory, gauss_node_count
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration
+from rsvib_torch.numerics.splines import correlated
 from rsvib_torch.numerics.tables import Array
 from rsvib_torch.registration.row_spectra import MARGIN, RowSpectra
 
@@ -289,20 +289,7 @@ _FILTERS = _derivative_filters(5)
 _SHORT_FILTERS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12
 
 
-_PART = 32  # rows; detection in a pair of 512 x 512 px takes 0.73 of the time with a matrix of all rows, mostly zeros
-
-
-def _across_rows(images: Tensor, filters: Array) -> list[Tensor]:
+def _across_rows(images: Tensor, filters: Array) -> tuple[Tensor, ...]:
     """Derivatives (B, G, s, U, 2) across rows of images (B, G, s + R - 1, U, 2), by filters (K, R)."""
-    taps = filters.shape[1]
-    count = images.shape[2] - taps + 1
-    size = _PART if count > 4 * _PART else count
-    matrix = np.concatenate([convolution_matrix(one[::-1], size + taps - 1, "valid") for one in filters])
-    parts = images[:, :, None]
-    if size < count:
-        place = torch.arange(size + taps - 1, device=images.device)
-        place = torch.arange(0, count, size, device=images.device)[:, None] + place
-        parts = images[:, :, place.clamp_(max=images.shape[2] - 1)]
-    derivatives = torch.from_numpy(matrix).to(images) @ parts.flatten(4)  # (B, G, parts, K size, U 2)
-    of_filters = derivatives.unflatten(3, (-1, size)).unbind(3)
-    return [values.flatten(2, 3)[:, :, :count].unflatten(3, images.shape[3:]) for values in of_filters]
+    derivatives = correlated(images.flatten(3), torch.from_numpy(filters).to(images), 2)
+    return derivatives.unflatten(-1, images.shape[3:]).unbind(0)
