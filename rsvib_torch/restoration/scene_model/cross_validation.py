@@ -141,7 +141,6 @@ def prior_strengths(
             for values in (prior.power, prior.reflections, prior.interpolation_power)
         )
     )
-    precisions = torch.stack([at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS])
     # 2. A stronger prior is allowed only if the noise level is certain, and can be distinguished from the interpolation
     # error of the kernel. The strongest priors are tried first, and all only if the weakest of them is selected.
     strengths = np.array(_STRENGTHS)
@@ -158,7 +157,8 @@ def prior_strengths(
         # ``n |r|^2 / (n - freedom)^2`` of Craven and Wahba (1979) estimates the squared error of predicting a pixel
         # from all others. The sum over the frequencies is dominated by those with the largest errors; the geometric
         # mean gives all the same weight. The weaker of the two selected priors is used, as it has the smaller error.
-        explained = sample.explain(precisions[:tried])
+        precisions = [at.precision(noise_power, strength, blur_reach) for strength in _STRENGTHS[:tried]]
+        explained = sample.explain(torch.stack(precisions))
         rest = explained.count[:, None] - explained.freedom
         with np.errstate(divide="ignore", invalid="ignore"):
             of_sum = np.log(explained.power.sum(-1)) - 2 * np.log(rest.sum(-1))

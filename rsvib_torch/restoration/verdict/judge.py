@@ -388,8 +388,8 @@ def _judge_batch(
         results: list[RestorationVerdict | TooLittleInCommonError] = []
         for stack, of_stack in enumerate(common):
             if any(small[stack]):
-                (y, x), pair = (values[small[stack].index(True)] for values in ([one.step for one in of_stack], pairs))
-                earlier, later = (numbers[frame] for frame in pair)
+                place = small[stack].index(True)
+                (y, x), (earlier, later) = of_stack[place].step, (numbers[frame] for frame in pairs[place])
                 apart = f"they lie ({x}, {y}) px apart"
                 results.append(
                     TooLittleInCommonError(
