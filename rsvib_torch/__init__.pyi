@@ -31,10 +31,8 @@ from .evaluation import find_slanted_edges as find_slanted_edges
 from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim
-from .export import camera_isd as camera_isd
 from .export import sampling_map as sampling_map
 from .export import write_gcsv as write_gcsv
-from .export import write_isd as write_isd
 from .export import write_stmap as write_stmap
 from .gyroscope import AccelerometerComparison as AccelerometerComparison
 from .gyroscope import AngularRates as AngularRates

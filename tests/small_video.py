@@ -37,7 +37,8 @@ def write_video(
 ):
     """Write frames (T, H, W) or (T, H, W, 3) in a pixel format; ``rotation`` is anticlockwise in degrees."""
     with av.open(str(path), "w") as output:
-        video = output.add_stream(codec, rate=rate or round(1 / PERIOD), options=options or {})
+        same = {"mbtree": "0"} if codec == "libx264" else {}  # with it, files of the same frames differ from run to run
+        video = output.add_stream(codec, rate=rate or round(1 / PERIOD), options=same | (options or {}))
         video.height, video.width = frames.shape[1:3]
         video.pix_fmt = encoded or layout
         video.codec_context.thread_count = 1  # rate control of several threads depends on the load of the machine

@@ -9,16 +9,16 @@ import rsvib_torch
 from rsvib_torch import export as exports
 from rsvib_torch import io, restoration
 from rsvib_torch import report as reports
-from rsvib_torch.checks.validation import options, read_json
+from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new, size_of
 from rsvib_torch.commands.terminal import Answer, warn, working
 from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import ExportFormat, IsdModel, StmapConvention
+from rsvib_torch.options import ExportFormat, StmapConvention
 from rsvib_torch.text import AXES
 
-_FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".json": "isd", ".csv": "csv"}
+_FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".csv": "csv"}
 
 
 @options
@@ -29,11 +29,9 @@ class ExportOptions:
     """The vibration.json written by detect or run."""
     out: Path = argument()
     """File to write; for stmap a folder."""
-    file_format: ExportFormat | None = option(
-        None, "--format", show_default="from the extension: .gcsv, .csv, .json for isd"
-    )
+    file_format: ExportFormat | None = option(None, "--format", show_default="from the extension: .gcsv, .csv")
     """gcsv: angular rates, for Gyroflow; stmap: a position per pixel and frame, for compositing programs and OpenCV;
-    isd: image support data, for the Community Sensor Model; csv: offsets of the rows before and after correction."""
+    csv: offsets of the rows before and after correction."""
     frames: Path | None = None
     """The stack of frames, for their size and number (gcsv, stmap)."""
     size: str | None = option(None, metavar="HEIGHTxWIDTH")
@@ -42,15 +40,6 @@ class ExportOptions:
     """Number of frames, in place of --frames."""
     focal_length: float | None = None
     """Focal length in px, for a vibration that was detected without one; required for gcsv."""
-    camera_isd: Path | None = option(None, "--isd")
-    """ISD of the camera at rest (JSON), which isd requires."""
-    frame: int = 0
-    """Number of the frame that isd describes, from 0."""
-    model: IsdModel = "auto"
-    """Sensor model of isd: frame, a frame camera with jitter polynomials; line-scan, one quaternion per row; auto, the
-    first of them that is accurate enough."""
-    tolerance: float = 0.005
-    """Largest error of a position by isd, in px."""
     convention: StmapConvention = "nuke"
     """Positions of stmap: nuke, 0 to 1 from the bottom left corner; opencv, px from the first pixel."""
     sample_rate: float | None = option(None, show_default="chosen for an attitude within 2e-7 rad")
@@ -69,9 +58,9 @@ def export(given: ExportOptions) -> Answer:
     out = given.out
     chosen = given.file_format or _FORMAT_OF_ENDING.get(out.suffix.lower())
     if chosen is None:
-        raise ValueError(f"the format of {out.name} is not known from its name: give --format gcsv, stmap, isd or csv")
+        raise ValueError(f"the format of {out.name} is not known from its name: give --format gcsv, stmap or csv")
     frames = [] if given.frames is None else io.stack_files(given.frames)
-    check_new([out], given.overwrite, [given.vibration, *frames, given.camera_isd])
+    check_new([out], given.overwrite, [given.vibration, *frames])
     check_writable(out, folder=chosen == "stmap")
     detected = reports.load_detection(given.vibration)
     if chosen == "csv":
@@ -87,19 +76,6 @@ def export(given: ExportOptions) -> Answer:
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
     data: Table = {"format": chosen}
-    if chosen == "isd":
-        if given.camera_isd is None:
-            raise ValueError("isd needs the ISD of the camera at rest: give --isd FILE; camera_isd builds one")
-        found = read_json(given.camera_isd, "ISD")
-        rows = found.get("image_lines")
-        motion = _trusted(given, detected, timing, given.frame + 1, rows if isinstance(rows, int) and rows > 0 else 1)
-        written = exports.write_isd(
-            out, motion, timing, found, frame=given.frame, model=given.model, tolerance=given.tolerance
-        )
-        frame = "frame camera with jitter polynomials"
-        form = frame if written == "frame" else "line scanner with one quaternion per row"
-        data |= {"model": written, "frame": given.frame}
-        return Answer({"Sensor model": [f"frame {given.frame} as a {form}"]}, data, [out])
     shape, count = _extent(given)
     motion = _trusted(given, detected, timing, count, shape[int(timing.scan_axis)])
     data |= {"size": list(shape), "num_frames": count}

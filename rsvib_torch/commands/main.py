@@ -66,7 +66,6 @@ _EXAMPLES = """
         --steady 1
   rsvib export found/vibration.json clip.gcsv --frames clip.mp4 \\
         --focal-length 1800
-  rsvib export found/vibration.json frame.json --isd camera.json
   rsvib simulate scene.png frames.tif --config camera.toml
   rsvib simulate scene.png frames.npy --config camera.toml --seed 2
 """

@@ -1,4 +1,4 @@
-"""Motions in the file formats of other programs: angular rates, sampling maps, and image support data."""
+"""Motions in the file formats of other programs: angular rates and sampling maps."""
 
 import lazy_loader
 

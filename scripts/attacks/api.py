@@ -123,7 +123,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     tones = [torch.full((1,), 0.1, dtype=torch.float64)] * 8
     record = (torch.tensor([True]), 5e-6, 1e-9, 0.0, 1e-6, (), times, path, path)
     accelerometer = rsv.AccelerometerComparison(("x",), *tones, *record)
-    isd = rsv.camera_isd(rsv.Camera(2e6), (96, 64), position=(6878.0, 0.0, 0.0), look=(-1.0, 0.0, 0.0))
     camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
     components = torch.zeros(2, 3, dtype=torch.float64)
     # values of the parameters of all functions and methods, by name
@@ -142,7 +141,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     pool |= {"line_time": 1e-4, "delays": [0.0, 0.04], "num_lines": 100, "exposure_lines": 2.0, "size": (96, 64)}
     pool |= {"height": 24, "width": 16, "u": times * 10, "v": times * 10, "input": frames[:, None], "index": 0}
     pool |= {"count": 2, "shape": (3, 96, 64), "dtype": "float32", "frame": frames[0].numpy(), "x": scene}
-    pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0, "isd": isd}
+    pool |= {"y": frames[0], "scene_shape": (160, 128), "tones": None, "flicker_frequency": 1000.0}
     pool |= {"results": [detected.std] * 2, "images": frames}
     pool |= {"visible": torch.ones(96, 64, dtype=torch.bool), "other": rsv.Margins(1, 2, 3, 4), "place": torch.zeros(2)}
     pool |= {"stated": timing, "agreeing": timing, "row_time": 1e-4, "pixel_size": 5e-6}
@@ -158,15 +157,13 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         return Call(function, others | {name: value for name, value in known.items() if value is not inspect._empty})
 
     fast = {"method": "bands", "tones": 1}
-    new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "rates.gcsv", "isd.json", "maps")}
-    of_isd = {"camera": rsv.Camera(2e6), "position": (6878.0, 0.0, 0.0), "look": (-1.0, 0.0, 0.0)}
+    new = {name: folder / name for name in ("new.npy", "new.mkv", "figure.png", "rates.gcsv", "maps")}
     with_camera = vibration.with_camera(rsv.Camera(900.0))
     different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
         "align_motion": {"camera": None, "fit_gain": True},
         "calibrate_row_time": {"frames": stripes},
         "calibrate_row_time_by_exposure": {"frames": stripes},
         "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
-        "camera_isd": of_isd,
         "comparison_figure": {"size": 32, "restored": restored[0]},
         "detect_motion": {"iterations": 1},
         "detect_swept_tone": {"iterations": 1},
@@ -188,7 +185,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "ssim": {"image": restored, "reference": frames},
         "windows_figure": {"times": [0.0]},
         "write_gcsv": {"path": new["rates.gcsv"], "motion": with_camera, "num_frames": 2},
-        "write_isd": {"path": new["isd.json"], "motion": vibration, "frame": 1},
         "write_offsets": {"path": folder / "offsets.csv"},
         "write_stack": {"path": folder / "written.tif", "like": info},
         "write_stmap": {"folder": new["maps"], "motion": vibration},

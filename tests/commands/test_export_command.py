@@ -23,8 +23,6 @@ def place(tmp_path_factory):
     detected = rsv.detect_vibration(frames, TIMING)
     assert detected.reliable.all()
     detected.save(folder / "vibration.json")
-    camera = rsv.camera_isd(rsv.Camera(2e6), tuple(frames.shape[-2:]), position=(6878.0, 0, 0), look=(-1.0, 0, 0))
-    (folder / "camera.json").write_text(json.dumps(camera))
     return folder, detected, tuple(frames.shape[-2:])
 
 
@@ -48,19 +46,6 @@ def test_gcsv_with_a_focal_length(place, tmp_path, capsys):
     )
 
 
-def test_isd_of_the_second_frame(place, tmp_path, capsys):
-    folder, _, size = place
-    out = tmp_path / "frame.json"
-    options = ("--isd", folder / "camera.json", "--frame", 1)
-    assert run(folder / "vibration.json", out, *options) == 0
-    assert "line scanner with one quaternion per row" in capsys.readouterr().out
-    assert len(json.loads(out.read_text())["instrument_pointing"]["quaternions"]) == size[0] + 8
-    assert "no sensor model represents this motion within 0.005 px (frame: " in refused(
-        capsys, "export", folder / "vibration.json", out, *options, "--overwrite", "--model", "frame"
-    )
-    assert json.loads(out.read_text())["name_model"] == "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"  # not replaced
-
-
 def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     folder, _, size = place
     data = json.loads((folder / "vibration.json").read_text())
@@ -82,11 +67,9 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("vibration.json", "clip.xyz"), "give --format gcsv, stmap, isd or csv"),
-        (("vibration.json", "vibration.json"), "it is the same file as the input"),
-        (("vibration.json", "camera.json", "--isd", "camera.json"), "it is the same file as the input camera.json"),
+        (("vibration.json", "clip.xyz"), "give --format gcsv, stmap or csv"),
+        (("vibration.json", "vibration.json", "--format", "csv"), "it is the same file as the input"),
         (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
-        (("vibration.json", "frame.json"), "give --isd FILE"),
     ],
 )
 def test_errors_are_one_line(place, monkeypatch, capsys, arguments, message):

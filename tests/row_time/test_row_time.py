@@ -168,7 +168,7 @@ def test_command(two_tones, one_tone, tmp_path, capsys):
     assert re.search(r"error: the row time is not certain: \d+ row times explain", error)
     assert not (tmp_path / "none.toml").exists()
     assert "--frame-rate" in refused(capsys, "calibrate", moving, "--by-motion")
-    clip = tmp_path / "clip.mp4"  # states its frame rate
+    clip = tmp_path / "clip.mkv"  # states its frame rate
     rsv.write_stack(
         clip, two_tones, dtype="uint8", like=StackInfo(tuple(two_tones.shape), "uint8", 255.0, frame_rate=RATE)
     )
