@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.numerics.splines import spline_taps
@@ -27,6 +27,7 @@ WINDOW_FRAMES = 96  # of one fit; amplitudes and frequencies may change from win
 _MOST_TONES = 3  # of an axis in a window
 _KNOTS = 2  # of the spline per frame; with one, residuals of hand-held clips are 1.7 times as large
 _STIFFNESS = 1e-3  # of the third difference of the spline, in units of the information of a typical knot
+_LEAST = 1e-9  # information of what is not determined, likewise
 # px, of the reduced frames. A window whose corners are left with more is fitted again in short windows, with tones that
 # sweep; clips with parallax and compression have 0.05 to 0.17, a tone of 1.5 px that sweeps by 24 Hz/s leaves 0.8
 _UNEXPLAINED = 0.3
@@ -167,6 +168,42 @@ def _robust_weights(distance: Array, std: Array | float) -> Array:
     return weights
 
 
+class _Band:
+    """Normal equations whose matrix is a band: ``matrix[i - j, j]`` is the entry of row i and column j, i >= j."""
+
+    def __init__(self, blocks: Sequence[NDArray[np.int64]], count: int) -> None:
+        """Equations of ``count`` unknowns; each of the blocks lists those that its entries depend on."""
+        self.blocks, self.parts = blocks, list[tuple[NDArray[np.int64], NDArray[np.int64]]]()
+        self.matrix, self.right = np.zeros((1 + max(int(np.ptp(index)) for index in blocks), count)), np.zeros(count)
+        for index in blocks:
+            row, column = np.nonzero(index[:, None] >= index)
+            place = (index[row] - index[column]) * count + index[column]
+            self.parts.append((row * len(index) + column, place))
+
+    def clear(self) -> None:
+        """Begin with no equations."""
+        self.matrix[:] = self.right[:] = 0.0
+
+    def add(self, number: int, columns: Array, values: Array, weights: Array) -> None:
+        """Add the equations ``columns @ unknowns = values`` of a block (C-contiguous matrices)."""
+        heavy, (inside, place) = columns.T * weights, self.parts[number]
+        self.matrix.reshape(-1)[place] += (heavy @ columns).reshape(-1)[inside]
+        self.right[self.blocks[number]] += heavy @ values
+
+    def stiffen(self, index: NDArray[np.int64], order: int, weight: float) -> None:
+        """Keep the differences of some ``order`` between neighbouring unknowns, with rising numbers, small."""
+        differences = np.diff(np.eye(len(index)), order, axis=0)
+        product = weight * differences.T @ differences
+        for apart in range(order + 1):
+            later, earlier = index[apart:], index[: len(index) - apart]
+            self.matrix[later - earlier, earlier] += product.diagonal(apart)
+
+    def solve(self) -> tuple[Array, Callable[[Array], Array]]:
+        """The unknowns, and a function that solves for other right sides."""
+        factor = cholesky_banded(self.matrix, lower=True, check_finite=False), True
+        return cho_solve_banded(factor, self.right), lambda right: np.asarray(cho_solve_banded(factor, right))
+
+
 class _WindowFit:
     """The robust fit of path and tones to the corners of one window."""
 
@@ -199,10 +236,6 @@ class _WindowFit:
             self.envelopes.append(
                 (knots_of_tone, _basis(taps[0][part] - knots_of_tone[0], taps[1][part], len(knots_of_tone)))
             )
-        third = np.diff(np.eye(self.count), 3, axis=0)
-        self.penalty = third.T @ third
-        steps = np.diff(np.eye(self.envelope_knots), axis=0)
-        self.steadiness = steps.T @ steps
         self.tones: list[WindowTone] = []
         self.weights = np.ones(len(factors))
         self.sigma = math.inf  # px, standard deviation of a corner along one axis
@@ -222,56 +255,55 @@ class _WindowFit:
 
     def solve(self, rounds: int = 2) -> None:
         """Fit path and tones; each round corrects the weights and the frequencies."""
-        size, of_tone = 4 * self.count, 2 * self.envelope_knots
-        total = size + of_tone * len(self.tones)
+        # Unknowns are numbered by the times of their knots, so that the normal matrix is a band.
+        knots = np.tile(self.step * np.arange(self.count), 4)
+        knots_of_tones = np.tile(self.envelope_step * np.arange(self.envelope_knots), 2 * len(self.tones))
+        place = np.argsort(np.argsort(np.concatenate([knots, knots_of_tones]), kind="stable"))
+        of_path, of_tones = place[: len(knots)], place[len(knots) :].reshape(len(self.tones), 2, self.envelope_knots)
+        blocks = [
+            np.concatenate([of_path[unknowns], of_tones[..., knots].ravel()])
+            for (_, unknowns, _), (knots, _) in zip(self.pairs, self.envelopes, strict=True)
+        ]
+        band = _Band(blocks, len(place))
         for _ in range(rounds):
             for tone in self.tones:
                 if tone.knots.any():
                     tone.correct_frequency(0.25 / (self.times.max() - self.times.min()))
             # 1. Columns of the path and the tones, for the few knots that a pair of frames depends on.
-            waves = [tone.waves(self.times, self.averaged) for tone in self.tones]
-            gram, right, columns = np.zeros((total, total)), np.zeros(total), []
-            for (part, unknowns, of_path), (knots, values) in zip(self.pairs, self.envelopes, strict=True):
-                count, places = of_path.shape[1], [unknowns]
-                of_tones = np.zeros((len(self.tones), 2, count, 2 * len(knots)))
-                for number, (tone, wave) in enumerate(zip(self.tones, waves, strict=True)):
-                    of_tones[number, tone.axis] = _wave_columns(wave[part], values)
-                    first = size + of_tone * number
-                    places += [first + knots, first + self.envelope_knots + knots]
-                both = np.concatenate([of_path, *of_tones], -1).reshape(2 * count, -1)
-                index = np.concatenate(places)
-                heavy = both.T * np.tile(self.weights[part], 2)
-                gram[np.ix_(index, index)] += heavy @ both
-                right[index] += heavy @ self.corners.offsets[part].T.ravel()
-                columns.append((part, index, both))
+            band.clear()
+            waves, columns = [tone.waves(self.times, self.averaged) for tone in self.tones], []
+            for number, ((part, _, path), (_, values)) in enumerate(zip(self.pairs, self.envelopes, strict=True)):
+                waving = np.zeros((len(self.tones), *path.shape[:2], 2 * values.shape[-1]))
+                for tone, wave, of_axis in zip(self.tones, waves, waving, strict=True):
+                    of_axis[tone.axis] = _wave_columns(wave[part], values)
+                columns.append(np.concatenate([path, *waving], -1).reshape(2 * path.shape[1], -1))
+                band.add(number, columns[-1], self.corners.offsets[part].T.ravel(), np.tile(self.weights[part], 2))
             # 2. The solution with a stiff path, and tones that are steady where nothing determines them.
-            self._regularise(gram, size)
-            for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
+            typical = max(float(np.median(band.matrix[0, of_path])), 1e-9)
+            mean = float(band.matrix[0, of_path].mean())
+            band.matrix[0] += _LEAST * typical
+            for index in of_path.reshape(4, -1):
+                band.stiffen(index, 3, _STIFFNESS * typical)
+            for tone, parts in zip(self.tones, of_tones, strict=True):
                 spread = _STEADY * np.sqrt(np.square(np.abs(tone.knots)).mean())
-                stiffness = (self.sigma / spread) ** 2 if spread > 0 else 1e-3 * gram.diagonal()[:size].mean()
-                for begin in (first, first + self.envelope_knots):
-                    part = slice(begin, begin + self.envelope_knots)
-                    gram[part, part] += stiffness * self.steadiness
-            factor = cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)
-            solution = cho_solve(factor, right)
-            self.knots = solution[:size].reshape(4, self.count)
+                for index in parts:
+                    band.stiffen(index, 1, (self.sigma / spread) ** 2 if spread > 0 else 1e-3 * mean)
+            solution, solved = band.solve()
+            self.knots = solution[of_path].reshape(4, -1)
             # 3. Weights by the residuals, and the tones.
             residual = self.corners.offsets.copy()
-            for part, index, both in columns:
-                residual[part] -= (both @ solution[index]).reshape(2, -1).T
+            for (part, *_), index, of_pair in zip(self.pairs, blocks, columns, strict=True):
+                residual[part] -= (of_pair @ solution[index]).reshape(2, -1).T
             length = np.hypot(*residual.T)
             self.sigma = max(float(np.median(length)) / 1.177, 1e-3)  # of two normal components: 1.177 std
             medians = self._medians(length)
             self.weights = self._weights(length, self.sigma, medians / 1.177)
             self.unexplained = float(np.square(medians).mean())
-            for first, tone in zip(range(size, total, of_tone), self.tones, strict=True):
-                real, imaginary = solution[first : first + of_tone].reshape(2, -1)
+            for tone, (real, imaginary) in zip(self.tones, solution[of_tones], strict=True):
                 tone.knots = real + 1j * imaginary
-        unit = np.eye(total)[:, size:]
-        covariance = self.sigma**2 * cho_solve(factor, unit)[size:]
-        for number, tone in enumerate(self.tones):
-            part = slice(of_tone * number, of_tone * (number + 1))
-            tone.set_std(covariance[part, part])
+        for tone, parts in zip(self.tones, of_tones, strict=True):
+            index = parts.ravel()
+            tone.set_std(self.sigma**2 * solved(np.eye(len(place))[:, index])[index])
 
     def _medians(self, distance: Array) -> Array:
         """Median of every pair of frames."""
@@ -285,21 +317,13 @@ class _WindowFit:
         counts = [part.stop - part.start for part, *_ in self.pairs]
         return _robust_weights(distance, np.repeat(np.maximum(std, of_pairs), counts))
 
-    def _regularise(self, gram: Array, size: int) -> None:
-        """Add the stiffness of the path, whose columns are the first ones, and a little for what is not determined."""
-        typical = max(float(np.median(gram.diagonal()[:size])), 1e-9)
-        for first in range(0, size, self.count):
-            part = slice(first, first + self.count)
-            gram[part, part] += _STIFFNESS * typical * self.penalty
-        gram[np.diag_indices(len(gram))] += 1e-9 * typical
-
     def with_tone(self, axis: int, frequency: float, slope: float) -> "_WindowFit":
         """The fit with one more tone."""
         knots = np.zeros(self.envelope_knots, complex)
         tone = WindowTone(axis, frequency, knots, self.start - self.origin, self.envelope_step, slope)
         other = copy(self)
         other.tones, other.weights = [*map(copy, self.tones), tone], np.ones_like(self.weights)
-        other.solve(_ROUNDS)
+        other.solve()
         return other
 
     def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
@@ -336,7 +360,10 @@ class _WindowFit:
         tones = [_wave_columns(tone.waves(times, self.averaged), values) for tone in self.tones if tone.axis == axis]
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known
-        self._regularise(gram, self.count)
+        typical = max(float(np.median(gram.diagonal()[: self.count])), 1e-9)
+        third = np.diff(np.eye(self.count), 3, axis=0)
+        gram[: self.count, : self.count] += _STIFFNESS * typical * third.T @ third
+        gram[np.diag_indices(len(gram))] += _LEAST * typical
         factor = cho_factor(gram, lower=True)
         rest = rest * root
         rest = rest - known @ cho_solve(factor, known.T @ rest)
@@ -392,14 +419,14 @@ def fit_window(
     is_resolved = np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1) > _MIN_SINC
     is_visible = is_resolved & (np.abs(2 * np.sin(math.pi * frequencies * interval)) > _MIN_GAIN)
     axes = [0, 1] if has_tones and is_visible.sum() > 2 else []
+    # Strongest tones by axis and slope. A tone of one axis does not change those of the other.
+    found: dict[tuple[int, float], tuple[float, float, float]] = {}
     while axes:
-        tried = [(axis, float(slope)) for axis in axes for slope in slopes]
-        wanted = [
-            fit.is_apart(axis, frequencies) & (is_resolved if abs(slope) > _FAST else is_visible)
-            for axis, slope in tried
-        ]
-        found = [fit.strongest(*of, frequencies, where) for of, where in zip(tried, wanted, strict=True)]
-        (axis, slope), (frequency, ratio, offsets) = max(zip(tried, found, strict=True), key=lambda item: item[1][1])
+        for axis, slope in ((axis, float(slope)) for axis in axes for slope in slopes):
+            if (axis, slope) not in found:
+                wanted = fit.is_apart(axis, frequencies) & (is_resolved if abs(slope) > _FAST else is_visible)
+                found[axis, slope] = fit.strongest(axis, slope, frequencies, wanted)
+        (axis, slope), (frequency, ratio, offsets) = max(found.items(), key=lambda item: item[1][1])
         if ratio < _MIN_RATIO or offsets < _MIN_EXPLAINED:
             break
         # Frequencies one period per frame apart differ within the readout only, where the path follows a part of the
@@ -408,6 +435,8 @@ def fit_window(
         inside = (aliases > frequencies[is_visible][0]) & (aliases < frequencies[is_visible][-1])
         trials = [fit.with_tone(axis, float(alias), slope) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
         fit = min(trials, key=lambda trial: trial.unexplained)
+        fit.solve()
+        found = {of: value for of, value in found.items() if of[0] != axis}
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
     fit.solve()
     knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])

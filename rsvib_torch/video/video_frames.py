@@ -5,6 +5,7 @@ column.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import cv2
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv1d, embedding_bag
 
+from rsvib_torch.execution.chunking import chunks
 from rsvib_torch.frames.prepare import prepare_frames
 from rsvib_torch.io.full_scale import counts_to_frames, frames_to_counts
 from rsvib_torch.io.video import Picture
@@ -201,25 +203,29 @@ def _with_rows_moved(plane: Frame, offsets: Array, *, rows_first: bool) -> Frame
 
     Interpolation first across and then along the rows takes a third of the time of ``_with_pixels_moved``.
     """
-    flat = plane.reshape(-1, *plane.shape[-2:]).astype(np.float32)
+    flat = plane.reshape(-1, *plane.shape[-2:])
     along, across = offsets if rows_first else offsets[::-1]
-    rows = flat if rows_first else np.ascontiguousarray(flat.swapaxes(-1, -2))
+    rows = np.ascontiguousarray(flat if rows_first else flat.swapaxes(-1, -2), dtype=np.float32)
     count, length = rows.shape[-2:]
     first, of_rows = _lanczos_taps(np.arange(count) + across)
     taps = mirrored(torch.from_numpy(first[:, None] + np.arange(2 * _LOBES)), count)
     begin, of_columns = _lanczos_taps(along)
     before, behind = max(0, -begin.min()), max(0, begin.max() + 2 * _LOBES - 1)
-    moved = np.empty_like(rows)
-    for one, result in zip(rows, moved, strict=True):
+    moved = np.empty(rows.shape, plane.dtype)
+    # Four images of float32 are made on the way. In blocks, Y of 1920 x 1080 px takes 14 ms instead of 25.
+    blocks = chunks(count, 4 * rows.itemsize * length, torch.device("cpu"))
+    for (one, result), block in product(zip(rows, moved, strict=True), blocks):
         # 1. Across the rows, then whole pixels along them.
-        mixed = embedding_bag(taps, torch.from_numpy(one), per_sample_weights=torch.from_numpy(of_rows), mode="sum")
+        weights = torch.from_numpy(of_rows[block])
+        mixed = embedding_bag(taps[block], torch.from_numpy(one), per_sample_weights=weights, mode="sum")
         wide = np.pad(mixed.numpy(), ((0, 0), (before, behind)), "reflect")
-        shifted = sliding_window_view(wide, length + 2 * _LOBES - 1, 1)[np.arange(count), begin + before]
+        shifted = sliding_window_view(wide, length + 2 * _LOBES - 1, 1)[np.arange(len(wide)), begin[block] + before]
         # 2. Parts of a pixel along the rows.
-        kernels = torch.from_numpy(of_columns)[:, None]
-        result[:] = conv1d(torch.from_numpy(shifted)[None], kernels, groups=count)[0].numpy()
+        kernels = torch.from_numpy(of_columns[block])[:, None]
+        filtered = conv1d(torch.from_numpy(shifted)[None], kernels, groups=len(kernels))[0].numpy()
+        result[block] = _as_counts(filtered, plane.dtype)
     image = moved if rows_first else moved.swapaxes(-1, -2)
-    return _as_counts(image.reshape(plane.shape), plane.dtype)
+    return image.reshape(plane.shape)
 
 
 def _lanczos_taps(positions: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
