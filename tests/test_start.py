@@ -1,7 +1,6 @@
 """Start of the package and of the program: what is imported when, and names that type checkers and editors find."""
 
 import ast
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -109,38 +108,3 @@ def test_functions_named_like_their_module_stay_functions():
         "import rsvib_torch.restoration.restore\nfrom rsvib_torch.restoration import restore\nassert callable(restore)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_type_checker_knows_the_names(tmp_path, pytestconfig):
-    pytest.importorskip("mypy")
-    (tmp_path / "user.py").write_text(
-        "import rsvib_torch as rsv\n"
-        "from rsvib_torch.imaging.trajectory import rows_showing\n"
-        "from rsvib_torch.io import StackInfo\n"
-        "timing = rsv.SensorTiming(row_time=2e-5, exposure_rows=20, frame_rows=512)\n"
-        "info: StackInfo = rsv.read_stack_info('frames.tif')\n"
-        "reveal_type(rsv.restore(rsv.read_stack('frames.tif'), timing, rsv.Vibration.still()))\n"
-        "rsv.evaluation.cramer_rao_bound\n"
-        "rsv.restor\n"
-        "frames, still = rsv.read_stack('frames.tif'), rsv.Vibration.still()\n"
-        "rsv.detect_vibration(frames, timing=timing, tones=2).vibration\n"
-        "rsv.detect_motion(frames, timing, knot_rows=20).motion\n"
-        "rsv.restore(frames, timing, still, half_rows='x')\n"
-        "rsv.restore(frames, timing, still, method='magic')\n"
-        "rsv.register_bands(frames, timing, band_row=3)\n"
-        "rsv.VibrationTracker(timing, window=4.5)\n"
-        "rsv.detect_swept_tone(frames, timing, tones=2)\n"
-        "row, start = frames[0, :, 0], frames[0, 0, 0]\n"
-        "rows_showing(row, start, timing.in_row_order(), still)\n"
-        "rows_showing(row, start, timing, still)\n"
-    )
-    cache = pytestconfig.cache.mkdir("mypy")  # types of PyTorch are read once, in a minute
-    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(cache), "user.py"]
-    found = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}  # mypy does not follow the hooks of editable installations
-    shown = subprocess.run(command, cwd=tmp_path, env=found, capture_output=True, text=True, check=False).stdout
-    assert 'note: Revealed type is "torch._tensor.Tensor"' in shown
-    assert 'user.py:8: error: Module has no attribute "restor"' in shown
-    mistakes = [line.split(":")[1] for line in shown.splitlines() if "error:" in line]
-    # options are known from the fields of their groups; functions of rows require a timing in row order
-    assert mistakes == ["8", "12", "13", "14", "15", "16", "19"]
-    assert 'has incompatible type "SensorTiming"; expected "RowTiming"' in shown
