@@ -175,7 +175,8 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         pixels, rate = _pixels(first), stream.average_rate
         duration = float(stream.frames / rate if rate else 0)  # stated by .avi, .mp4 and .mov
         if not stream.frames and "matroska" in container.format.name and len(container.streams) == 1:
-            duration = 1e-6 * (container.duration or 0)  # of the longest of several streams
+            # of the longest of several streams, from the time 0 on
+            duration = 1e-6 * ((container.duration or 0) - (container.start_time or 0))
         decoded = float(known[-1] - known[0] + (1 / rate if rate else 0)) if rising else duration
         # .avi also counts empty frames
         if len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration:

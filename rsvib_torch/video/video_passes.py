@@ -24,7 +24,7 @@ from rsvib_torch.motion.sampling import recorded_offsets
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, tensor
-from rsvib_torch.registration.corners import CornerFollower, Corners
+from rsvib_torch.registration.corners import CornerFollower, Corners, reduction
 from rsvib_torch.restoration import RestorationVerdict
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
@@ -42,6 +42,9 @@ PART_FRAMES = 32  # of a part of the video, which is encoded by itself; an inter
 CHECKED_FRAMES = 8  # of each part, in which the shaking of the output is measured
 _AHEAD = 4  # frames decoded before they are used
 _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is known so well (52 to 205 Hz: 0.4 to 1.6 %)
+# px^-2, of the third cumulant of the path within an exposure, by which a blurred corner is found beside the mean of the
+# path. 36 tones of 33 to 177 Hz and 0.4 to 2.5 px behind 4 ms: 0.07 to 0.34, amplitudes were up to 15 % too large
+_BLUR_BIAS = 0.15
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
 _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
 
@@ -296,7 +299,8 @@ class VideoPasses:
         window = path.nearest(middle)
         tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
         amplitude, frequency, phase, size, rate = tone_tables(tones, 2)
-        size = np.hypot(size, _GAIN_ERROR * amplitude)
+        found, amplitude = amplitude, self._without_blur(amplitude, frequency)
+        size = np.hypot(np.hypot(size, _GAIN_ERROR * amplitude), 0.5 * (found - amplitude))
         with np.errstate(divide="ignore", invalid="ignore"):
             phase_std = np.where(amplitude > 0, size / amplitude, math.inf)
             period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
@@ -331,6 +335,21 @@ class VideoPasses:
             findings=findings,
             assumptions=(),
         )
+
+    def _without_blur(self, amplitude: Array, frequency: Array) -> Array:
+        """Amplitudes in px of tones in Hz without what the blur of the corners adds to them.
+
+        Corners lie where their blur is strongest, near the turning points of the motion. A tone of amplitude a with the
+        exposure E appears as ``a + k a^3``, ``k = 3/4 c (1 + s(2 f E) - 2 s(f E)^2)``, ``s(x) = sin(pi x) / (pi x)``:
+        c times the third cumulant of the path. Frames are restored with what appears.
+        """
+        turns = frequency * self.frames.job.timing.exposure_time
+        of_path = 1.0 + np.sinc(2.0 * turns) - 2.0 * np.sinc(turns) ** 2
+        cubic = 0.75 * _BLUR_BIAS * of_path / reduction(*self.frames.size) ** 2
+        true = amplitude
+        for _ in range(8):  # Newton's method, from above
+            true = true - (true + cubic * true**3 - amplitude) / (1.0 + 3.0 * cubic * true**2)
+        return np.asarray(true)
 
     def _findings(self, axis: int, tones: list[Tone]) -> tuple[Reason, ...]:
         """Reasons against an axis: no tone, or two that only a wrong row time tells apart.

@@ -126,7 +126,6 @@ def test_time_stamps_are_used_and_kept_with_the_sound(place):
     assert sound_of(restored) == sound_of(place / "clip.mp4")
 
 
-@pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
 @pytest.mark.parametrize("late", [0.0, 5e-3])
 def test_times_in_whole_milliseconds_are_those_of_the_frame_rate_where_it_explains_them(tmp_path, late):
     """Intervals of 14, 15, 14 and 15 ms have another mean than 14.4 ms."""
@@ -137,6 +136,14 @@ def test_times_in_whole_milliseconds_are_those_of_the_frame_rate_where_it_explai
     assert error < (1e-9 if late == 0.0 else 6e-4)
 
 
+def test_matroska_may_begin_at_any_time(tmp_path):
+    """Its duration counts from the time 0."""
+    counts = np.random.default_rng(0).integers(0, 255, (8, 32, 48), dtype=np.uint8)
+    write_video(tmp_path / "a.mkv", counts, 12.345 + np.arange(8) / 30)
+    assert read_stack_info(tmp_path / "a.mkv").shape == (8, 32, 48)
+
+
+@pytest.mark.filterwarnings("default::rsvib_torch.io.TimingWarning")
 def test_slow_motion_keeps_the_times_of_playback_and_warns(place, capsys):
     times = np.arange(8) * PERIOD
     write_clip(place / "slow.mp4", times, shown_at=np.arange(8) / 25)
