@@ -404,3 +404,17 @@ def test_amplitudes_in_encoded_video_are_within_their_standard_deviations(tmp_pa
     error = (found.vibration.amplitude[:, 0].numpy() - motion.amplitude) / found.std.amplitude[:, 0].numpy()
     assert (np.abs(error) < 3).all()
     assert (found.std.amplitude[:, 0] < 0.02).all()
+
+
+def test_rows_without_content_do_not_decide():
+    """Black bars have no noise: their rows had the largest weights, and an image motion of 0.8 px/s was found."""
+    motion = Motion((3.0, 2.0), (50.0, 71.0), (0.5, 1.0))
+    timing = SensorTiming(row_time=3e-5, exposure_rows=33.3, frame_rows=555.556)
+    frames = take_frames(draw_scene(440, 440, 4), timing, motion, 4, 0.004, seed=4)
+    height = frames.shape[1] // 9
+    frames[:, :height] = frames[:, -height:] = 0.0
+    found = detect_vibration(torch.from_numpy(frames).float(), timing)
+    assert found.reliable.all(), found.reasons
+    error = (found.vibration.amplitude[:, 0].numpy() - motion.amplitude) / found.std.amplitude[:, 0].numpy()
+    assert (np.abs(error) < 4).all()
+    assert found.vibration.image_motion.abs().max() < 0.2
