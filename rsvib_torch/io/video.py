@@ -181,16 +181,16 @@ def _scan(path: Path, size: int, changed: int) -> tuple[StackInfo, tuple[Fractio
         # .avi also counts empty frames
         if len(times) < 0.9 * duration * float(rate or 0) - 1 and decoded < 0.9 * duration:
             raise ValueError(f"truncated: {len(times)} frames, {decoded:.3g} of {duration:.3g} s, can be decoded")
-        exact = known
+        stated = known
         if rising and rate:  # Matroska rounds times to 1 ms: 5 frames at 69.44 per second, its frame rate, have 68.97
             even = [known[0] + round((time - known[0]) * rate) / rate for time in known]
-            close = all(abs(a - b) <= stream.time_base for a, b in zip(even, known, strict=True))
-            exact = even if close else known
+            if all(abs(a - b) <= stream.time_base for a, b in zip(even, known, strict=True)):
+                stated = even
         info = StackInfo(
             (len(times), *pixels.shape),
             pixels.dtype.name,
             _decoded_as(first.format)[1],
-            tuple(float(time) for time in exact) if rising else None,
+            tuple(float(time) for time in stated) if rising else None,
             channels_last=pixels.ndim == 3,
             frame_rate=None if rising or not rate else float(rate),
             orientation=_orientation(first),

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -172,6 +173,13 @@ def _robust_weights(distance: Array, std: Array | float) -> Array:
     return weights
 
 
+@cache
+def _squared_differences(count: int, order: int) -> Array:
+    """Matrix (count, count) of the sum of the squares of the differences of some ``order`` between neighbours."""
+    differences = np.diff(np.eye(count), order, axis=0)
+    return np.asarray(differences.T @ differences)
+
+
 class _Band:
     """Normal equations whose matrix is a band: ``matrix[i - j, j]`` is the entry of row i and column j, i >= j."""
 
@@ -196,11 +204,10 @@ class _Band:
 
     def stiffen(self, index: NDArray[np.int64], order: int, weight: float) -> None:
         """Keep the differences of some ``order`` between neighbouring unknowns, with rising numbers, small."""
-        differences = np.diff(np.eye(len(index)), order, axis=0)
-        product = weight * differences.T @ differences
+        squares = _squared_differences(len(index), order)
         for apart in range(order + 1):
             later, earlier = index[apart:], index[: len(index) - apart]
-            self.matrix[later - earlier, earlier] += product.diagonal(apart)
+            self.matrix[later - earlier, earlier] += weight * squares.diagonal(apart)
 
     def solve(self) -> tuple[Array, Callable[[Array], Array]]:
         """The unknowns, and a function that solves for other right sides."""
@@ -283,8 +290,8 @@ class _WindowFit:
                 columns.append(np.concatenate([path, *waving], -1).reshape(2 * path.shape[1], -1))
                 band.add(number, columns[-1], self.corners.offsets[part].T.ravel(), np.tile(self.weights[part], 2))
             # 2. The solution with a stiff path, and tones that are steady where nothing determines them.
-            typical = max(float(np.median(band.matrix[0, of_path])), 1e-9)
-            mean = float(band.matrix[0, of_path].mean())
+            diagonal = band.matrix[0, of_path]
+            typical, mean = max(float(np.median(diagonal)), 1e-9), float(diagonal.mean())
             band.matrix[0] += _LEAST * typical
             for index in of_path.reshape(4, -1):
                 band.stiffen(index, 3, _STIFFNESS * typical)
@@ -365,8 +372,7 @@ class _WindowFit:
         known = np.concatenate([basis, *tones], 1) * root[:, None]
         gram = known.T @ known
         typical = max(float(np.median(gram.diagonal()[: self.count])), 1e-9)
-        third = np.diff(np.eye(self.count), 3, axis=0)
-        gram[: self.count, : self.count] += _STIFFNESS * typical * third.T @ third
+        gram[: self.count, : self.count] += _STIFFNESS * typical * _squared_differences(self.count, 3)
         gram[np.diag_indices(len(gram))] += _LEAST * typical
         factor = cho_factor(gram, lower=True)
         rest = rest * root

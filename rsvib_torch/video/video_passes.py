@@ -299,11 +299,12 @@ class VideoPasses:
         window = path.nearest(middle)
         tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
         amplitude, frequency, phase, size, rate = tone_tables(tones, 2)
-        found, amplitude = amplitude, self._without_blur(amplitude, frequency)
-        size = np.hypot(np.hypot(size, _GAIN_ERROR * amplitude), 0.5 * (found - amplitude))
+        apparent, amplitude = amplitude, self._without_blur(amplitude, frequency)
+        size = np.hypot(size, _GAIN_ERROR * apparent)
         with np.errstate(divide="ignore", invalid="ignore"):
-            phase_std = np.where(amplitude > 0, size / amplitude, math.inf)
+            phase_std = np.where(amplitude > 0, size / apparent, math.inf)
             period_std = np.where(frequency > 0, rate / frequency**2, math.inf)
+        size = np.hypot(size, 0.5 * (apparent - amplitude))  # blur does not turn the phase
         unknown = np.full(2, math.inf)
         values = (size, rate, period_std, phase_std, unknown, unknown)
         begin = times[[tracks[0].index]]
@@ -349,7 +350,7 @@ class VideoPasses:
         true = amplitude
         for _ in range(8):  # Newton's method, from above
             true = true - (true + cubic * true**3 - amplitude) / (1.0 + 3.0 * cubic * true**2)
-        return np.asarray(true)
+        return true
 
     def _findings(self, axis: int, tones: list[Tone]) -> tuple[Reason, ...]:
         """Reasons against an axis: no tone, or two that only a wrong row time tells apart.
