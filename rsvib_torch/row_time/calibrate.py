@@ -19,7 +19,7 @@ from rsvib_torch.numerics.tables import Array
 from rsvib_torch.results.presentation import JudgedResult
 from rsvib_torch.results.reason import Reason
 from rsvib_torch.row_time.flicker import MIN_PERIODS, BandFit, Profiles, find_bands, row_profiles
-from rsvib_torch.row_time.strobe import exposure_from_contrast, fit_strobe
+from rsvib_torch.row_time.strobe import exposure_from_contrast, exposure_from_shape, fit_strobe
 from rsvib_torch.text import measured_text, wrapped
 
 Gamma = Annotated[float, Field(gt=0, le=4)]
@@ -159,7 +159,15 @@ def calibrate_row_time(
     if on_fraction is not None and light_contrast is not None:
         raise ValueError("pass on_fraction for an on-off light, or light_contrast for a sinusoidal one, not both")
     profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
-    bands, scene = find_bands(profiles)
+    try:
+        bands, scene = find_bands(profiles)
+    except ValueError as error:
+        other: ScanAxis = -2 if scan_axis in (-1, "x") else -1
+        try:
+            find_bands(row_profiles(frames, other, full_scale, gamma, channels))
+        except ValueError:
+            raise error from None
+        raise ValueError(f"there are bands along the other axis of the frames: pass scan_axis={other}") from error
     height = profiles.rows.shape[1]
     row_time = 1 / (frequency * bands.period)
     notes: list[str] = []
@@ -169,8 +177,11 @@ def calibrate_row_time(
         notes.append("the bands lie at the same rows in all frames, or the scene moves: its texture is not eliminated")
     direction, contrast, why = _direction(bands, frequency, frame_rate)
     notes += [f"readout direction unknown: {why}"] if why else []
-    exposure, exposure_std, why = _exposure(profiles, bands, contrast, row_time, on_fraction, light_contrast)
-    notes += [f"exposure unknown: {why}"] if why else []
+    rows, rows_std, note = _exposure_rows(
+        profiles, bands, scene == "fixed", gamma, contrast, on_fraction, light_contrast
+    )
+    exposure, exposure_std = (None, None) if rows is None else (rows * row_time, rows_std * row_time)
+    notes += [f"exposure unknown: {note}" if exposure is None else note] if note else []
     return RowTimeCalibration(
         row_time=row_time,
         row_time_std=row_time * bands.period_std / bands.period,
@@ -222,7 +233,8 @@ def calibrate_row_time_by_exposure(
     ]
     period = sum(s.period / s.period_std**2 for s in singles) / sum(1 / s.period_std**2 for s in singles)
     phases = np.concatenate([s.phases for s in singles])
-    fit = fit_strobe(profiles.rows, period, phases, np.array(exposures))
+    fit = fit_strobe(profiles.rows, period, phases, np.array(exposures))[0]
+    fit.check_shape()
     row_time = max(exposures) / fit.exposure_rows
     shortest = int(np.argmin(exposures))
     return RowTimeCalibration(
@@ -299,29 +311,42 @@ def _turning(values: Array, turns: float) -> tuple[float, float]:
     return float(cost / (np.abs(values) ** 2).sum()), float(np.abs(solution[1]))
 
 
-def _exposure(
+def _exposure_rows(
     profiles: Profiles,
     bands: BandFit,
+    fixed: bool,
+    gamma: float,
     contrast: float,
-    row_time: float,
     on_fraction: float | None,
     light_contrast: float | None,
-) -> tuple[float | None, float | None, str]:
-    """Exposure in seconds with its standard deviation, or why it is undetermined."""
-    if on_fraction is None and light_contrast is None:
-        return None, None, "it requires on_fraction of an on-off light, or light_contrast of a sinusoidal one"
-    if profiles.clipped > 0.02:
-        return None, None, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
+) -> tuple[float | None, float, str]:
+    """Exposure in rows with its standard deviation and a note, or None, 0 and why it is undetermined."""
+    if profiles.clipped > 0.02 and (on_fraction or light_contrast):
+        return None, 0.0, f"{profiles.clipped:.0%} of the pixels are saturated, which changes the shape of the bands"
     if light_contrast is not None:
         noise = math.sqrt((np.abs(bands.coefficients[:, 0]) ** 2).sum() / max(bands.certainty, 1e-9))
         exposure, further = (
-            exposure_from_contrast(value, light_contrast, bands.period * row_time)
+            exposure_from_contrast(value, light_contrast, bands.period)
             for value in (contrast, max(contrast - noise / math.sqrt(2), 1e-6))
         )
         return exposure, abs(further - exposure), ""
-    even = profiles.rows / (bands.scene / bands.scene.mean(1, keepdims=True))
+    if on_fraction is None:
+        return None, 0.0, "it requires on_fraction of an on-off light, or light_contrast of a sinusoidal one"
+    scale = bands.scene.mean(1, keepdims=True)
+    even = profiles.rows / (scale if fixed else bands.scene / scale)
+    other_gamma = 2.2 if gamma < 1.5 else 1.0
     try:
-        fit = fit_strobe(even, bands.period, bands.phases, np.ones(len(even)), on_fraction)
+        fits, others = (
+            fit_strobe(power, bands.period, bands.phases, np.ones(len(even)), on_fraction=on_fraction, fixed=fixed)
+            for power in (even, even ** (other_gamma / gamma))
+        )
+        # a wrong gamma changes an exposure of 0.2 ms by 20 % and its misfit by a factor of 3 to 70, one of 1.25 periods
+        # by a factor of 1.5
+        if others[0].misfit < 0.8 * fits[0].misfit:
+            raise ValueError(
+                f"the bands agree with gamma={other_gamma:g} (misfit {others[0].misfit:.1%}) rather than with "
+                f"gamma={gamma:g} (misfit {fits[0].misfit:.1%})"
+            )
+        return exposure_from_shape(fits, on_fraction)
     except ValueError as error:
-        return None, None, str(error)
-    return fit.exposure_rows * row_time, fit.exposure_std * row_time, ""
+        return None, 0.0, str(error)

@@ -64,7 +64,8 @@ class BandFit:
     scene: Array  # (T, H) float64, brightness of the rows without flicker
     fitted: Array  # (T, H) float64, light of the rows over its mean: ``1 + sum_k Re[c_pk exp(-2 pi j k i / P)]``
     residual: Array  # (T, H) float64, residual brightness over that of the scene
-    certainty: float  # power of the fundamental over that of residuals at frequencies beside it, all frames together
+    # power of the fundamental over that of residuals at frequencies beside it, in all frames of a fixed scene together
+    certainty: float
     evidence: float  # Gaussian log-likelihood less half the number of parameters times log N (BIC)
 
     @property
@@ -124,9 +125,8 @@ def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit |
         found = _fit(brightness, best.period if best else start, scene, count)
         if found is None or abs(found.period / start - 1) > 0.25:
             break
-        if best is not None and found.evidence <= best.evidence:
-            break
-        best = found
+        if best is None or found.evidence > best.evidence:
+            best = found
     return best
 
 
@@ -136,7 +136,8 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
     centre = 0.5 * (height - 1)
     rows = np.arange(height) - centre
     order = np.arange(1, count + 1)
-    degree = max(2, min(8, round(height / period)))  # of the smooth scene, at most one per period
+    # of the smooth scene, at most one per period; a fixed scene differs by a factor
+    degree = 0 if scene == "fixed" else max(2, min(8, round(height / period)))
     smooth = np.polynomial.chebyshev.chebvander(rows / centre, degree)
     dark = 0.02  # smallest brightness of the scene, of its mean
     floor = dark * brightness.mean(1, keepdims=True)
@@ -180,6 +181,8 @@ def _fit(brightness: Array, period: float, scene: SceneModel, count: int) -> Ban
     back = np.exp(2j * math.pi * centre / period * order)
     coefficients = (waves[:, :count] + 1j * waves[:, count:]) * back
     certainty = _certainty(coefficients, residual, period)
+    if scene == "smooth":  # its texture is the same in all frames
+        certainty /= frames
     values = brightness.size / _correlation_rows(residual)  # independent ones
     evidence = -0.5 * values * math.log(float((residual**2).mean()) + _TINY)
     period_std = float(deviations(leverage[..., None], residual, max(8, math.ceil(period)))[0])
@@ -270,13 +273,11 @@ def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
         usable = [fit for fit in fits if fit is not None and fit.period <= brightness.shape[1]]
         if scene == "fixed":  # a pattern at the same rows in all frames is texture
             usable = [fit for fit in usable if fit.moves]
-        if not usable:
-            continue
-        fit = max(usable, key=lambda fit: fit.evidence)
-        visible = float(np.abs(fit.coefficients[:, 0]).max()) > 2e-3
         # the certainty of texture stays below 50 on drawn scenes
-        if fit.certainty > 50.0 and visible and _same_everywhere(profiles, fit, scene):
-            trusted.append((fit, scene))
+        usable = [fit for fit in usable if fit.certainty > 50.0 and np.abs(fit.coefficients[:, 0]).max() > 2e-3]
+        usable = [fit for fit in usable if _same_everywhere(profiles, fit, scene)]
+        if usable:
+            trusted.append((max(usable, key=lambda fit: fit.evidence), scene))
     if not trusted:
         raise ValueError(
             "no flicker found: no bands of the same period across all columns exceed the texture of the scene; at "
@@ -309,4 +310,4 @@ def _same_everywhere(profiles: Profiles, fit: BandFit, scene: SceneModel) -> boo
         parts = _less_parabola(parts)
     phase = 2 * np.pi * np.arange(kept)
     amplitude = parts[..., :kept] @ ((0.5 - 0.5 * np.cos(phase / kept)) * np.exp(-1j * phase / fit.period))
-    return bool(np.abs(amplitude.sum(1)).sum() > 0.7 * np.abs(amplitude).sum())
+    return bool(np.abs(amplitude.sum(1)).sum() > 0.85 * np.abs(amplitude).sum())
