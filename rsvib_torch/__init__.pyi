@@ -31,9 +31,7 @@ from .evaluation import find_slanted_edges as find_slanted_edges
 from .evaluation import psnr as psnr
 from .evaluation import slanted_edge_mtf as slanted_edge_mtf
 from .evaluation import ssim as ssim
-from .export import sampling_map as sampling_map
 from .export import write_gcsv as write_gcsv
-from .export import write_stmap as write_stmap
 from .gyroscope import AccelerometerComparison as AccelerometerComparison
 from .gyroscope import AngularRates as AngularRates
 from .gyroscope import ClockAlignment as ClockAlignment

@@ -7,7 +7,7 @@ LAYERS: tuple[dict[str, str], ...] = (
     {"video": "process_video.py: videos in two passes; camera_path.py, steadying.py; session.py: a running camera"},
     {
         "report": "results on disk: JSON, CSV, figures (plots.py), HTML page (html/)",
-        "export": "motions for other programs: angular rates, sampling maps, image support data",
+        "export": "motions for other programs: angular rates",
     },
     {"config": "TOML files ↔ groups of options"},
     {"stacks": "process.py: windows, jobs, memory planning; run_folder.py: a run to a file, its journal, resume"},

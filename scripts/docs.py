@@ -17,7 +17,6 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -96,8 +95,11 @@ def write_sources(folder: Path) -> list[object]:
         text = page.read_text(encoding="utf-8").replace("](docs/", "](").replace("](../README.md", "](index.md")
         text = text.replace(".ipynb)", ".md)")
         page.write_text(without_outer_links(text, folder), encoding="utf-8")
-    font = files("ziamath") / "fonts" / "STIXTwoMath-Regular.ttf"
-    for path in (DOCUMENTATION / STYLE, DOCUMENTATION / SEARCH_SHIM, Path(str(font))):
+    fonts = find_spec("ziamath")  # its import warns
+    assert fonts is not None
+    assert fonts.origin is not None
+    font = Path(fonts.origin).parent / "fonts" / "STIXTwoMath-Regular.ttf"
+    for path in (DOCUMENTATION / STYLE, DOCUMENTATION / SEARCH_SHIM, font):
         shutil.copy(path, folder)
     (folder / "api").mkdir()
     reference: list[object] = [{"Configuration": "configuration.md"}, {"Commands": "commands.md"}]

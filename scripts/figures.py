@@ -23,7 +23,6 @@ from torch import Tensor
 import rsvib_torch as rsv
 from rsvib_torch.datasets import city_and_fields, resolution_chart
 from rsvib_torch.report.plots import offset_figure, psf_figure, save_figure
-from rsvib_torch.video import Spectrogram
 
 SEED = 3
 FRAME_ROWS = 2048
@@ -173,15 +172,14 @@ def colour_mosaic() -> Figure:
 
 
 def tracking() -> Figure:
-    """Errors of a tone that sweeps and grows, as the tracker follows it, and its spectrogram."""
+    """Errors of a tone that sweeps and grows, as the tracker follows it."""
     size, count, motion = 256, 90, live.Changing(sweep=2.0, doublings=0.5)
     timing = live.timing_of(size)
     middle = 0.5 * (size - 1 + live.EXPOSURE_ROWS) * timing.row_time
-    tracker, spectrogram = rsv.VibrationTracker(timing), Spectrogram(timing, 0.4, 120.0)
+    tracker = rsv.VibrationTracker(timing)
     times, values, stds = [], [], []
     for frame in live.frames_of(size, motion, count):
         tracked = tracker.update(frame)
-        spectrogram.add(tracked)
         found = tracked.detection
         if found is None:
             continue
@@ -189,26 +187,19 @@ def tracking() -> Figure:
         values.append([found.vibration.frequency[:, 0].tolist(), found.vibration.amplitude[:, 0].tolist()])
         stds.append([found.std.frequency[:, 0].tolist(), found.std.amplitude[:, 0].tolist()])
     when, truth = np.array(times), (motion.frequency(np.array(times)), motion.amplitude(np.array(times)))
-    figure = Figure(figsize=(9, 5.6), layout="constrained")
-    panels = figure.subplots(2, 2, sharex="col")
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    panels = figure.subplots(1, 2)
     for place, (quantity, limit) in enumerate((("frequency (Hz)", 0.25), ("amplitude (px)", 0.12))):
-        panel = panels[place, 0]
+        panel = panels[place]
         for axis, (name, colour) in enumerate(zip("xy", COLOURS, strict=True)):
             error = np.array(values)[:, place, axis] - truth[place][axis]
             deviation = 2 * np.array(stds)[:, place, axis]
             panel.plot(when, error, color=colour, label=name)
             panel.fill_between(when, -deviation, deviation, color=colour, alpha=0.15, linewidth=0)
-        panel.set(ylabel=f"error of the {quantity}", ylim=(-limit, limit))
+        panel.set(xlabel="time (s)", ylabel=f"error of the {quantity}", ylim=(-limit, limit))
         panel.axvline(live.BEFORE, color="#d9d9d9", linewidth=1, zorder=0)
         panel.spines[["top", "right"]].set_visible(False)
-    panels[0, 0].legend(frameon=False)
-    columns, frequencies, amplitude = spectrogram.result()
-    for panel, picture, name in zip(panels[:, 1], amplitude, "xy", strict=True):
-        image = panel.pcolormesh(columns, frequencies, picture.T, shading="nearest", vmin=0, rasterized=True)
-        panel.set_ylabel(f"frequency along {name} (Hz)")
-        figure.colorbar(image, ax=panel, label="amplitude (px)")
-    for panel in panels[1]:
-        panel.set_xlabel("time (s)")
+    panels[0].legend(frameon=False)
     figure.suptitle(
         f"{live.FREQUENCY[0]:.0f} Hz along x, swept by {motion.sweep:g} Hz/s and grown by "
         f"{100 * (2**motion.doublings - 1):.0f} % per second from {live.BEFORE} s on; {live.RATE} frames/s",

@@ -12,10 +12,9 @@ from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands.flat_command import argument, option
 from rsvib_torch.commands.shared_options import check_new, size_of
-from rsvib_torch.commands.terminal import Answer, warn, working
+from rsvib_torch.commands.terminal import Answer, warn
 from rsvib_torch.files.atomic import check_writable
-from rsvib_torch.files.reading import Table
-from rsvib_torch.options import ExportFormat, StmapConvention
+from rsvib_torch.options import ExportFormat
 from rsvib_torch.text import AXES
 
 _FORMAT_OF_ENDING: dict[str, ExportFormat] = {".gcsv": "gcsv", ".csv": "csv"}
@@ -28,20 +27,17 @@ class ExportOptions:
     vibration: Path = argument()
     """The vibration.json written by detect or run."""
     out: Path = argument()
-    """File to write; for stmap a folder."""
+    """File to write."""
     file_format: ExportFormat | None = option(None, "--format", show_default="from the extension: .gcsv, .csv")
-    """gcsv: angular rates, for Gyroflow; stmap: a position per pixel and frame, for compositing programs and OpenCV;
-    csv: offsets of the rows before and after correction."""
+    """gcsv: angular rates, for Gyroflow; csv: offsets of the rows before and after correction."""
     frames: Path | None = None
-    """The stack of frames, for their size and number (gcsv, stmap)."""
+    """The stack of frames, for their size and number (gcsv)."""
     size: str | None = option(None, metavar="HEIGHTxWIDTH")
     """Size of the frames in px, in place of --frames."""
     num_frames: int | None = None
     """Number of frames, in place of --frames."""
     focal_length: float | None = None
     """Focal length in px, for a vibration that was detected without one; required for gcsv."""
-    convention: StmapConvention = "nuke"
-    """Positions of stmap: nuke, 0 to 1 from the bottom left corner; opencv, px from the first pixel."""
     sample_rate: float | None = option(None, show_default="chosen for an attitude within 2e-7 rad")
     """Samples per second of gcsv."""
     force: bool = False
@@ -58,10 +54,10 @@ def export(given: ExportOptions) -> Answer:
     out = given.out
     chosen = given.file_format or _FORMAT_OF_ENDING.get(out.suffix.lower())
     if chosen is None:
-        raise ValueError(f"the format of {out.name} is not known from its name: give --format gcsv, stmap or csv")
+        raise ValueError(f"the format of {out.name} is not known from its name: give --format gcsv or csv")
     frames = [] if given.frames is None else io.stack_files(given.frames)
     check_new([out], given.overwrite, [given.vibration, *frames])
-    check_writable(out, folder=chosen == "stmap")
+    check_writable(out)
     detected = reports.load_detection(given.vibration)
     if chosen == "csv":
         reports.write_offsets(out, detected)
@@ -75,17 +71,11 @@ def export(given: ExportOptions) -> Answer:
     timing = detected.timing
     if timing is None:
         raise ValueError(f"{given.vibration}: the timing of the sensor is missing; detect the vibration again")
-    data: Table = {"format": chosen}
     shape, count = _extent(given)
     motion = _trusted(given, detected, timing, count, shape[int(timing.scan_axis)])
-    data |= {"size": list(shape), "num_frames": count}
-    if chosen == "gcsv":
-        exports.write_gcsv(out, motion, timing, shape, count, sample_rate=given.sample_rate)
-        return Answer({"Angular rates": [f"of {count} frames, on the clock of the first row of frame 0"]}, data, [out])
-    with working("computing the positions"):
-        files = exports.write_stmap(out, motion, timing, shape, count, convention=given.convention)
-    text = f"{count} maps of {shape[0]} x {shape[1]} px, convention {given.convention}"
-    return Answer({"Sampling maps": [text]}, data | {"convention": given.convention}, files)
+    exports.write_gcsv(out, motion, timing, shape, count, sample_rate=given.sample_rate)
+    text = f"of {count} frames, on the clock of the first row of frame 0"
+    return Answer({"Angular rates": [text]}, {"format": chosen, "size": list(shape), "num_frames": count}, [out])
 
 
 def _extent(given: ExportOptions) -> tuple[tuple[int, int], int]:

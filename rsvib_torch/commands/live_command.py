@@ -19,7 +19,7 @@ from rsvib_torch.commands.answers import detection_data
 from rsvib_torch.commands.flat_command import Given, argument, option
 from rsvib_torch.commands.shared_options import CameraOptions, RangeOptions, check_new, size_of
 from rsvib_torch.commands.terminal import Answer, error_line, warn
-from rsvib_torch.files.atomic import check_tree, check_writable
+from rsvib_torch.files.atomic import check_writable
 from rsvib_torch.files.reading import Table
 from rsvib_torch.options import BorderName, TrackerOptions, method_options
 from rsvib_torch.text import number_of
@@ -41,10 +41,6 @@ class LiveOptions(CameraOptions, RangeOptions):
     """Video to write (.mp4, .mov, .m4v, .mkv), or - for raw frames to stdout."""
     page: Annotated[int, Field(ge=0, le=65535)] | None = option(None, metavar="PORT")
     """Show the restored frames at http://127.0.0.1:PORT."""
-    spectrogram: Path | None = option(None, metavar="NAME")
-    """Write the spectrogram of both axes: NAME.png and NAME.zarr."""
-    max_frequency: float = option(250.0, metavar="HZ")
-    """Highest frequency of the spectrogram."""
     size: str | None = option(None, metavar="WIDTHxHEIGHT")
     """Size of the frames on standard input, e.g. 1024x768."""
     pixel_format: PixelFormatName = "gray8"
@@ -99,15 +95,11 @@ def live_session(given: LiveOptions) -> Answer:
     """
     settings = given.settings_for(None if given.file is None else Path(given.source), given.frame_range)
     _check_options(given)
-    files, saved = [] if given.written is None else [given.written], []
-    if given.spectrogram is not None:
-        saved = [given.spectrogram.with_name(given.spectrogram.name + ending) for ending in (".png", ".zarr")]
+    files = [] if given.written is None else [given.written]
     inputs = [*([] if given.file is None else io.stack_files(given.file)), settings.path]
-    check_new([*files, *saved], given.overwrite, inputs)
-    for path in [*files, *saved]:
-        if path.suffix == ".zarr":
-            check_tree(path, "zarr.json", "Zarr group")
-        check_writable(path, folder=path.suffix == ".zarr")
+    check_new(files, given.overwrite, inputs)
+    for path in files:
+        check_writable(path)
     method = given.tracker.get("method", settings.restoration.get("method", "dewarp"))
     available = set(method_options(method)) - {"joint"}
     restoration = {name: value for name, value in settings.restoration.items() if name in available}
@@ -115,15 +107,6 @@ def live_session(given: LiveOptions) -> Answer:
     with _frames_on_standard_output(enabled=str(given.out) == "-") as stream:
         outputs = _outputs(given, settings, stream)
         shown = [output for output in outputs if isinstance(output, video.PageOutput)]
-        spectrogram = None
-        if given.spectrogram is not None:
-            spectrogram = video.Spectrogram(settings.timing, max_frequency=given.max_frequency)
-
-        def save() -> None:
-            if spectrogram is not None and given.spectrogram is not None:
-                check_new(saved, given.overwrite, [])  # another program may have written them meanwhile
-                video.save_spectrogram(given.spectrogram, spectrogram)
-
         tracker = tracking.VibrationTracker(
             settings.timing,
             **restoration | given.tracker | {"method": method},
@@ -140,9 +123,7 @@ def live_session(given: LiveOptions) -> Answer:
             drops=drops,
             waiting=given.waiting,
             max_frames=given.num_frames,
-            spectrogram=spectrogram,
             progress=_state_text(shown[0]) if shown else None,
-            save=save,
         )
     if report.frames == 0:
         raise ValueError(f"{given.source}: no frame was read")
@@ -151,7 +132,7 @@ def live_session(given: LiveOptions) -> Answer:
     parts = [f"{number_of(count, 'frame')} {why}" for why, count in missing.items() if count]
     if parts:
         warn("; ".join(parts))
-    return _answer(given.source, report, [*files, *saved], drops=drops)
+    return _answer(given.source, report, files, drops=drops)
 
 
 def _source(given: LiveOptions, settings: Config) -> video.FrameSource:

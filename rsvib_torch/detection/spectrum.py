@@ -23,7 +23,7 @@ from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES, Result, check_pixel_size, plain_values
 from rsvib_torch.text import measured_text, text_table
 
-BLIND_GAIN = 0.1  # of the largest response; noise is amplified tenfold, and errors of the timing as well
+_BLIND_GAIN = 0.1  # of the largest response; noise is amplified tenfold, and errors of the timing as well
 _SEARCHED_GAIN = 0.01  # a line in a blind band has ghosts outside, one frame rate away, if it is not subtracted
 _MAX_LINES = 20  # per axis; the joint fit of 20 lines to 27,000 offsets takes 2 s
 _FALSE_ALARM = 1e-3  # probability that noise alone has a line
@@ -157,7 +157,7 @@ def displacement_spectrum(
     found = []
     for axis in range(offsets.shape[-1]):
         height = curve.heights[axis % 2 if axis < 2 else 0]
-        record = Offsets(
+        record = _Offsets(
             earlier - centre,
             later - centre,
             offsets[:, axis],
@@ -168,7 +168,7 @@ def displacement_spectrum(
         found.append(record.spectrum(frequency, span, _lines_of(vibration, axis, centre)))
     amplitudes, noises, lines, responses = zip(*found, strict=True)
     # a frequency is blind if it is for any axis
-    blind = np.any([response < BLIND_GAIN * response.max() for response in responses], 0)
+    blind = np.any([response < _BLIND_GAIN * response.max() for response in responses], 0)
     return DisplacementSpectrum(
         tensor(frequency),
         tensor(np.where(blind, np.nan, np.stack(amplitudes))),
@@ -180,7 +180,7 @@ def displacement_spectrum(
 
 
 @dataclass(frozen=True, eq=False)
-class Offsets:
+class _Offsets:
     """Offsets of one axis and their times, from which a spectrum is computed."""
 
     earlier: Array  # (N,) s, mid-exposures of the rows in the earlier frame, from the middle of the record
@@ -190,9 +190,7 @@ class Offsets:
     exposure_time: float  # s
     band_time: float  # s, time over which the rows of one offset are exposed
 
-    def spectrum(
-        self, frequency: Array, span: float, known: Array, most_lines: int = _MAX_LINES
-    ) -> tuple[Array, Array, Array, Array]:
+    def spectrum(self, frequency: Array, span: float, known: Array) -> tuple[Array, Array, Array, Array]:
         """Amplitudes (F,), noise (F,), lines (L, 2) as frequency and complex amplitude, and the response (F,).
 
         ``frequency`` (F,) Hz has equal steps that begin at twice the step, ``span`` is the duration in s, and ``known``
@@ -206,7 +204,7 @@ class Offsets:
         energy = 2 * (self.weights.sum() - intervals.real)
         energy = np.maximum(energy, 1e-12 * energy.max())
         response = np.abs(attenuation) * np.sqrt(energy)
-        visible, shown = (response >= gain * response.max() for gain in (BLIND_GAIN, _SEARCHED_GAIN))
+        visible, shown = (response >= gain * response.max() for gain in (_BLIND_GAIN, _SEARCHED_GAIN))
         searched = shown
         threshold = math.log(len(frequency) / 2 / _FALSE_ALARM)
         lines = np.zeros((0, 2), complex)
@@ -218,7 +216,7 @@ class Offsets:
             power = np.square(np.abs(sums)) / energy
             level = float(np.median(power[visible])) / math.log(2)  # the power of white noise is exponential
             excess = np.where(searched, power / max(level, 1e-300), 0.0)
-            if excess.max() < threshold or len(lines) == most_lines:
+            if excess.max() < threshold or len(lines) == _MAX_LINES:
                 break
             # The line that is most significant, then all lines together. A line beside another one, or at a frequency
             # that the offsets do not show, is an error of the others.

@@ -1,4 +1,4 @@
-"""Motions in the file formats of other programs: angular rates and sampling maps."""
+"""Motions in the file formats of other programs: angular rates."""
 
 import lazy_loader
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from rsvib_torch.checks.arguments import checks_arguments
 from rsvib_torch.checks.validation import Count
-from rsvib_torch.export.pixel_map import Size, num_rows_of
+from rsvib_torch.checks.values import check_single
 from rsvib_torch.files.atomic import whole_file
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import SensorTiming
@@ -36,7 +36,7 @@ def write_gcsv(
     path: str | os.PathLike[str],
     motion: Motion,
     timing: SensorTiming,
-    size: Size,
+    size: tuple[Count, Count],
     num_frames: Count,
     *,
     sample_rate: Annotated[float, Field(ge=1, le=1e9)] | None = None,
@@ -79,14 +79,16 @@ def write_gcsv(
         >>> lines[lines.index("t,gx,gy,gz") + 1]  # 1e-9 rad/s: pitch rate 2 pi 80 / 1000, yaw rate -2 pi 50 2 / 1000
         '0,502654825,-628318531,0'
     """
-    rows = num_rows_of(motion, timing, size)
+    check_single("motion", motion)
+    rows = int(size[int(timing.scan_axis)])
+    timing.check_rows(rows)
     if motion.camera is None:
         raise ValueError(
             "angular rates require the focal length in px: motion.with_camera(Camera(focal_length)), on the command "
             "line --focal-length"
         )
     if motion.num_axes > 3 and bool(motion.moving_axes()[3]):
-        raise ValueError("motion has zoom, which angular rates do not contain; write_stmap exports it")
+        raise ValueError("motion has zoom, which angular rates do not contain")
     starts = timing.frame_starts(num_frames)
     first, last = float(starts[0]), float(starts[-1]) + rows * timing.row_time + timing.exposure_time
     rate = sample_rate or _LOWEST_RATE

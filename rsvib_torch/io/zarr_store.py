@@ -94,11 +94,7 @@ def write_zarr(path: Path, info: StackInfo, frames: Iterator[Array], compression
         group.create_array("time", data=times, dimension_names=["frame"], attributes={"units": "s"})
     for index, frame in enumerate(frames):
         array[index] = info.to_stored(frame)
-    consolidate(path)
-
-
-def consolidate(path: Path) -> None:
-    """Copy the metadata of the arrays of a group into its header; xarray warns where it reads them one by one."""
+    # copy the metadata of the arrays into the header of the group; xarray warns where it reads them one by one
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other programs read the headers of the arrays, which remain
         _zarr().consolidate_metadata(str(path))

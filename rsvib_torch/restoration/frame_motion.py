@@ -8,7 +8,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -173,34 +173,26 @@ def visible_pixels(
         needed = 25 * math.prod(batch) * num_frames * height * width  # float64 columns, their comparisons, masks
         check_fits(f"masks of num_frames={num_frames} frames of {height} x {width} px", needed, "pass fewer frames")
     limits = np.array([width, height])[:, None, None] - 1
-    found = [
-        (((places >= 0) & (places <= limits)).all(0), shift)
-        for one in ([vibration[stack] for stack in range(batch[0])] if batch else [vibration])
-        for places, shift in recorded_places(one, timing, (height, width), num_frames)
-    ]
-    mask = torch.from_numpy(np.stack([visible for visible, _ in found])).to(vibration.device)
-    shift = torch.stack([shift for _, shift in found])
-    return mask.view(*batch, num_frames, height, width), shift.view(*batch, num_frames, 2)
-
-
-def recorded_places(
-    motion: Motion, timing: SensorTiming, size: tuple[int, int], num_frames: int
-) -> Iterator[tuple[NDArray[np.float64], Tensor]]:
-    """The place (2, H, W) in a frame where each pixel of the restored frame was recorded, and its shift (2,), by frame.
-
-    Places and shifts are in px, (x, y) in image axes. The motion is one in image axes, not a batch.
-    """
-    height, width = size if timing.scan_axis == -2 else size[::-1]
-    motion, row_timing = motion.detached(), timing.in_row_order()
-    row_timing.check_rows(height)
-    bounding: Motion = motion.to_row_order(timing).expanded(1)
-    shift = offsets_from_row_order(frame_motion(bounding, row_timing, num_frames, height).shift, timing)[0, :, :2]
-    if not motion.same_for_all_columns:
-        ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (width - 1)
-        bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, height)
-    frame_motion(bounding, row_timing, num_frames, height).check_fits(width)
-    for frame in range(num_frames):
-        yield source_map(motion, timing, size, frame, shift[frame], np.float64), shift[frame]
+    masks, shifts = [], []
+    for one in [vibration[stack] for stack in range(batch[0])] if batch else [vibration]:
+        rows, columns = (height, width) if timing.scan_axis == -2 else (width, height)
+        motion, row_timing = one.detached(), timing.in_row_order()
+        row_timing.check_rows(rows)
+        bounding: Motion = motion.to_row_order(timing).expanded(1)
+        of_frames = frame_motion(bounding, row_timing, num_frames, rows)
+        shift = offsets_from_row_order(of_frames.shift, timing)[0, :, :2]
+        if not motion.same_for_all_columns:
+            ends = torch.tensor([-0.5, 0.5], dtype=torch.float64, device=motion.device) * (columns - 1)
+            bounding = ColumnMotion.of_columns(bounding, ends, row_timing, num_frames, rows)
+            of_frames = frame_motion(bounding, row_timing, num_frames, rows)
+        of_frames.check_fits(columns)
+        for frame in range(num_frames):
+            # the place in the frame where each pixel of the restored frame was recorded
+            places = source_map(motion, timing, (height, width), frame, shift[frame], np.float64)
+            masks.append(((places >= 0) & (places <= limits)).all(0))
+        shifts.append(shift)
+    mask = torch.from_numpy(np.stack(masks)).to(vibration.device)
+    return mask.view(*batch, num_frames, height, width), torch.stack(shifts).view(*batch, num_frames, 2)
 
 
 def joint_groups(count: int, joint: bool | int) -> list[tuple[list[int], int]]:

@@ -2,7 +2,6 @@ from .frame_outputs import FrameOutput, PageOutput, PipeOutput, VideoOutput
 from .process_video import process_video
 from .session import LiveReport, run_live
 from .sources import CameraSource, FileSource, FrameSource, PipeSource, TimedFrame
-from .spectrogram import Spectrogram, save_spectrogram
 from .video_border import Margins, VideoBorder
 
 __all__ = [
@@ -15,11 +14,9 @@ __all__ = [
     "PageOutput",
     "PipeOutput",
     "PipeSource",
-    "Spectrogram",
     "TimedFrame",
     "VideoBorder",
     "VideoOutput",
     "process_video",
     "run_live",
-    "save_spectrogram",
 ]

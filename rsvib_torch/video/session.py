@@ -20,7 +20,6 @@ from rsvib_torch.tracking import TrackedFrame, VibrationTracker
 from rsvib_torch.video import VideoBorder
 from rsvib_torch.video.frame_outputs import FrameOutput
 from rsvib_torch.video.sources import FrameReader, FrameSource
-from rsvib_torch.video.spectrogram import Spectrogram
 
 _WAITING_RESTORED = 2  # frames between tracking and writing: the largest delay of the output in frames
 _LATENCY_COUNTS = 64  # frames; longer delays are counted as this
@@ -64,9 +63,7 @@ def run_live(
     drops: bool = True,
     waiting: int = 64,
     max_frames: int | None = None,
-    spectrogram: Spectrogram | None = None,
     progress: Callable[[TrackedFrame, LiveReport], None] | None = None,
-    save: Callable[[], object] | None = None,
 ) -> LiveReport:
     """Track the frames of a source, and write the restored ones, until the source ends or a signal arrives.
 
@@ -82,9 +79,7 @@ def run_live(
             instead of measured, and beyond ``waiting`` frames the oldest are dropped.
         waiting: Largest number of frames that wait.
         max_frames: Number of frames to process; None for all.
-        spectrogram: Collects the offsets.
         progress: Called for every tracked frame.
-        save: Called when all frames are written, also after an error; no signal ends the process before it returns.
 
     Returns:
         The report.
@@ -97,16 +92,10 @@ def run_live(
     border, period = border or VideoBorder("mirror"), tracker.timing.frame_period
     reader, last, index = FrameReader(source, waiting, drops=drops), None, -1
 
-    def saved(_: Any, error: BaseException | None, *__: Any) -> None:
-        if save is not None and report.frames > 0:
-            with suppress(*[] if error is None else [Exception]):  # after an error of the session, those of saving
-                save()
-
     with ExitStack() as ending:  # from the last line to the first
         ending.callback(torch.set_num_threads, threads)
         torch.set_num_threads(max(1, threads // 2))  # tracking and writing share the processors
         in_time = ending.enter_context(_signals_stop(reader))
-        ending.push(saved)
         ending.enter_context(suppress(BrokenPipeError, _AbandonedError))  # the program behind a pipe has ended
         ending.callback(in_time)
         ending.callback(reader.close)
@@ -119,8 +108,6 @@ def run_live(
         ending.callback(reader.stop)
         reader.start()
         for tracked, arrived in tracked_frames:
-            if spectrogram is not None:
-                spectrogram.add(tracked)
             if progress is not None:
                 progress(tracked, report)
             frame, index = to_counts(border(tracked)), max(index + 1, round(tracked.time / period))

@@ -179,7 +179,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "read_vibration": {"path": folder / "vibration.json"},
         "restore_block": {"frames": counts, **options, "full_scale": 4095.0},
         "row_psf": {"starts": timing.row_starts(1, 96)[0], "num_nodes": 4},
-        "sampling_map": {"motion": vibration},
         "save_figure": {"path": new["figure.png"], "dpi": 20},
         "simulate_frames": {"frame_size": (64, 48), "num_frames": 2, "generator": generator},
         "ssim": {"image": restored, "reference": frames},
@@ -187,7 +186,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
         "write_gcsv": {"path": new["rates.gcsv"], "motion": with_camera, "num_frames": 2},
         "write_offsets": {"path": folder / "offsets.csv"},
         "write_stack": {"path": folder / "written.tif", "like": info},
-        "write_stmap": {"folder": new["maps"], "motion": vibration},
         "write_vibration": {"path": folder / "written.json"},
         "write_table": {"path": folder / "tones.csv"},
     }

@@ -128,12 +128,6 @@ class _Session:
         """Close the other end of the pipe or terminal."""
         os.close(self.reader)
 
-    def save_while_signals_arrive(self) -> None:
-        """Send SIGTERM until the spectrogram is saved, which must not be interrupted."""
-        end = time.monotonic() + _LIMIT
-        while self.child.poll() is None and not self.out.with_suffix(".zarr").exists() and time.monotonic() < end:
-            self.send(signal.SIGTERM)
-
     def ended(self, limit: float | None = None) -> Process:
         """Wait for the end of the process; it is killed after the limit.
 
@@ -150,10 +144,10 @@ class _Session:
         return Process(code, self.printed.read_text(errors="replace"), time.perf_counter() - begin, 0)
 
 
-def _start(url: str, out: Path, output: str = "file", *options: str | Path) -> _Session:
+def _start(url: str, out: Path, output: str = "file") -> _Session:
     """Start a session that records to ``out``; its output is a ``file``, a ``pipe``, or a ``terminal``."""
     printed = out.with_name(f"{len(list(out.parent.iterdir()))}.txt")
-    command = rsvib("live", url, *_CAMERA, "--out", out, *options)
+    command = rsvib("live", url, *_CAMERA, "--out", out)
     reader, writer = os.pipe() if output == "pipe" else pty.openpty() if output == "terminal" else (-1, -1)
     with printed.open("wb") as file:
         if output == "terminal":
@@ -189,13 +183,11 @@ class _Ending:
     expected: Outcome = "completed"  # its outcome
     message: str = ""  # part of what it prints; {out} is the recording
     output: str = "file"  # see ``_start``
-    spectrogram: bool = False  # whether one is saved
 
     def __call__(self, name: str, out: Path, frames: int) -> Trial:
         """A trial."""
         with _camera(begins=True) as camera:
-            options = ("--spectrogram", out.with_suffix("")) if self.spectrogram else ()
-            session = _start(camera.url, out, self.output, *options)
+            session = _start(camera.url, out, self.output)
             count = session.recorded(frames)
             if session.child.poll() is None:
                 self.act(session)
@@ -311,9 +303,6 @@ _WAYS: dict[str, Callable[[str, Path, int], Trial]] = {
     "answer into a closed pipe": _Ending(_without_reader, "refused", "the answer cannot be written", "pipe"),
     "SIGINT before the first frame": _before_the_first_frame,
     "two sessions with one name": _same_name,
-    "SIGTERM while the spectrogram is saved": _Ending(
-        _Session.save_while_signals_arrive, message="recorded.zarr", spectrogram=True
-    ),
     "SIGINT": _Ending(_signals(signal.SIGINT)),
     "SIGHUP": _Ending(_signals(signal.SIGHUP)),
     "SIGINT twice": _Ending(_signals(signal.SIGINT, signal.SIGINT)),

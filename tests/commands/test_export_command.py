@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import tifffile
 import torch
 from program import refused, rsvib
 
@@ -50,24 +49,27 @@ def test_axes_that_are_not_reliable_are_left_out(place, tmp_path, capsys):
     folder, _, size = place
     data = json.loads((folder / "vibration.json").read_text())
     path, blind = tmp_path / "doubtful.json", {"code": "of a later version", "text": "blind"}
-    options = ("--format", "stmap", "--size", f"{size[0]}x{size[1]}", "--num-frames", 1, "--convention", "opencv")
+    options = ("--size", f"{size[0]}x{size[1]}", "--num-frames", 1, "--focal-length", 900)
+
+    def pitch(out):  # about x, from the motion along y
+        return np.loadtxt(out.read_text().split("t,gx,gy,gz\n")[1].splitlines(), delimiter=",")[:, 1]
+
     path.write_text(json.dumps(data | {"reliable": [True, False], "findings": [[], [blind]]}))
-    assert run(path, tmp_path / "maps", *options) == 0
+    assert run(path, tmp_path / "rates.gcsv", *options) == 0
     assert "y is not exported: its vibration is not reliable (blind)" in " ".join(capsys.readouterr().err.split())
-    rows = np.arange(size[0])[:, None]
-    assert np.abs(tifffile.imread(tmp_path / "maps" / "stmap_0000.tif")[..., 1] - rows).max() == 0
-    assert run(path, tmp_path / "forced", *options, "--force") == 0
-    assert np.abs(tifffile.imread(tmp_path / "forced" / "stmap_0000.tif")[..., 1] - rows).max() > 1
+    assert np.abs(pitch(tmp_path / "rates.gcsv")).max() == 0
+    assert run(path, tmp_path / "forced.gcsv", *options, "--force") == 0
+    assert np.abs(pitch(tmp_path / "forced.gcsv")).max() > 0
     path.write_text(json.dumps(data | {"reliable": [False, False], "findings": [[blind], [blind]]}))
-    assert "--overwrite" in refused(capsys, "export", path, tmp_path / "maps", *options, "--force")
-    assert "nothing to export" in refused(capsys, "export", path, tmp_path / "none", *options)
-    assert not (tmp_path / "none").exists()
+    assert "--overwrite" in refused(capsys, "export", path, tmp_path / "rates.gcsv", *options, "--force")
+    assert "nothing to export" in refused(capsys, "export", path, tmp_path / "none.gcsv", *options)
+    assert not (tmp_path / "none.gcsv").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("vibration.json", "clip.xyz"), "give --format gcsv, stmap or csv"),
+        (("vibration.json", "clip.xyz"), "give --format gcsv or csv"),
         (("vibration.json", "vibration.json", "--format", "csv"), "it is the same file as the input"),
         (("vibration.json", "clip.gcsv", "--focal-length", "900"), "give --frames, or --size and --num-frames"),
     ],

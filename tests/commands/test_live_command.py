@@ -1,7 +1,6 @@
-"""rsvib live: from a file or a pipe to a video, a pipe, and a spectrogram."""
+"""rsvib live: from a file or a pipe to a video or a pipe."""
 
 import json
-import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,25 +27,21 @@ def make_clip(tmp_path_factory):
     return folder / "clip.mkv"
 
 
-def test_from_file_to_video_with_spectrogram(clip, tmp_path, capsys):
+def test_from_file_to_video(clip, tmp_path, capsys):
     out = tmp_path / "still.mkv"
-    arguments = ("live", clip, *CAMERA, "--out", out, "--spectrogram", tmp_path / "spectrum", "--json")
+    arguments = ("live", clip, *CAMERA, "--out", out, "--json")
     assert rsvib(*arguments) == 0
     shown = capsys.readouterr()
     answer = json.loads(shown.out)
     assert (answer["frames"], answer["tracked"], answer["dropped"], answer["detections"]) == (COUNT, COUNT - 3, 0, 1)
     frequency = np.array(answer["detection"]["vibration"]["frequency"])[:, 0]
     assert frequency == pytest.approx([52.0, 71.0], abs=0.1)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["spectrum.png", "spectrum.zarr", "still.mkv"]
+    assert [path.name for path in tmp_path.iterdir()] == ["still.mkv"]
     still = crop(SCENE)
     raw, restored = read_stack(clip), read_stack(out)
     assert restored.shape == raw.shape
     assert min(decibel(frame, still) for frame in restored[4:]) > max(decibel(frame, still) for frame in raw[4:]) + 6
     assert "results exist already" in refused(capsys, *arguments)
-    assert rsvib(*arguments, "--overwrite") == 0  # the spectrogram is replaced
-    shutil.rmtree(tmp_path / "spectrum.zarr")
-    (tmp_path / "spectrum.zarr").mkdir()
-    assert "is not a Zarr group" in refused(capsys, *arguments, "--overwrite")
 
 
 def test_from_pipe_to_pipe(clip, monkeypatch, capfdbinary):

@@ -69,7 +69,6 @@ def test_a_full_disk_is_named_with_the_output(tmp_path):
     frames = torch.rand(4, 64, 64, generator=torch.Generator().manual_seed(0))
     info = rsv.StackInfo((4, 64, 64), "uint8", 255.0, frame_rate=30.0)
     writers = {
-        "maps": lambda path: rsv.write_stmap(path, vibration, TIMING, size=(64, 64), num_frames=1),
         "a.mkv": lambda path: rsv.write_stack(path, frames, dtype="uint8", like=info),
         "a.json": lambda path: rsv.write_gcsv(
             path, vibration.with_camera(rsv.Camera(900.0)), TIMING, size=(64, 64), num_frames=9

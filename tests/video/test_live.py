@@ -1,4 +1,4 @@
-"""Sources, outputs, page and spectrogram of live sessions."""
+"""Sources, outputs and page of live sessions."""
 
 import io
 import os
@@ -20,7 +20,6 @@ from truth import draw_scene
 
 import rsvib_torch as rsv
 from rsvib_torch import video
-from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.video.sources import FrameCounter, FrameReader
 
 TIMING = rsv.SensorTiming(row_time=1e-4, exposure_rows=6, frame_rows=1 / 30 / 1e-4)
@@ -218,58 +217,6 @@ def test_a_video_replaces_a_file_if_that_is_asked_for(tmp_path):
     refuses(lambda: video.VideoOutput(tmp_path / "video.gif", 30.0), r"a live video is written to \.mp4")
 
 
-class Tracked:
-    """Offsets of rows by a known displacement, as a tracked frame."""
-
-    def __init__(self, time, displacement):
-        rows = np.arange(4.5, 300.0, 8) * TIMING.row_time
-        starts = np.stack([rows - TIMING.frame_period, rows], -1)
-        middles = starts + 0.5 * TIMING.exposure_time + time
-        moved = displacement(middles[:, 1]) - displacement(middles[:, 0])
-        information = np.broadcast_to(np.eye(2), (1, len(rows), 2, 2))
-        self.time = time
-        self.measurements = Measurements.of_pairs(
-            starts[None, :, 0], starts[None, :, 1], moved[None], information, TIMING.exposure_time
-        )
-
-
-def test_the_spectrogram_has_the_amplitudes_at_their_frequencies_and_times(tmp_path):
-    def displacement(t):
-        x = np.where(t < 2.0, 1.5 * np.sin(2 * np.pi * 52 * t), 0.7 * np.sin(2 * np.pi * 80 * t))
-        return np.stack([x, 0.3 * np.sin(2 * np.pi * 112 * t + 1)], -1)
-
-    spectrogram = video.Spectrogram(TIMING, duration=0.5, max_frequency=150.0)
-    for index in range(1, 121):
-        spectrogram.add(Tracked(index / 30, displacement))
-    times, frequencies, amplitude = spectrogram.result()
-    assert amplitude.shape == (2, len(times), len(frequencies))
-    assert times[1] - times[0] == pytest.approx(0.5, abs=1 / 30)
-    attenuation = np.sinc(np.array([52, 80, 112]) * TIMING.exposure_time)
-    for column, (hertz, size) in ((1, (52, 1.5)), (len(times) - 1, (80, 0.7))):
-        strongest = np.nanargmax(amplitude[0, column])
-        assert frequencies[strongest] == hertz
-        assert amplitude[0, column, strongest] == pytest.approx(size / attenuation[0 if hertz == 52 else 1], rel=0.1)
-    assert frequencies[np.nanargmax(amplitude[1, 3])] == 112
-    assert np.isnan(amplitude[:, :, frequencies == 60]).all()  # blind: twice the frame rate
-    ghosts = np.isin(frequencies, (22, 82, 112))  # 52 Hz and multiples of the frame rate: no larger than 1 %
-    assert np.nanmax(amplitude[0, 1, ghosts]) < 0.01 * np.nanmax(amplitude[0, 1])
-    files = video.save_spectrogram(tmp_path / "spectrum", spectrogram)
-    assert [path.name for path in files] == ["spectrum.png", "spectrum.zarr"]
-    import zarr
-
-    stored = zarr.open_group(str(files[1]), mode="r")
-    np.testing.assert_array_equal(stored["amplitude"][:], amplitude)
-    assert stored["frequency"].attrs["units"] == "Hz"
-    assert stored["time"].shape == times.shape
-
-
-def test_the_memory_of_the_spectrogram_is_bounded():
-    spectrogram = video.Spectrogram(TIMING, duration=0.1, max_frequency=60.0, max_columns=8)
-    for index in range(1, 120):
-        spectrogram.add(Tracked(index / 30, lambda t: np.stack([np.sin(50 * t), np.sin(300 * t)], -1)))
-    assert len(spectrogram.result()[0]) <= 9
-
-
 def test_a_full_disk_is_named_and_leaves_the_frames_before(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     frames = list(np.random.default_rng(0).integers(0, 256, (64, 64, 64), np.uint8))  # 5 kB each
@@ -295,14 +242,8 @@ def test_signals_end_a_session(tmp_path, number):
             signal.raise_signal(number)
             signal.raise_signal(number)  # a second one does not end the process
 
-    saved = []
-
-    def save():
-        signal.raise_signal(number)
-        saved.append(rsv.read_stack(tmp_path / "video.mkv"))
-
-    report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end, save=save)
-    assert report.frames == len(saved[0])
+    report = video.run_live(Numbers(), rsv.VibrationTracker(TIMING), [output], drops=False, progress=end)
+    assert report.frames == len(rsv.read_stack(tmp_path / "video.mkv"))
     assert 6 <= report.frames <= 8  # at most two frames are tracked ahead of the written one
     assert signal.signal(number, before) == usual
 
