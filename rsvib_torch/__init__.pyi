@@ -19,12 +19,10 @@ from .detection import DetectionResult as DetectionResult
 from .detection import DisplacementSpectrum as DisplacementSpectrum
 from .detection import MotionDetection as MotionDetection
 from .detection import SweptTone as SweptTone
-from .detection import TimingDiagnosis as TimingDiagnosis
 from .detection import VibrationDetector as VibrationDetector
 from .detection import detect_motion as detect_motion
 from .detection import detect_swept_tone as detect_swept_tone
 from .detection import detect_vibration as detect_vibration
-from .detection import diagnose_timing as diagnose_timing
 from .evaluation import MtfCurve as MtfCurve
 from .evaluation import SlantedEdge as SlantedEdge
 from .evaluation import find_slanted_edges as find_slanted_edges

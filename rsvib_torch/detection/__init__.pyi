@@ -1,5 +1,4 @@
 from .detect import VibrationDetector, detect_vibration
-from .diagnosis import TimingDiagnosis, diagnose_timing
 from .result import DetectionResult
 from .shapes.free import MotionDetection, detect_motion
 from .shapes.swept import SweptTone, detect_swept_tone
@@ -10,10 +9,8 @@ __all__ = [
     "DisplacementSpectrum",
     "MotionDetection",
     "SweptTone",
-    "TimingDiagnosis",
     "VibrationDetector",
     "detect_motion",
     "detect_swept_tone",
     "detect_vibration",
-    "diagnose_timing",
 ]

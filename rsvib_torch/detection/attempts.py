@@ -88,9 +88,9 @@ def detect_tones(
     # reliable axes beside a contradicted one, 3 were wrong.
     result = assembled_attempt(translation, timing, num_frames)
     reliable, findings = result.reliable.clone(), list(result.findings)
-    for index, diagnosis in other_timings(stacks, timing, translation).items():
+    for index, reason in other_timings(stacks, timing, translation).items():
         reliable[index] = False
-        findings[index] = tuple((diagnosis.reason, *of_axis) for of_axis in findings[index])
+        findings[index] = tuple((reason, *of_axis) for of_axis in findings[index])
     return replace(result, reliable=reliable, findings=tuple(findings))
 
 

@@ -1,111 +1,31 @@
 """Diagnosis of a wrong setting: another timing with which the frames agree, unlike the stated one.
 
 ``period_factor`` finds the frame period or the readout direction with which one tone along each axis explains the
-measured displacements of the rows. ``other_timings`` confirms it by a detection with that timing, and
-``diagnose_timing`` is the same for users.
+measured displacements of the rows. ``other_timings`` confirms it by a detection with that timing.
 
 Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.pipeline import Attempt, DetectionOptions, Hypothesis, attempt
+from rsvib_torch.detection.pipeline import Attempt, Hypothesis, attempt
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.strips import FieldScale
 from rsvib_torch.detection.tones.fit import MotionModel
 from rsvib_torch.detection.tones.selection import find_tones, robust_fit, typical_size
 from rsvib_torch.detection.verdict import contradicted_axes, halves_move_apart
-from rsvib_torch.execution.precision import full_precision, without_gradients
-from rsvib_torch.frames.entry_points import frames_options
-from rsvib_torch.frames.grey import GreyFrames, grey_frames
-from rsvib_torch.io.stack_reading import FramesOrFiles
+from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.numerics.tables import Array, split_axis, table, take_stacks
-from rsvib_torch.options import OffsetOptions
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.results.reason import Reason
 
 
-@dataclass(frozen=True)
-class TimingDiagnosis:
-    """A setting of the sensor that the frames contradict, and the value that they agree with.
-
-    Attributes:
-        setting: ``"frame_rows"``, ``"row_time"``, ``"readout_direction"`` or ``"scan_axis"``.
-        stated: The stated value.
-        agreeing: The value that the frames agree with.
-        timing: The sensor with this value.
-    """
-
-    setting: Literal["frame_rows", "row_time", "readout_direction", "scan_axis"]
-    stated: float | str
-    agreeing: float | str
-    timing: SensorTiming
-
-    @property
-    def reason(self) -> Reason:
-        """The reason against all axes of a detection with the stated value."""
-        code = f"other_{self.setting}"
-        if isinstance(self.stated, str) or isinstance(self.agreeing, str):
-            return Reason(code, details={"stated": str(self.stated), "agreeing": str(self.agreeing)})
-        details: dict[str, float | str] = {}
-        if self.setting == "frame_rows":
-            frame_rate = 1 / (self.timing.row_time * self.stated)
-            details = {"frame_rate": frame_rate, "row_time": 1 / (frame_rate * self.agreeing)}
-        return Reason(code, None, self.stated, self.agreeing, details)
-
-
-@frames_options(OffsetOptions)
-@full_precision
-@without_gradients
-def diagnose_timing(frames: FramesOrFiles, timing: SensorTiming, options: OffsetOptions) -> TimingDiagnosis | None:
-    """Find the setting of the sensor that the frames contradict.
-
-    A row ``i`` of frame ``p`` starts its exposure at ``p frame_rows row_time + i row_time``. The rows of a frame and
-    the phase from frame to frame must agree with the same frequency, which determines ``frame_rows`` and the readout
-    direction from three frames on. With the wrong scan axis, the halves of the rows move apart. ``detect_vibration``
-    does the same for axes that it refuses.
-
-    Args:
-        frames: Stack (T, H, W) or (T, C, H, W), as in ``detect_vibration``.
-        timing: The sensor as stated.
-        options: Options, as in ``detect_vibration``.
-
-    Returns:
-        The setting with the value that the frames agree with; None if they do not contradict the stated timing, or
-        agree with no other one.
-
-    Raises:
-        ValueError: If frames are a batch, or too small, see ``detect_vibration``.
-
-    Example:
-        >>> import rsvib_torch as rsv
-        >>> from rsvib_torch.datasets import city_and_fields
-        >>> timing = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=300)
-        >>> vibration = rsv.Vibration(amplitude=[2.1, 1.6], frequency=[110.0, 90.0], phase=[0.5, 1.0])
-        >>> frames = rsv.simulate_frames(city_and_fields(320, 240, seed=3), timing, vibration, num_frames=4)
-        >>> stated = rsv.SensorTiming(row_time=40e-6, exposure_rows=8, frame_rows=310)
-        >>> diagnosis = rsv.diagnose_timing(frames, stated)
-        >>> diagnosis.setting, round(diagnosis.agreeing)
-        ('frame_rows', 300)
-    """
-    stacks = grey_frames(frames, timing, options)
-    if stacks.batched:
-        raise ValueError("diagnose_timing takes one stack, not a batch")
-    height, width = stacks.images.shape[-2:]
-    translation = Hypothesis(FieldScale(2, width, height))
-    found = attempt(
-        stacks, stacks.timing.in_row_order(), DetectionOptions("direct", None, MotionModel(), options), translation
-    )
-    return other_timings(stacks, stacks.timing, found).get(0)
-
-
-def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, TimingDiagnosis]:
-    """The settings that stacks contradict, by the index of the stack; without stacks that contradict none.
+def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, Reason]:
+    """The reasons against all axes of stacks that agree with another timing, by the index of the stack.
 
     ``found`` is the attempt with the stated timing, in image order.
     """
@@ -123,8 +43,8 @@ def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> d
 
 def _diagnosis(
     stack: GreyFrames, timing: SensorTiming, found: Attempt, index: int, axes: tuple[bool, bool], *, rotates: bool
-) -> TimingDiagnosis | None:
-    """The setting with the value that one stack agrees with; None if it agrees with no other timing.
+) -> Reason | None:
+    """The reason against all axes of a stack that agrees with another timing; None if it agrees with none.
 
     ``axes`` (x, y) in row order contradict the stated timing; ``rotates`` states that the halves of the rows move
     apart, as they do with the wrong scan axis.
@@ -170,16 +90,20 @@ def _diagnosis(
     return None
 
 
-def _between(stated: SensorTiming, agreeing: SensorTiming) -> TimingDiagnosis:
-    """The setting in which two timings differ; another row time also changes what is counted in rows."""
-    if stated.readout_direction != agreeing.readout_direction:
-        return TimingDiagnosis("readout_direction", stated.readout_direction, agreeing.readout_direction, agreeing)
-    if stated.scan_axis != agreeing.scan_axis:
-        axes = ("y", "x") if stated.scan_axis == -2 else ("x", "y")
-        return TimingDiagnosis("scan_axis", *axes, agreeing)
+def _between(stated: SensorTiming, agreeing: SensorTiming) -> Reason:
+    """The reason that two timings differ; another row time also changes what is counted in rows."""
+    for setting in ("readout_direction", "scan_axis"):
+        values = {"stated": getattr(stated, setting), "agreeing": getattr(agreeing, setting)}
+        if values["stated"] != values["agreeing"]:
+            return Reason(f"other_{setting}", details={name: _AXES.get(value, value) for name, value in values.items()})
     if stated.row_time != agreeing.row_time:
-        return TimingDiagnosis("row_time", stated.row_time, agreeing.row_time, agreeing)
-    return TimingDiagnosis("frame_rows", stated.frame_rows, agreeing.frame_rows, agreeing)
+        return Reason("other_row_time", None, stated.row_time, agreeing.row_time)
+    frame_rate = stated.frame_rate
+    details = {"frame_rate": frame_rate, "row_time": 1 / (frame_rate * agreeing.frame_rows)}
+    return Reason("other_frame_rows", None, stated.frame_rows, agreeing.frame_rows, details)
+
+
+_AXES = {-2: "y", -1: "x"}  # names of the scan axes
 
 
 # Frame period

@@ -230,7 +230,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
     described += (accelerometer, tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
-    described += (rsv.TimingDiagnosis("frame_rows", 104.0, 110.0, timing),)
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)
     described += (detected, detected.offsets, free, swept, check, alignment, rates, rotation)
