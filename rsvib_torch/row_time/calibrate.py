@@ -162,12 +162,12 @@ def calibrate_row_time(
     try:
         bands, scene = find_bands(profiles)
     except ValueError as error:
-        other: ScanAxis = -2 if scan_axis in (-1, "x") else -1
+        other: ScanAxis = "y" if scan_axis in (-1, "x") else "x"
         try:
             find_bands(row_profiles(frames, other, full_scale, gamma, channels))
         except ValueError:
             raise error from None
-        raise ValueError(f"there are bands along the other axis of the frames: pass scan_axis={other}") from error
+        raise ValueError(f"there are bands along the other axis of the frames: pass scan_axis={other!r}") from error
     height = profiles.rows.shape[1]
     row_time = 1 / (frequency * bands.period)
     notes: list[str] = []
