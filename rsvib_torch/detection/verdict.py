@@ -280,6 +280,9 @@ def halves_move_apart(other: OtherMotion) -> Array:
 # linear in the column, and the rows moved by 4 times the difference of their halves; clouds, parallax and objects had
 # 0.12 px and more, motions that are no sums of tones 10 times and more.
 _MAX_UNEVEN, _MAX_MOVED = 3.0, 8.0  # of the permitted difference of the halves, of the difference of the halves
+# of the difference of the halves: roll of 4 to 20 mrad in 300 columns has 0.14 to 0.17, because differences of a pixel
+# are not linear in the gradients; halves at two distances have 0.9
+_MAX_UNEVEN_PART = 0.25
 
 
 def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array:
@@ -289,7 +292,8 @@ def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array
     is the rows of a frame over its columns.
     """
     apart = other.differential[..., ::-1]
-    is_uneven = (uneven[..., ::-1] > _MAX_UNEVEN * _max_apart(other.size)).any(-1)
+    even = np.maximum(_MAX_UNEVEN * _max_apart(other.size), _MAX_UNEVEN_PART * apart)
+    is_uneven = (uneven[..., ::-1] > even).any(-1)
     moved = np.maximum(other.permitted, _MAX_MOVED * max(1.0, aspect) * apart)
     return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
 

@@ -1,5 +1,6 @@
 """Angular rates that a gyroscope recorded, and the rotations between two times that follow from them."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -79,6 +80,16 @@ class AngularRates(
     def sample_rate(self) -> float:
         """Samples per second (median)."""
         return 1.0 / float(self.times.diff().median())
+
+    @cached_property
+    def noise(self) -> Tensor:
+        """(3,) rad/s, standard deviation of white noise of the rates, from differences of order 6 of samples.
+
+        The differences of white noise have the variance 924, the binomial coefficient of 12 over 6.
+        """
+        order = min(6, len(self.times) - 1)
+        scatter = self.rates.diff(n=order, dim=0).abs().median(0).values
+        return 1.4826 * scatter / math.comb(2 * order, order) ** 0.5
 
     def summary(self) -> str:
         """Duration, sample rate, mean and standard deviation of the rates."""

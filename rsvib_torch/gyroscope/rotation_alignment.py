@@ -30,6 +30,9 @@ _CERTAIN = 25.0  # chi-square by which other axes or offsets fit worse: 5 standa
 _NEAR_COST = 1.05
 _MAX_COST, _MOST_OTHERS = 4.0, 5  # starts that are worse by this factor in the search, and further ones, are not fitted
 _MAX_FOCAL_LENGTH_STD, _MAX_ROW_TIME_STD = 0.05, 0.2  # of the value; less accurate ones are not determined
+# longer sides of the frames: of a fisheye lens, and of 1000 mm on film. Rates in degrees per second for rad/s fitted
+# reliably with 180 for 3.1
+_FOCAL_LENGTHS = (0.15, 30.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,7 +200,7 @@ def align_rates(
     others = [start for start in again.starts if start.orientation != fit.model.orientation][:_MOST_OTHERS]
     axes = [start.orientation for start in others if explains(start)]
     other = next((start.offset for start in again.other_offsets[:_MOST_OTHERS] if explains(start)), None)
-    return _result(fit, again, axes, other, free, starts, height, offsets)
+    return _result(fit, again, axes, other, free, starts, size, offsets)
 
 
 def _result(
@@ -207,9 +210,10 @@ def _result(
     other: float | None,
     free: list[bool],
     starts: Tensor,
-    height: int,
+    size: Sequence[int],
     offsets: tuple[float, float] | None,
 ) -> RotationAlignment:
+    height, side = size[0], max(size)
     model, radius = fit.model, fit.model.tracks.radius
     values = dict(zip(NAMES, fit.parameters.tolist(), strict=True))
     std = fit.covariance.diagonal().clamp(min=0.0).sqrt()
@@ -230,7 +234,7 @@ def _result(
         reasons.append(Reason("axes_mirrored", details={"axes": search.mirrored}))
     if axes:
         reasons.append(Reason("axes_ambiguous", details={"axes": ", ".join(axes)}))
-    reasons += _uncertain(fit, free, std) + outside(offset, offset_std, offsets)
+    reasons += _uncertain(fit, free, std, side) + outside(offset, offset_std, offsets)
     steps = model.rates.times.diff()
     inside = (model.rates.times[1:] > clock[0]) & (model.rates.times[:-1] < clock[1])
     longest, allowed = float(steps[inside].amax()), 4 * float(steps.median())
@@ -264,8 +268,8 @@ def _result(
     )
 
 
-def _uncertain(fit: RotationFit, free: list[bool], std: Tensor) -> list[Reason]:
-    """Reasons against parameters that are not determined."""
+def _uncertain(fit: RotationFit, free: list[bool], std: Tensor, side: int) -> list[Reason]:
+    """Reasons against parameters that are not determined; ``side`` is the longer one of the frames in px."""
     reasons = []
     focal_length, row_time = fit.parameters[5:7].tolist()
     focal_length_std, row_time_std = std[5:7].tolist()
@@ -273,6 +277,10 @@ def _uncertain(fit: RotationFit, free: list[bool], std: Tensor) -> list[Reason]:
     if focal_length_std > allowed:
         details = {"focal_length": focal_length}
         reasons.append(Reason("focal_length_uncertain", None, focal_length_std, allowed, details))
+    shortest, longest = (sides * side for sides in _FOCAL_LENGTHS)
+    if free[5] and not shortest <= focal_length <= longest:
+        limit = shortest if focal_length < shortest else longest
+        reasons.append(Reason("focal_length_implausible", None, focal_length, limit, {"times": focal_length / side}))
     if free[6] and row_time_std > _MAX_ROW_TIME_STD * row_time:
         reasons.append(Reason("row_time_uncertain", None, row_time_std / row_time, _MAX_ROW_TIME_STD))
     if not math.isfinite(float(std.sum())):

@@ -117,9 +117,12 @@ class FrameMotion:
         return lengths
 
 
-def frame_motion(vibration: Motion, timing: RowTiming, num_frames: int, num_rows: int) -> FrameMotion:
-    """Motion of ``num_frames`` frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order."""
-    starts = timing.frame_starts(num_frames, vibration.device)
+def frame_motion(vibration: Motion, timing: RowTiming, frames: int | Tensor, num_rows: int) -> FrameMotion:
+    """Motion of frames of ``num_rows`` rows for a vibration of batch shape (B,) in row order.
+
+    ``frames`` is their number, or their exposure starts (T,) if they are some of a stack.
+    """
+    starts = frames if isinstance(frames, Tensor) else timing.frame_starts(frames, vibration.device)
     middle = starts + timing.time_to_middle(num_rows)
     shift = vibration.drift(middle.expand(*vibration.batch_shape, -1)).detach().round()
     return FrameMotion(vibration, timing, starts, shift, num_rows)

@@ -368,6 +368,12 @@ _RECORDED = {
         "give camera=",
         "standard deviation of the focal length, above 5 % of it",
     ),
+    "focal_length_implausible": _px_of_result(
+        "the focal length of {value:.0f} px that agrees with the rates is {times:.3g} times the longer side of the "
+        "frames: rates in degrees per second instead of rad/s, or the reverse, cause it",
+        "check the unit of the rates, or give camera=",
+        "fitted focal length, below 0.15 (value below limit) or above 30 times the longer side of the frames",
+    ),
     "fit_not_converged": _of_result("the fit does not converge"),
     "gap_in_recording": _of_result(
         "the recording has a gap of {value:.3g} s within the frames, {limit:.3g} s are allowed",

@@ -119,13 +119,17 @@ def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit |
     that times a texture of the rows, which is the same in all frames while the bands move. None if the fit diverges.
     """
     best: BandFit | None = None
+    worse = 0  # numbers in a row; a square wave has no even harmonics
     for count in (1, 2, 3, 5, 8, 12, 16):
         if count > 1 and count > start / 4:
             break
         found = _fit(brightness, best.period if best else start, scene, count)
         if found is None or abs(found.period / start - 1) > 0.25:
             break
-        if best is None or found.evidence > best.evidence:
+        worse = 0 if best is None or found.evidence > best.evidence else worse + 1
+        if worse == 2:
+            break
+        if worse == 0:
             best = found
     return best
 

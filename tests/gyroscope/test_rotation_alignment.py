@@ -1,6 +1,7 @@
 """Alignment of a gyroscope with frames of an independent camera: axes, bias, clock, focal length, row time."""
 
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -113,6 +114,24 @@ def test_search_finds_all_24_orientations(tracks):
 @pytest.mark.parametrize("name", ORIENTATIONS)
 def test_all_24_orientations(tracks, name):
     check(aligned(tracks, recorded(name)), name, limit=5.0)
+
+
+def test_errors_contain_the_noise_of_the_rates(tracks):
+    """It turns all corners of a row alike: as for errors of independent corners, one value was beyond 4."""
+    clean, errors = recorded(), []
+    for seed in range(5):
+        noise = 0.02 * torch.randn(clean.rates.shape, generator=torch.Generator().manual_seed(seed)).double()
+        found = aligned(tracks, replace(clean, rates=clean.rates + noise), rsv.Camera(FOCAL_LENGTH))
+        errors += [(found.offset - OFFSET) / found.offset_std, (found.scale - 1.0) / found.scale_std]
+    assert max(map(abs, errors)) < 3
+
+
+@pytest.mark.parametrize("factor", [math.pi / 180, 180 / math.pi])
+def test_a_wrong_unit_of_the_rates_is_named(tracks, factor):
+    rates = recorded()
+    found = aligned(tracks, replace(rates, rates=factor * rates.rates))
+    assert not found.reliable
+    assert any("check the unit of the rates" in reason for reason in found.reasons)
 
 
 def test_dashboard_is_excluded():

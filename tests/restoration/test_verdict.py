@@ -7,6 +7,7 @@ import warnings
 import pytest
 import torch
 from detections import detection_of
+from field_truth import FieldMotion, take_field_frames
 from truth import Motion, crop, decibel, draw_scene, take_frames
 
 from rsvib_torch import SensorTiming, Vibration
@@ -391,3 +392,14 @@ def test_finer_grids_and_mosaics_are_judged_at_the_pixels(options, direction):
         assert judge_restoration(colour, restored, timing, right, joint=True, channels="last").overall == "helps"
     with pytest.raises(ValueError, match="with scale=2, got"):
         judge_restoration(frames, restored[..., 1:], timing, right, joint=True, mosaic=mosaic)
+
+
+def test_pairs_of_frames_with_roll_are_judged_at_their_times():
+    """The strip of columns that is judged has the times of the frames that are compared, not of the first ones."""
+    timing = SensorTiming(row_time=5e-5, exposure_rows=10, frame_rows=150)
+    motion = FieldMotion((2.0, 3.0, 2e-3, 0.0))
+    frames = take_field_frames(draw_scene(150, 280, 3, blur=0.6), timing, motion, (112, 240), 4)
+    vibration = Vibration(motion.amplitude[:3], motion.frequency[:3], motion.phase[:3])
+    restored = restore(frames, timing, vibration, joint=True, check=False)
+    verdict = judge_restoration(frames, restored, timing, vibration, joint=True, most_pairs=2)
+    assert verdict.outcome == ("helps", "helps")

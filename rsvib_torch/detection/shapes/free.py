@@ -629,9 +629,12 @@ def _report(
     value = value - value.mean((0, 1))
     # The power at other frequencies does not determine a tone that displaces all frames nearly equally.
     blind = _blind_tone(table(value), table(times), seen_and_unseen[0])
-    std = torch.hypot(std, tensor(blind))
-    std_seen, unseen = tensor(seen_and_unseen[0]), tensor(np.hypot(seen_and_unseen[1], blind))
-    rest = tensor(measured.unexplained(residual_of_motion(measured, motion))[0])
+    residual = residual_of_motion(measured, motion)
+    sudden = tensor(_sudden(measured, residual, table(times), fit.spacing))
+    std = torch.hypot(torch.hypot(std, tensor(blind)), sudden)
+    std_seen = torch.hypot(tensor(seen_and_unseen[0]), sudden.square().mean((0, 1)).sqrt())
+    unseen = tensor(np.hypot(seen_and_unseen[1], blind))
+    rest = tensor(measured.unexplained(residual)[0])
     moved = (value - value.mean(0)).square().mean((0, 1)).sqrt()
     findings = []
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
@@ -654,6 +657,28 @@ def _report(
         reliable=magnitudes_from_row_order(reliable, timing),
         findings=findings_from_row_order(findings, timing),
     )
+
+
+# of the median mean square of residuals within a knot interval; smaller ones are noise. Of steps of 2 and 6 px within
+# 0.6 ms, and an impulse of 1.2 ms, the largest error was 6 to 7 standard deviations without this part, with it 4
+_SUDDEN = 6.0
+
+
+def _sudden(measured: Measurements, residual: Array, times: Array, spacing: float) -> Array:
+    """(T, R, A) px, residuals near motion that is faster than the knots follow, such as a step; 0 elsewhere.
+
+    They are the root of the mean square of the residuals (1, N, G, A) within a knot ``spacing`` in s of the ``times``
+    (T, R), where that is significantly larger than elsewhere.
+    """
+    seen = measured.visible[0] > 0
+    at = (measured.exposure_starts[0] + 0.5 * measured.exposure_time)[seen]
+    order = np.argsort(at)
+    squares = np.square(residual[0][seen][order])
+    total = np.concatenate([np.zeros((1, squares.shape[-1])), np.cumsum(squares, 0)])
+    first, last = (np.searchsorted(at[order], times + side * spacing) for side in (-1.0, 1.0))
+    local = (total[last] - total[first]) / np.maximum(last - first, 1)[..., None]
+    usual = np.median(local, (0, 1))
+    return np.sqrt(np.where(local > _SUDDEN * usual, local, 0.0))
 
 
 # px, standard deviation of the quadratures of a nearly blind tone before it is measured: vibrations have a few pixels

@@ -301,7 +301,7 @@ def _judged_strip(frames: ComparedFrames) -> ComparedFrames:
         cut_columns(raw, parts),
         cut_columns(frames.restored, parts),
         None if frames.ignore is None else cut_columns(frames.ignore, parts),
-        frame_motion(of_strips, motion.timing, raw.shape[1], height),
+        frame_motion(of_strips, motion.timing, motion.frame_starts, height),
     )
 
 
