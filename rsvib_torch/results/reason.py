@@ -332,6 +332,10 @@ _SHAPES = {
         "use more frames, or a steady tone (detect_vibration)",
         "number of frames, below 3",
     ),
+    "other_axis_unknown": ReasonKind(
+        "rows move along {other} by a motion that is not known, which displaces what they show of {axis}",
+        _MORE_FRAMES,
+    ),
     "tone_of_chance": ReasonKind(
         "the best of so many tones explains as much of noise with a probability of {value:.2g}, {limit:g} is allowed",
         _MORE_FRAMES,
@@ -369,10 +373,10 @@ _RECORDED = {
         "standard deviation of the focal length, above 5 % of it",
     ),
     "focal_length_implausible": _px_of_result(
-        "the focal length of {value:.0f} px that agrees with the rates is {times:.3g} times the longer side of the "
-        "frames: rates in degrees per second instead of rad/s, or the reverse, cause it",
+        "a focal length of {value:.0f} px agrees with the rates, {times:.3g} times the longer side of the frames and "
+        "beyond the limit of {limit:.0f} px: rates in degrees per second instead of rad/s, or the reverse, cause it",
         "check the unit of the rates, or give camera=",
-        "fitted focal length, below 0.15 (value below limit) or above 30 times the longer side of the frames",
+        "fitted focal length, below 0.15 or above 30 times the longer side of the frames",
     ),
     "fit_not_converged": _of_result("the fit does not converge"),
     "gap_in_recording": _of_result(

@@ -543,6 +543,11 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         against += fitted.against[axis] if present else []
         against += unexplained_reasons(name, float(fitted.unexplained[axis]), size, "swept tone")
         findings.append(tuple(against))
+    # the row bands contradict the fit of one axis, with which the rows of the other one were warped
+    wrong = [any(reason.code == "bands_contradict" for reason in against) for against in findings]
+    for axis, name in enumerate(AXIS_NAMES[:2]):
+        if wrong[1 - axis] and not findings[axis]:
+            findings[axis] = (Reason("other_axis_unknown", name),)
     reliable = torch.tensor([not against for against in findings], device=fitted.fits.device)
     parameters, deviations = (magnitudes_from_row_order(torch.stack(x, -1), timing) for x in (values, stds))
     return SweptTone(
