@@ -340,6 +340,7 @@ def _exposure_rows(
             fit_strobe(power, bands.period, bands.phases, np.ones(len(even)), on_fraction=on_fraction, fixed=fixed)
             for power in (even, even ** (other_gamma / gamma))
         )
+        fits[0].check_shape()
         # a wrong gamma changes an exposure of 0.2 ms by 20 % and its misfit by a factor of 3 to 70, one of 1.25 periods
         # by a factor of 1.5
         if others[0].misfit < 0.8 * fits[0].misfit:

@@ -117,7 +117,6 @@ def exposure_from_shape(fits: list[StrobeFit], on_fraction: float) -> tuple[floa
     Raises:
         ValueError: If several exposures explain the bands.
     """
-    fits[0].check_shape()
     found = []  # exposure in periods, share of other light, fit
     for fit in fits:
         turns = fit.exposure_rows / fit.period
