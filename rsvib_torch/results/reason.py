@@ -425,7 +425,8 @@ _ROW_TIME = {
     ),
     "no_motion_for_row_time": _of_result(
         "no vibration, and no motion that is smooth over the blanking time, determines the row time",
-        "shake the camera while it records, and use more frames",
+        "shake the camera while it records, use more frames, and leave out what is fixed to the frames or moves by "
+        "itself (ignore)",
     ),
 }
 _RESTORATION = {
