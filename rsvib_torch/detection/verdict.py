@@ -298,23 +298,21 @@ def rotation_possible(other: OtherMotion, uneven: Array, aspect: float) -> Array
     return halves_move_apart(other) & ~is_uneven & ~(other.unexplained > moved).any(-1)
 
 
-def rotation_reasons(
-    axis: int, axes: int, differential: Sequence[float], size: float, remedy: str = "'auto'"
-) -> list[Reason]:
+def rotation_reasons(axis: int, axes: int, differential: Sequence[float], size: float) -> list[Reason]:
     """Reasons against an axis from rotation and zoom, which move the halves of a row apart along the other axis.
 
     A roll by theta moves the halves of a row by ``theta W / 4`` along y in opposite directions, and rows by up to
     ``theta H / 2`` along x. A zoom does the same with the axes exchanged. Rows of both axes are concerned by parallax.
 
     ``differential`` (2,) px is the rms difference of the displacements along a row that the motion does not explain,
-    ``size`` px the rms offset along the axis, and ``remedy`` the value of roll and zoom with which they are measured.
+    and ``size`` px the rms offset along the axis.
     """
     apart, allowed = max(differential) if axes > 2 else differential[1 - axis], float(_max_apart(size))
     if not apart > allowed:  # nothing was measured: NaN
         return []
     if axes > 2:
         return [Reason("strips_apart", AXIS_NAMES[axis], apart, allowed)]
-    return [Reason("halves_apart", AXIS_NAMES[axis], apart, allowed, {"remedy": remedy})]
+    return [Reason("halves_apart", AXIS_NAMES[axis], apart, allowed)]
 
 
 # Exposure

@@ -13,6 +13,9 @@ from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.timing import SensorTiming
 from rsvib_torch.options import MaskedInputOptions
 
+# of the 3 x 3 pixels around a missing one that counts as measured: at the straight edge of a hole, 0.67 are
+_MEASURED_AROUND = 0.7
+
 
 @dataclass(frozen=True, eq=False)
 class GreyFrames:
@@ -88,6 +91,9 @@ def grey_frames(
                 f"frame {where[-1]} has only {fraction[*where]:.1%} of pixels with data, {min_valid_fraction:.0%} are "
                 "needed; mark fewer pixels by NaN or ignore"
             )
+        # single pixels are interpolated: the rows of a frame without one pixel in twenty could not be registered
+        around = torch.nn.functional.avg_pool2d(valid.to(images.dtype), 3, 1, 1)
+        valid = _unless_complete(valid | (around > _MEASURED_AROUND))
     # a frame without detail has no displacement; every 16th row is enough to find that a frame is not constant
     constant = _constant(images[..., ::16, :])
     if bool(constant.any()):

@@ -115,7 +115,7 @@ _OPTIONS = {
     "pass row_time=(low, high)": "give --row-time twice",
     "scan_axis=": "--scan-axis ",
     "readout_direction=": "--readout-direction ",
-    "roll='auto', zoom='auto' and no columns": "no columns, and 'auto' for roll and zoom, in [detection]",
+    "roll=True, zoom=True and no columns": "no columns, and true for roll and zoom, in [detection]",
 }
 _of_program: list[bool] = []  # not empty while a command runs
 
@@ -243,7 +243,7 @@ _TONES = {
     ),
     "halves_apart": _px(
         "left and right halves of the rows move apart by {value:.3g} px along {other}, {limit:.2g} px are allowed: the "
-        "camera rolls or zooms (pass roll={remedy}, zoom={remedy} and no columns), or the scene has parallax (select a "
+        "camera rolls or zooms (pass roll=True, zoom=True and no columns), or the scene has parallax (select a "
         "part of the frame with one distance)",
         compares="rms difference between the halves of the rows along the other axis, above 0.035 px and 0.9 % of the "
         "rms offsets",

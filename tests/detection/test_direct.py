@@ -214,7 +214,7 @@ SMALL = Motion((0.2, 0.13), (155.0, 155.0), (0.8, -2.6))
 
 def with_missing(frames, random):
     """Scattered pixels, two rows and a column."""
-    missing = np.broadcast_to(random.random(frames.shape[-2:]) < 0.01, frames.shape).copy()
+    missing = np.broadcast_to(random.random(frames.shape[-2:]) < 0.05, frames.shape).copy()
     missing[:, 500:502] = missing[:, :, 130] = True
     return np.where(missing, np.nan, frames)
 

@@ -57,6 +57,16 @@ def make_steady():
     return frames, track(frames)
 
 
+def test_frames_after_the_end_of_a_vibration_do_not_become_worse():
+    """The tones of the frames before fit the first frame at rest badly; they would lower its PSNR by 10 dB."""
+    end = 12 / RATE
+    stopping = Sines(amplitude=lambda t: (2.1 * (t < end - 1e-9), 1.6 * (t < end - 1e-9)))
+    frames = taken(stopping, 15)
+    for frame, tracked in list(zip(frames, track(frames), strict=True))[12:]:
+        assert decibel(tracked.restored.numpy(), crop(SCENE)) > decibel(frame.numpy(), crop(SCENE)) - 1
+    assert not tracked.detection.reliable.any()
+
+
 def test_result_agrees_with_the_batch_within_the_standard_deviations(steady):
     frames, tracked = steady
     ours = tracked[-1].detection

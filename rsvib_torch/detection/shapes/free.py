@@ -640,7 +640,7 @@ def _report(
     for axis, name in enumerate(AXIS_NAMES[: scale.axes]):
         against = unexplained_reasons(name, float(rest[axis]), float(moved[axis]), "smooth motion") + of_bands[axis]
         size = math.sqrt(2) * float(moved[axis] if scale.axes == 2 else moved[:2].amax())
-        against += rotation_reasons(axis, scale.axes, apart.tolist(), size, remedy="True")
+        against += rotation_reasons(axis, scale.axes, apart.tolist(), size)
         if float(std_seen[axis]) > _MAX_STD_SEEN:
             against.append(Reason("motion_uncertain", name, float(std_seen[axis]), _MAX_STD_SEEN))
         findings.append(tuple(against))
