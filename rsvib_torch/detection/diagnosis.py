@@ -93,17 +93,14 @@ def _diagnosis(
 def _between(stated: SensorTiming, agreeing: SensorTiming) -> Reason:
     """The reason that two timings differ; another row time also changes what is counted in rows."""
     for setting in ("readout_direction", "scan_axis"):
-        values = {"stated": getattr(stated, setting), "agreeing": getattr(agreeing, setting)}
+        values = {"stated": stated.to_dict()[setting], "agreeing": agreeing.to_dict()[setting]}
         if values["stated"] != values["agreeing"]:
-            return Reason(f"other_{setting}", details={name: _AXES.get(value, value) for name, value in values.items()})
+            return Reason(f"other_{setting}", details=values)
     if stated.row_time != agreeing.row_time:
         return Reason("other_row_time", None, stated.row_time, agreeing.row_time)
     frame_rate = stated.frame_rate
     details = {"frame_rate": frame_rate, "row_time": 1 / (frame_rate * agreeing.frame_rows)}
     return Reason("other_frame_rows", None, stated.frame_rows, agreeing.frame_rows, details)
-
-
-_AXES = {-2: "y", -1: "x"}  # names of the scan axes
 
 
 # Frame period

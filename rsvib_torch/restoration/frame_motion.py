@@ -176,11 +176,12 @@ def visible_pixels(
         needed = 25 * math.prod(batch) * num_frames * height * width  # float64 columns, their comparisons, masks
         check_fits(f"masks of num_frames={num_frames} frames of {height} x {width} px", needed, "pass fewer frames")
     limits = np.array([width, height])[:, None, None] - 1
+    rows, columns = (height, width) if timing.scan_axis == -2 else (width, height)
+    row_timing = timing.in_row_order()
+    row_timing.check_rows(rows)
     masks, shifts = [], []
     for one in [vibration[stack] for stack in range(batch[0])] if batch else [vibration]:
-        rows, columns = (height, width) if timing.scan_axis == -2 else (width, height)
-        motion, row_timing = one.detached(), timing.in_row_order()
-        row_timing.check_rows(rows)
+        motion = one.detached()
         bounding: Motion = motion.to_row_order(timing).expanded(1)
         of_frames = frame_motion(bounding, row_timing, num_frames, rows)
         shift = offsets_from_row_order(of_frames.shift, timing)[0, :, :2]
