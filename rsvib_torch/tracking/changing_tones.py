@@ -16,14 +16,12 @@ import numpy as np
 
 from rsvib_torch.detection.measurements import Measurements
 from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
-from rsvib_torch.detection.shapes.free import start_curve
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN
-from rsvib_torch.detection.verdict import scene_reasons
-from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, table
+from rsvib_torch.numerics.tables import Array, table, valid_mean
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 
 _KNOT_FRAMES = 8  # frame periods between knots: a tone that decays to a third within them is straight to 5 % of it
 _STEPS = 3.0  # frequencies that are tried for each inverse distance of the knots
@@ -31,6 +29,8 @@ _MIN_EXPLAINED = 14.0  # decrease of chi-square for each parameter of a tone: th
 # px, rms of the offsets by a tone: smaller ones may be errors of the registration, and of rows that are measured around
 # a motion that is known less well
 _MIN_SIZE, _MIN_SIZE_OF_ROWS = 0.02, 0.1
+# of the largest offsets of a pair, those of a pair at rest, and by how many times these its neighbours exceed it
+_AT_REST, _SUDDEN = 0.05, 5.0
 _MIN_BETTER = 25.0  # decrease of chi-square by which a tone must be better than one at another frequency
 
 
@@ -73,24 +73,52 @@ class ChangingTones:
         return self.coefficients @ hats * np.exp(2j * math.pi * self.frequencies * time), float(self.velocity @ hats)
 
 
-def changing_tones(stack: GreyFrames, bands: RegistrationOptions) -> tuple[ChangingTones, ChangingTones]:
-    """The tones of both axes of one stack, in row order.
+def moving_parts(curve: OffsetCurve) -> list[slice]:
+    """The runs of two and more frames that vibrate all the time, of a record whose vibration starts and stops suddenly.
 
-    Raises:
-        ValueError: If the frames cannot be registered.
+    A tone that stops between two knots looks like further tones: of 12 frames with 2 px before 12 at rest, none was
+    reliable.
     """
-    # 1. Offsets of the row bands, and the middles of their exposures.
-    rows, curve, _ = start_curve(stack, stack.timing, bands)
-    against = scene_reasons(curve, stack.images.shape[-1])[0]
-    if against:
-        raise ValueError(str(against[0]))
+    # 1. How much the rows of the two frames of each pair move apart, beside a drift.
+    offsets, rows = table(curve.offsets[0]), table(curve.rows)  # (P, N, 2)
+    centred = rows - rows.mean()
+    offsets = offsets - valid_mean(offsets, 1)[:, None]
+    slope = valid_mean(offsets * centred[:, None], 1)[:, None] / np.square(centred).mean()
+    level = np.sqrt(valid_mean(np.square(offsets - slope * centred[:, None]), 1)).max(-1)
+    # 2. Pairs at rest beside which it changes suddenly. The frame before them and the one after may rest in part.
+    least = max(_MIN_SIZE, _AT_REST * float(level.max()))
+    moves = np.ones(len(level) + 1, dtype=bool)
+    for rest in _runs(level < least):
+        beside = np.concatenate([level[max(rest.start - 2, 0) : rest.start], level[rest.stop : rest.stop + 2]])
+        if beside.max(initial=0.0) > _SUDDEN * least:
+            moves[max(rest.start - 1, 0) : rest.stop + 2] = False
+    # 3. The runs between them.
+    return [run for run in _runs(moves) if run.stop - run.start > 1]
+
+
+def _runs(values: Array) -> list[slice]:
+    """The runs of entries that are True."""
+    change = np.diff(np.concatenate([[0], values.astype(int), [0]]))
+    return [
+        slice(int(start), int(end)) for start, end in zip(*(np.flatnonzero(change == d) for d in (1, -1)), strict=True)
+    ]
+
+
+def changing_tones(
+    curve: OffsetCurve, starts: Array, rows: RowTiming, bands: RegistrationOptions
+) -> tuple[ChangingTones, ChangingTones]:
+    """The tones of both axes of one stack, in row order, from the offsets of its row bands.
+
+    ``starts`` are those of the frames, in s.
+    """
+    # 1. The offsets, and the middles of their exposures.
     banded = measurements_of_curve(curve, rows, bands.band_step)
     offsets = np.diff(banded.displacements[0], axis=1)[:, 0]  # (N, 2)
     times = banded.exposure_starts[0] + 0.5 * banded.exposure_time  # (N, 2)
     times[:, 1] -= offsets[:, 1] * rows.row_time
     # 2. Rows of content that moves along the scan are exposed later. By how much is taken from the tones along the
     # scan: with the measured offsets, a tone that frames do not show would explain these offsets by themselves.
-    record = _Record.of(table(rows.frame_starts(stack.images.shape[1])), rows, bands.band_rows)
+    record = _Record.of(starts, rows, bands.band_rows)
     weights, moved = banded.weights[0] * banded.independent, np.zeros(len(times))
     for _ in range(2):
         shifted = times + np.stack([np.zeros_like(moved), moved * rows.row_time], 1)

@@ -8,16 +8,18 @@ Invariant: the displacement depends on the row only (docs/architecture.md).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn import functional
 
-from rsvib_torch.detection.tones.fit import displacement_std, residual_of
-from rsvib_torch.detection.verdict import Findings
+from rsvib_torch.detection.shapes.free import start_curve
+from rsvib_torch.detection.tones.fit import residual_of
+from rsvib_torch.detection.verdict import Findings, scene_reasons
 from rsvib_torch.execution.parallel import threads_for
 from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.execution.progress import steps
@@ -30,10 +32,11 @@ from rsvib_torch.motion.timing import RowTiming, SensorTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd
 from rsvib_torch.numerics.tables import Array, table, tensor
 from rsvib_torch.options import FollowOptions, RegistrationOptions
+from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, tones_of_rows
-from rsvib_torch.tracking.tracked_frame import TrackedTones, vibration_at_frame
+from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, moving_parts, tones_of_rows
+from rsvib_torch.tracking.tracked_frame import TrackedTones, displacement_std_at_frame, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
 _BANDS = RegistrationOptions()
@@ -41,6 +44,7 @@ _SLOWEST = 1.25  # frame rates; slower tones are not distinguished from a drift 
 _BEGIN = 3  # frames at the start of a tracker, whose rows are measured around a less accurate motion
 _TONE = ("amplitude", "frequency", "phase")
 _DRIFT = ("image_motion", "image_acceleration")
+_STDS = (*_TONE, "period", *_DRIFT, "displacement")
 _ACROSS = (1.0, -1.0)  # sign of displacements along and across the rows if rows are read backwards
 _SIZE_STD, _FREQUENCY_STD = 0.2, 0.2  # of the amplitude, and Hz, of the tones of a record at a frame
 # Largest rms difference of the displacements of the rows by both trackers: px, of the displacement, and standard
@@ -49,6 +53,7 @@ _MAX_APART = (0.01, 0.03, 4.0)
 # Part of the frames whose rows contradict the tones of an axis: with more, tones are missing or wrong in all frames. Of
 # 16 axes with two tones that decay, 4 had wrong displacements in frames whose rows do not contradict them.
 _MAX_CONTRADICTED = 0.07
+_UNCERTAIN = {"displacement_ambiguous", "displacement_uncertain"}  # by the tracker that knows an axis less well
 _CONTRADICTED = {"rows_unexplained", "neighbours_unexplained", "halves_apart", "directions_differ", "not_followed"}
 
 
@@ -65,21 +70,30 @@ class _Follower(VibrationTracker):
         before, last = state.frames[-2:]
         time = 0.5 * (before.time + last.time) + 0.5 * last.images.shape[-2] * self._rows.row_time
         parts = [of_axis.at(time) for of_axis in self._known]
-        count = max(1, *(len(size) for size, _ in parts))
+        frequencies = _frequencies(self._known)
+        count = frequencies.shape[-1]
         coefficients = np.array([np.pad(size, (0, count - len(size))) for size, _ in parts])
-        frequencies = np.array([np.pad(one.frequencies, (0, count - len(one.frequencies))) for one in self._known])
         drift = np.array([[velocity, 0.0] for _, velocity in parts])
         size_std, frequency_std = _SIZE_STD * np.abs(coefficients), np.full_like(frequencies, _FREQUENCY_STD)
         state = replace(state, contradictions=0)
         return self._begun(state, time, coefficients, frequencies, drift, size_std, frequency_std)
 
 
+def _frequencies(tones: Sequence[ChangingTones]) -> Array:
+    """(2, K) Hz of the tones of both axes, 0 for those that an axis does not have."""
+    count = max(1, *(len(one.frequencies) for one in tones))
+    return np.array([np.pad(one.frequencies, (0, count - len(one.frequencies))) for one in tones])
+
+
 @dataclass(frozen=True, eq=False)
 class _AtFrame:
-    """Both axes at a frame by one tracker, in row order, with the time origin of the stack."""
+    """Both axes at a frame, in row order; the time origin is the start of the frame.
 
-    vibration: Vibration  # (2, K)
-    std: VibrationStd  # (2, K)
+    Tones are in the order of those of the record.
+    """
+
+    values: Mapping[str, Tensor]  # (2, K), the fields of ``Vibration``
+    std: Mapping[str, Tensor]  # those of ``VibrationStd``
     known_std: Array  # (2,) px, of the displacement of the rows
     residual: Array  # (2,) px
     findings: Findings  # reasons against each axis
@@ -128,13 +142,42 @@ def follow_vibration(frames: FramesOrFiles, timing: SensorTiming, options: Follo
 
 
 def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
-    number, height = stack.images.shape[1:3]
-    starts = table(stack.timing.in_row_order().frame_starts(number))
-    rows = replace(stack.timing.in_row_order(), frame_start_times=None)
+    rows, curve, _ = start_curve(stack, stack.timing, _BANDS)
+    against = scene_reasons(curve, stack.images.shape[-1])[0]
+    if against:
+        raise ValueError(str(against[0]))
+    number = stack.images.shape[1]
+    starts = table(rows.frame_starts(number))
     images = stack.images[0] if stack.valid is None else stack.images[0].masked_fill(~stack.valid[0], math.nan)
+    at_rest: list[_Judged] = [(None, (Reason("no_tone", name),)) for name in AXIS_NAMES[:2]]
+    judged: list[list[_Judged]] = [at_rest] * number
+    for part in moving_parts(curve):
+        judged[part] = _followed_part(images[part], starts[part], _of_pairs(curve, part), rows, options)
+    return _assembled(judged, starts, stack)
+
+
+def _of_pairs(curve: OffsetCurve, frames: slice) -> OffsetCurve:
+    """The offsets between some frames."""
+    pairs = slice(frames.start, frames.stop - 1)
+    return replace(
+        curve,
+        pairs=curve.pairs[pairs] - frames.start,
+        times=curve.times[pairs],
+        later_times=curve.later_times[pairs],
+        offsets=curve.offsets[:, pairs],
+        quality=curve.quality[:, pairs],
+    )
+
+
+def _followed_part(
+    images: Tensor, starts: Array, curve: OffsetCurve, rows: RowTiming, options: FollowOptions
+) -> list[list[_Judged]]:
+    """Each axis at each of T frames (T, H, W) with their starts in s."""
+    number, height = images.shape[:2]
+    tones: Sequence[ChangingTones] = changing_tones(curve, starts, rows, _BANDS)
+    rows = replace(rows, frame_start_times=None)
     ends = starts + (height - 1) * rows.row_time + rows.exposure_time
-    tones: Sequence[ChangingTones] = changing_tones(stack, _BANDS)
-    best: tuple[int, list[list[_Judged]], list[list[tuple[Reason, ...]]]] = (-1, [], [])
+    best: tuple[int, list[list[_Judged]]] = (-1, [])
     for last in (False, True):
         # 1. Both trackers. Backwards, a frame begins with the end of its last row.
         step = steps(2 * number, "frames")
@@ -150,24 +193,26 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
             for known, one, frequency in zip(tones, found, missing, strict=True)
         ]
         # 3. What both trackers agree on, at each frame and axis.
-        at_frames = [
-            (_at_frame(first, start, start, rows, height, 1), _at_frame(second, start, end, rows, height, -1))
-            for first, second, start, end in zip(forwards, backwards, starts, ends, strict=True)
-        ]
+        both_trackers: Iterable[list[_AtFrame | None]] = (
+            [
+                None if one is None else _at_frame(one, _frequencies(tones), start, origin, rows, height, sign)
+                for one, start, origin in zip(tracked, starts, origins, strict=True)
+            ]
+            for tracked, origins, sign in ((forwards, starts, 1), (backwards, ends, -1))
+        )
         judged = [
             [_judged([one for one in both if one is not None], axis, others[axis]) for axis in range(2)]
-            for both in at_frames
+            for both in zip(*map(_with_stds_of_neighbours, both_trackers), strict=True)
         ]
-        findings = _with_reasons_of_axes([[against for _, against in of_frame] for of_frame in judged])
-        reliable = sum(not of_axis for of_frame in findings for of_axis in of_frame)
+        judged = _with_reasons_of_axes(judged)
+        reliable = sum(not against for of_frame in judged for _, against in of_frame)
         if reliable > best[0]:
-            best = (reliable, judged, findings)
+            best = (reliable, judged)
         # 4. Once more, with the tones that are missing.
         if last or missing == [None, None]:
             break
         tones = [known if one is None else other for known, other, one in zip(tones, found, missing, strict=True)]
-    _, judged, findings = best
-    return _assembled([[one for one, _ in of_frame] for of_frame in judged], findings, starts, stack)
+    return best[1]
 
 
 def _reversed(tones: Sequence[ChangingTones]) -> list[ChangingTones]:
@@ -201,14 +246,13 @@ def _tracked(
 
 
 def _at_frame(
-    tones: TrackedTones | None, start: float, origin: float, rows: RowTiming, height: int, direction: int
-) -> _AtFrame | None:
+    tones: TrackedTones, frequencies: Array, start: float, origin: float, rows: RowTiming, height: int, direction: int
+) -> _AtFrame:
     """Both axes at a frame that starts at ``start`` in s, from tones with the time origin ``origin``.
 
+    Each tone has the place of the nearest one of ``frequencies`` (2, K) in Hz.
     ``direction`` is -1 for tones backwards in time: sin(-2 pi f t + phi) = sin(2 pi f t + pi - phi).
     """
-    if tones is None:
-        return None
     vibrations, stds_of_fit = vibration_at_frame(tones.fit, rows, height)
     vibration, std = vibrations[0], stds_of_fit[0]
     if direction < 0:
@@ -219,19 +263,68 @@ def _at_frame(
             image_motion=-signs * vibration.image_motion,
             image_acceleration=signs * vibration.image_acceleration,
         )
-    vibration = vibration.timed_from(-origin)
+    vibration = vibration.timed_from(start - origin)
     exposures = table(rows.row_starts(1, height)[0, ::8])
-    known = displacement_std(tones.fit, exposures, rows.exposure_time)[0]
-    phase_std = torch.hypot(std.phase, 2 * math.pi * origin * std.frequency)
-    std = replace(std, phase=phase_std, displacement=tensor(known))
+    known = displacement_std_at_frame(tones.fit, tones.growth, rows, height)
     residual = np.nanmean(np.abs(residual_of(tones.measurements, tones.fit)[0]), (0, 1))
     without_drift = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
-    moved = table(without_drift.mean_displacement(start + tensor(exposures), rows.exposure_time))
-    return _AtFrame(vibration, std, known, residual, tones.findings, moved - moved.mean(0))
+    moved = table(without_drift.mean_displacement(tensor(exposures), rows.exposure_time))
+    order = [
+        linear_sum_assignment(np.abs(np.subtract.outer(of_record, found)))[1]
+        for of_record, found in zip(frequencies, table(vibration.frequency), strict=True)
+    ]
+    places = torch.from_numpy(np.array(order))
+    values, stds = (
+        {name: getattr(of, name).gather(-1, places) for name in of_tones} | {name: getattr(of, name) for name in _DRIFT}
+        for of, of_tones in ((vibration, _TONE), (std, (*_TONE, "period")))
+    )
+    stds["displacement"] = tensor(known)
+    return _AtFrame(values, stds, known, residual, tones.findings, moved - moved.mean(0))
+
+
+def _with_stds_of_neighbours(found: Sequence[_AtFrame | None]) -> list[_AtFrame | None]:
+    """The frames of one tracker with the mean standard deviations of the five frames around each.
+
+    They change with the process noise that is the most probable at a frame, by up to ten times, the errors do not.
+    """
+    averaged: list[_AtFrame | None] = []
+    for index, one in enumerate(found):
+        around = [other.std for other in found[max(index - 2, 0) : index + 3] if one and other]
+        stds = {name: torch.stack([std[name] for std in around]).mean(0) for name in _STDS if around}
+        averaged.append(one and replace(one, std=stds))
+    return averaged
+
+
+def _mean(both: Sequence[_AtFrame], axis: int) -> _AtFrame:
+    """The mean of what both trackers know of an axis, with weights by the variances of its displacement.
+
+    What changes is late forwards in time and early backwards: of tones that sweep by 3 Hz/s, frequencies of one tracker
+    were wrong by up to 13 standard deviations. The frame itself is known to both, so that their errors do not average
+    out: standard deviations are those of equal errors, and of a choice between two values.
+    """
+    variance, other = (float(one.std["displacement"][axis]) ** 2 for one in both)
+    share = other / (variance + other)  # of the first
+
+    def mean(values: Tensor, others: Tensor) -> Tensor:
+        return share * values + (1 - share) * others
+
+    def std(name: str, apart: Tensor) -> Tensor:
+        return torch.hypot(mean(*(one.std[name] for one in both)), math.sqrt(share * (1 - share)) * apart)
+
+    before, after = (one.values for one in both)
+    apart = {name: after[name] - before[name] for name in before}
+    apart["phase"] = torch.remainder(apart["phase"] + math.pi, 2 * math.pi) - math.pi
+    apart["displacement"] = tensor(both[1].moved - both[0].moved).square().mean(0).sqrt()
+    values = {name: mean(before[name], after[name]) for name in before}
+    tones = mean(*(torch.polar(one["amplitude"], one["phase"]) for one in (before, after)))
+    values |= {"amplitude": tones.abs(), "phase": tones.angle()}
+    apart["period"] = apart["frequency"] / values["frequency"].clamp(min=1e-9).square()
+    stds = {name: std(name, difference) for name, difference in apart.items()}
+    return replace(both[0], values=values, std=stds, residual=0.5 * (both[0].residual + both[1].residual))
 
 
 def _judged(known: Sequence[_AtFrame], axis: int, other: float | None) -> _Judged:
-    """An axis at a frame by the tracker that knows its displacement better, and the reasons against it."""
+    """What is known of an axis at a frame from one or both trackers, and the reasons against it."""
     name = AXIS_NAMES[axis]
     if not known:
         return None, (Reason("not_followed", name),)
@@ -247,44 +340,51 @@ def _judged(known: Sequence[_AtFrame], axis: int, other: float | None) -> _Judge
         apart = float(np.sqrt(np.square(second - first).mean()))
         if not apart < allowed:
             return best, (Reason("directions_differ", name, apart, allowed),)
+        if all(one.code in _UNCERTAIN for one in (*known[0].findings[axis], *known[1].findings[axis])):
+            best = _mean(known, axis)
     return best, () if other is None else (Reason("other_tone", name, details={"frequency": other}),)
 
 
-def _with_reasons_of_axes(findings: Sequence[Sequence[tuple[Reason, ...]]]) -> list[list[tuple[Reason, ...]]]:
-    """The reasons at each frame, and those against an axis whose rows contradict the tones in too many frames."""
+def _with_reasons_of_axes(judged: list[list[_Judged]]) -> list[list[_Judged]]:
+    """The axes with a reason against all frames if rows contradict the tones in too many of them."""
     refused: list[tuple[Reason, ...]] = []
     for axis, name in enumerate(AXIS_NAMES[:2]):
-        share = sum(any(one.code in _CONTRADICTED for one in of_frame[axis]) for of_frame in findings) / len(findings)
-        reason = Reason("tones_contradicted", name, share, _MAX_CONTRADICTED)
-        refused.append((reason,) if share > _MAX_CONTRADICTED else ())
-    return [[of_axis or of_all for of_axis, of_all in zip(of_frame, refused, strict=True)] for of_frame in findings]
+        contradicted = [any(one.code in _CONTRADICTED for one in of_frame[axis][1]) for of_frame in judged]
+        reason = Reason("tones_contradicted", name, sum(contradicted) / len(judged), _MAX_CONTRADICTED)
+        refused.append((reason,) if sum(contradicted) > _MAX_CONTRADICTED * len(judged) else ())
+    return [
+        [(known, against or of_all) for (known, against), of_all in zip(of_frame, refused, strict=True)]
+        for of_frame in judged
+    ]
 
 
-def _assembled(
-    found: Sequence[Sequence[_AtFrame | None]],
-    findings: Sequence[Sequence[tuple[Reason, ...]]],
-    starts: Array,
-    stack: GreyFrames,
-) -> FollowedVibration:
-    """The result in image axes, from each frame and axis that is known."""
+def _assembled(judged: Sequence[Sequence[_Judged]], starts: Array, stack: GreyFrames) -> FollowedVibration:
+    """The result in image axes, from what is known of each axis at each frame."""
     timing = stack.timing
+    found = [[known for known, _ in of_frame] for of_frame in judged]
+    findings = [tuple(against for _, against in of_frame) for of_frame in judged]
     known = [(index, axis, one) for index, pair in enumerate(found) for axis, one in enumerate(pair) if one is not None]
-    count = max([1, *(one.vibration.amplitude.shape[-1] for _, _, one in known)])
+    count = max([1, *(one.values["amplitude"].shape[-1] for _, _, one in known)])
 
-    def of_axes(part: str, name: str, unknown: float) -> Tensor:
-        """(T, 2, K) values of tones, padded with zeros, or (T, 2) others."""
+    def of_axes(name: str, *, std: bool = False) -> Tensor:
+        """(T, 2, K) values of tones, padded with zeros, or (T, 2) others, or their standard deviations."""
         shape = (count,) if name in (*_TONE, "period") else ()
+        unknown = math.inf if std else 0.0
         values = torch.full((len(found), 2, *shape), unknown, dtype=torch.float64, device="cpu")
         for index, axis, one in known:
-            given = getattr(getattr(one, part), name)[axis]
+            given = (one.std if std else one.values)[name][axis]
             values[index, axis] = functional.pad(given, (0, count - len(given))) if shape else given
         return values
 
-    amplitude, frequency, phase = (of_axes("vibration", name, 0.0) for name in _TONE)
-    speed, acceleration = (of_axes("vibration", name, 0.0) for name in _DRIFT)
-    vibration = Vibration(amplitude, frequency, phase, speed, acceleration).from_row_order(timing)
-    of_std = ("amplitude", "frequency", "period", "phase", *_DRIFT, "displacement")
-    std = VibrationStd(*(of_axes("std", name, math.inf) for name in of_std))
+    amplitude = of_axes("amplitude")
+    order = torch.argsort(-amplitude, dim=-1, stable=True)  # that of the tones of a Vibration
+    amplitude, frequency, phase = (of_axes(name).gather(-1, order) for name in _TONE)
+    speed, acceleration = (of_axes(name) for name in _DRIFT)
+    origins = tensor(starts)  # of the frames; that of the stack is 0
+    vibration = Vibration(amplitude, frequency, phase, speed, acceleration).timed_from(-origins).from_row_order(timing)
+    stds = {name: of_axes(name, std=True) for name in _STDS}
+    std = VibrationStd(**stds | {name: stds[name].gather(-1, order) for name in (*_TONE, "period")})
+    std = replace(std, phase=torch.hypot(std.phase, 2 * math.pi * origins[:, None, None] * std.frequency))
     reliable = torch.tensor([[not of_axis for of_axis in of_frame] for of_frame in findings], device="cpu")
     residual = torch.full((len(found), 2), math.nan, dtype=torch.float64, device="cpu")
     for index, axis, one in known:

@@ -242,6 +242,11 @@ class ToneFilter:
         real, imaginary = variance[:, ::4], variance[:, 1::4]
         return float(np.sqrt(np.maximum((0.5 * (real + imaginary)).sum(-1), 0.0).max()))
 
+    def growth(self) -> Array:
+        """(A, K) 1/s, growth of the tones, the mean of all filters."""
+        values, _ = self._moments(self.probability[..., None])
+        return values[:, 0, 2:-2:4]
+
     def as_fit(self, origin: float) -> ToneFit:
         """The mean of all filters as a fit whose time origin is ``origin`` in s; the growth is left out."""
         values, covariance = (part[:, 0] for part in self._moments(self.probability[..., None]))

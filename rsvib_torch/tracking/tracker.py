@@ -36,7 +36,6 @@ from rsvib_torch.detection.tones.fit import (
     MIN_GAIN,
     MotionModel,
     ToneFit,
-    displacement_std,
     motion_of_fit,
     offset_gain,
     tone_displacements,
@@ -60,8 +59,9 @@ from rsvib_torch.registration.gradients import RowGradients
 from rsvib_torch.registration.register import fits_frame
 from rsvib_torch.registration.row_spectra import RowSpectra
 from rsvib_torch.restoration.restore import METHODS
+from rsvib_torch.results.reason import Reason
 from rsvib_torch.tracking.tone_filter import ToneFilter
-from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState
+from rsvib_torch.tracking.tracked_frame import TrackedFrame, TrackedTones, TrackingState, displacement_std_at_frame
 
 _MAX_PREDICTED_STD = 0.5  # px; the gradients of rows reach a few tenths of a pixel, and there are several rounds
 _MAX_UNMEASURED_STD = 0.1  # px; paths of hand-held cameras are predicted within 0.25 px, with 1 px within 0.6 px
@@ -324,7 +324,8 @@ class VibrationTracker:
         # 4. Judge the tones by the rows. Rows far from where the motion places them are not measured correctly.
         residual = measurements.displacements - by_tones - by_drift
         other = OtherMotion.of(measurements, by_tones, residual, scene.differential)
-        fit = corrected.predicted(frame.time + self._rows.time_to_middle(height), mixed=False).as_fit(frame.time)
+        at_middle = corrected.predicted(frame.time + self._rows.time_to_middle(height), mixed=False)
+        fit, growth = at_middle.as_fit(frame.time), at_middle.growth()
         if not (other.unexplained.max() < _MAX_UNEXPLAINED and _is_possible(fit, size, seconds)):
             return state.without_track("the rows are far from where the motion places them")
         aliasing = table(scene.gradients.aliasing)
@@ -332,7 +333,7 @@ class VibrationTracker:
             fit, aliasing, other.unexplained, np.diff(starts), self._rows.exposure_time, known=0
         )
         measurements = replace(measurements, exposure_starts=measurements.exposure_starts + (centre - frame.time))
-        tones = self._judged(frame, fit, measurements, other)
+        tones = self._judged(frame, fit, growth, measurements, other)
         trusted = np.array([not against for against in tones.findings])
         # an axis whose rows are far from its tones is not moved until these are reliable again
         lost = ~trusted & (other.unexplained[0] > _MAX_LEFT * np.sqrt(np.square(by_tones).mean((0, 1, 2))))
@@ -343,14 +344,14 @@ class VibrationTracker:
         return replace(state, track=track, contradictions=0, attempts=0)
 
     def _judged(
-        self, frame: _GreyFrame, fit: ToneFit, measurements: Measurements, other_motion: OtherMotion
+        self, frame: _GreyFrame, fit: ToneFit, growth: Array, measurements: Measurements, other_motion: OtherMotion
     ) -> TrackedTones:
         """The tones of a frame, whose first row is the time origin, with the verdict of its rows."""
         exposure_time = self._rows.exposure_time
         # Displacement of the rows of the frame by the tones, and its standard deviation.
         vibration, std = vibration_of_fit(fit)
         starts = table(self._rows.row_starts(1, frame.images.shape[-2])[0, ::8])
-        known_std = displacement_std(fit, starts, exposure_time)
+        known_std = displacement_std_at_frame(fit, growth, self._rows, frame.images.shape[-2])[None]
         (findings,) = judged(
             vibration,
             replace(std, displacement=tensor(known_std)),
@@ -361,9 +362,12 @@ class VibrationTracker:
             timing=self._rows,
             max_tones=MAX_TONES,
         )
-        # the tones are followed already
-        findings = tuple(with_remedy(of_axis, "use frames at shorter intervals") for of_axis in findings)
-        return TrackedTones(frame.time, fit, measurements, findings)
+        # the tones are followed already, and some may have ended
+        findings = tuple(
+            with_remedy(_of_present_tones(of_axis, tones), "use frames at shorter intervals")
+            for of_axis, tones in zip(findings, fit.active[0].sum(-1), strict=True)
+        )
+        return TrackedTones(frame.time, fit, growth, measurements, findings)
 
     def _predicted(self, state: TrackerState) -> TrackerState | None:
         """The state with predicted tones of the last frame; None if the frame must be measured.
@@ -552,6 +556,15 @@ def _plausible(found: Attempt) -> Tensor:
     strongest = amplitude == amplitude.amax(-1, keepdim=True)
     plausible = (amplitude > MIN_SIGNIFICANCE * std) | (strongest & (amplitude > std))
     return plausible & (vibration.gain(found.interval).abs() > MIN_GAIN)  # blind tones may have any amplitude
+
+
+def _of_present_tones(reasons: tuple[Reason, ...], tones: int) -> tuple[Reason, ...]:
+    """The reasons against an axis without those against tones that have ended beside others of its ``tones``.
+
+    Where one of two tones stops, no later frame would be reliable.
+    """
+    ended = [one.code == "tone_too_small" for one in reasons]
+    return reasons if sum(ended) == tones else tuple(one for one in reasons if one.code != "tone_too_small")
 
 
 def _end_of_line(places: tuple[tuple[float, Tensor], ...]) -> Tensor:

@@ -73,13 +73,40 @@ def test_each_frame_has_the_vibration_at_its_time(place):
     assert found.vibration.amplitude.shape == (FRAMES, 2, 1)
     errors, reliable = errors_of(found, 0.0), found.reliable.numpy()
     assert (reliable & (errors < 0.01)).all(1).sum() >= 36
-    assert not (reliable & (errors > np.maximum(5 * found.std.displacement.numpy(), 0.01))).any()
+    assert not (reliable & (errors > 3 * found.std.displacement.numpy())).any()
     table = found.table()
     assert len(table["axis"]) == 2 * FRAMES
     assert table["middle_time_s"][-1] == pytest.approx(39 * TIMING.frame_period + 0.5 * (127e-4 + 1.2e-3))
     restored = rsv.restore(frames, TIMING, found, method="dewarp").numpy()
     assert min(decibel(restored[index], STILL) - decibel(frames[index], STILL) for index in range(0, 30, 5)) > 4
     refuses(lambda: rsv.restore(frames[:8], TIMING, found), "pass the frames that it was detected in")
+
+
+def test_the_frames_before_a_vibration_stops_are_restored(tmp_path):
+    """It stops in the middle of a frame, whose rows no tones explain; the frames behind are at rest."""
+    stop = 11.3 * TIMING.frame_period
+    frames = take_frames(SCENE, TIMING, Curve(lambda t: decaying(t) * (t < stop)[..., None]), 20, noise=0.003)
+    np.save(tmp_path / "frames.npy", frames.astype(np.float32))
+    follow(tmp_path, tmp_path / "out.npy")
+    restored = np.load(tmp_path / "out.npy")
+    assert min(decibel(restored[index], STILL) - decibel(frames[index], STILL) for index in range(11)) > 5
+    np.testing.assert_array_equal(restored[12:], frames[12:].astype(np.float32))
+    found = rsv.follow_vibration(frames, TIMING)
+    assert found.reliable.sum(0).tolist() == [11, 11]
+    assert [one.code for one in found.findings[15][0]] == ["no_tone"]
+
+
+def test_frequencies_of_a_sweep_are_within_their_standard_deviations():
+    """A tracker is late; the one that runs backwards is early."""
+    start, rate = np.array([31.0, 52.0]), 1.5  # Hz, Hz/s
+    turned = Curve(lambda t: AMPLITUDE * np.sin(2 * np.pi * (start + 0.5 * rate * t[..., None]) * t[..., None] + PHASE))
+    found = rsv.follow_vibration(take_frames(SCENE, TIMING, turned, 30, noise=0.003), TIMING)
+    frequency = start + rate * (np.arange(30)[:, None] * TIMING.frame_period + 64e-4)
+    z = (found.vibration.frequency[..., 0].numpy() - frequency) / found.std.frequency[..., 0].numpy()
+    z = z[found.reliable.numpy()]
+    assert len(z) > 40
+    assert np.abs(z).max() < 3
+    assert 0.2 < np.sqrt(np.square(z).mean()) < 1.2
 
 
 def test_a_batch_of_stacks_read_from_below_is_followed(place):

@@ -165,6 +165,21 @@ def test_the_number_of_tones_changes():
     assert 2 <= sum(one.detected for one in tracked) <= 3
 
 
+def test_an_axis_is_reliable_after_one_of_its_tones_has_ended():
+    """The tone that has ended is too small in every later frame, which is no reason against the other one."""
+    end = 12 / RATE
+
+    @dataclass(frozen=True)
+    class Ending(Sines):
+        def displacement(self, times):
+            further = (1.1 * np.sin(2 * np.pi * 98.0 * times)) * (times < end)
+            return super().displacement(times) + np.stack([further, 0 * times], -1)
+
+    *_, last = track(taken(Ending(), 24))
+    assert last.detection.reliable.tolist() == [True, True]
+    assert np.abs(errors(last.detection)).max() < 0.02
+
+
 def test_a_camera_at_rest_needs_no_further_detection():
     tracked = track(taken(Sines(amplitude=lambda t: (0 * t, 0 * t)), 14))
     assert [one.detected for one in tracked] == [index == 3 for index in range(14)]
