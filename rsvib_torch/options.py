@@ -48,7 +48,6 @@ MotionUnit = Literal["px", "rad", "mrad", "urad", "deg", "arcsec", "rad/s", "deg
 PriorName = Literal["gaussian", "edges"]
 Registration = Literal["projection", "ncc", "phase"]
 RestorationName = Literal["exact", "banded", "dewarp", "richardson-lucy"]
-AccelerationUnit = Literal["g", "m/s2"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 Columns = Annotated[int, Field(ge=64, le=2**31)]  # px; narrower bands are often registered wrongly

@@ -18,7 +18,7 @@ LAYERS: tuple[dict[str, str], ...] = (
         "augmentation": "training data for Kornia pipelines",
         "datasets": "drawn scenes and example frames",
     },
-    {"gyroscope": "recorded motions: files, alignment of clock and axes with frames, comparison (accelerometer.py)"},
+    {"gyroscope": "recorded motions: files, alignment of clock and axes with frames"},
     {
         "detection": "detect.py: frames → motion, standard deviations, verdict",
         "restoration": "restore.py: frames and motion → frames, verdict; one file per method",

@@ -29,7 +29,6 @@ _COMMANDS: dict[str, Callable[..., Answer]] = {  # in the order of the help
     "report": stack_commands.report,
     "motion": motion_commands.motion,
     "known": motion_commands.known,
-    "compare": motion_commands.compare,
     "calibrate": motion_commands.calibrate,
     "live": live_session,
     "export": export,
@@ -56,8 +55,6 @@ _EXAMPLES = """
         --motion gyroscope.csv --unit rad/s --focal-length 1800
   rsvib known frames.tif restored.tif --config camera.toml \\
         --motion motion.csv --unit px --offset 0
-  rsvib compare found/vibration.json accelerometer.csv --unit g \\
-        --pixel-size 12.5um --out both.png
   rsvib calibrate led.mp4 --frequency 1000 --frame-rate 29.97 \\
         --out camera.toml
   rsvib calibrate long.png short.png --exposure 0.001 --exposure 0.00025

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import rsvib_torch
 from rsvib_torch import detection, gyroscope, io, row_time, stacks
-from rsvib_torch import motion as recordings
 from rsvib_torch import report as reports
 from rsvib_torch.checks.validation import options
 from rsvib_torch.commands import answers
@@ -19,7 +18,7 @@ from rsvib_torch.commands.stack_commands import load, print_notes
 from rsvib_torch.commands.terminal import Answer, note, warn, working
 from rsvib_torch.files.atomic import check_writable, whole_file
 from rsvib_torch.files.reading import Table
-from rsvib_torch.options import AccelerationUnit, FreeMotionOptions, MotionUnit, ProcessStackOptions, TimeUnit
+from rsvib_torch.options import FreeMotionOptions, MotionUnit, ProcessStackOptions, TimeUnit
 from rsvib_torch.text import measured_text
 
 if TYPE_CHECKING:
@@ -257,55 +256,6 @@ def _check_motion(
     else:
         _refuse(given, check.reasons)
     return check
-
-
-@options
-class CompareOptions(shared.PixelSizeOptions):
-    """Options of ``compare``."""
-
-    vibration: Path = argument()
-    """The vibration.json written by detect or run."""
-    record: Path = argument()
-    """CSV file with the columns time, x (right) and y (down), evenly sampled."""
-    unit: AccelerationUnit = option(...)
-    """Unit of x and y."""
-    out: Path | None = None
-    """Picture of both to write (PNG, SVG, PDF)."""
-    offset: float | None = option(None, show_default="that at which both resemble each other most")
-    """Time of the accelerometer, in s, at the exposure start of the first row of frame 0."""
-    offsets: tuple[float, float] | None = option(None, metavar="LOW HIGH", show_default="all that cover the frames")
-    """Smallest and largest offset to try."""
-    time_unit: TimeUnit = "s"
-    """Unit of the times."""
-    flip_x: bool = False
-    """Positive x is to the left of the image, or the accelerometer is on the camera."""
-    flip_y: bool = False
-    """Positive y is upwards in the image, or the accelerometer is on the camera."""
-    overwrite: bool = False
-    """Replace results that exist already."""
-
-
-def compare(given: CompareOptions) -> Answer:
-    """Compare a detected vibration with an accelerometer.
-
-    Frequency, ratio of the amplitudes and phase of each tone, and the offset of the clocks. The ratio is the size of a
-    pixel on the object, which --pixel-size states for comparison.
-    """
-    if given.out is not None:
-        shared.check_new([given.out], given.overwrite, [given.vibration, given.record])
-        check_writable(given.out)
-    signs = (-1.0 if given.flip_x else 1.0, -1.0 if given.flip_y else 1.0)
-    times, acceleration = recordings.read_acceleration(given.record, given.unit, given.time_unit, signs)
-    found = detection.DetectionResult.load(given.vibration)
-    with working("comparing"):
-        result = gyroscope.compare_accelerometer(
-            found, times, acceleration, pixel_size=given.pixel_size, offset=given.offset, offsets=given.offsets
-        )
-        if given.out is not None:
-            result.plot(given.out)
-    files = [] if given.out is None else [given.out]
-    title = f"{given.vibration} and {given.record}"
-    return Answer({title: [result.summary()]}, {"comparison": _without_curve(result)}, files)
 
 
 # Frames that are measured. With a flickering light, 30 of 1080 rows take 25 s. With --by-motion, 10 of 640 x 360 px

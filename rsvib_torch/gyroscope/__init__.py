@@ -1,4 +1,4 @@
-"""Motions recorded by gyroscopes and accelerometers: files, alignment of clocks and axes, checks."""
+"""Motions recorded by gyroscopes: files, alignment of clocks and axes, checks."""
 
 import lazy_loader
 

@@ -14,7 +14,7 @@ from rsvib_torch.checks.values import check_number
 from rsvib_torch.files.number_table import rows_of_numbers, text_lines
 from rsvib_torch.files.reading import check_regular
 from rsvib_torch.motion.spline import FreeMotion
-from rsvib_torch.options import AccelerationUnit, MotionUnit, TimeUnit
+from rsvib_torch.options import MotionUnit, TimeUnit
 from rsvib_torch.text import one_line
 
 _RADIANS = {
@@ -26,9 +26,9 @@ _RADIANS = {
     "rad/s": 1.0,
     "deg/s": math.pi / 180,
 }
-STANDARD_GRAVITY = 9.80665  # m/s^2
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _COLUMNS = ("time", "x", "y")
+_LEAST_SAMPLES = 4  # of a cubic spline
 
 Array = NDArray[np.float64]
 
@@ -91,18 +91,8 @@ def read_motion(
     return FreeMotion.from_samples(torch.from_numpy(times), torch.from_numpy(displacement), spacing=spacing)
 
 
-def read_acceleration(
-    path: Path, unit: AccelerationUnit, time_unit: TimeUnit = "s", signs: tuple[float, float] = (1.0, 1.0)
-) -> tuple[Array, Array]:
-    """Times (N,) in s and acceleration (N, 2) in m/s^2 from a CSV file with the columns ``time``, ``x`` and ``y``."""
-    times, values = _table(path)
-    times = times * SECONDS[time_unit]
-    check_times(path, times, time_unit)
-    return times, values * np.asarray(signs) * (STANDARD_GRAVITY if unit == "g" else 1.0)
-
-
-def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
-    """Times (N,) and values (N, 2) of a file; a cubic spline requires at least 4 samples."""
+def _table(path: Path) -> tuple[Array, Array]:
+    """Times (N,) and values (N, 2) of a file."""
     check_regular(path)
     with path.open(newline="", encoding="utf-8-sig") as file:
         try:
@@ -116,8 +106,8 @@ def _table(path: Path, least_samples: int = 4) -> tuple[Array, Array]:
             table = rows_of_numbers(path, lines, names, [names.index(name) for name in _COLUMNS], 2)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{path}: not a CSV file: {error}") from error
-    if len(table) < least_samples:
-        raise ValueError(f"{path}: {len(table)} samples; at least {least_samples} are required")
+    if len(table) < _LEAST_SAMPLES:
+        raise ValueError(f"{path}: {len(table)} samples; at least {_LEAST_SAMPLES} are required")
     return table[:, 0], table[:, 1:]
 
 

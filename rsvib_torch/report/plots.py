@@ -693,15 +693,6 @@ def _check_figure(result: gyroscope.MotionCheck) -> Figure:
     return _axes_figure(result.times, curves, labels, marker=".", linestyle="none")
 
 
-def _accelerometer_figure(result: gyroscope.AccelerometerComparison) -> Figure:
-    """Draw the acceleration of each axis by the accelerometer and by the frames, in the middle of the record."""
-    times, middle = result.times, 0.5 * (result.times[0] + result.times[-1])
-    shown = (times - middle).abs() < 4 / result.frequency.min()  # 8 periods of the slowest tone
-    curves = [(("accelerometer",) * 2, result.measured[shown], _GREY), (("frames",) * 2, result.predicted[shown], None)]
-    labels = ("time on the clock of the frames (ms)", "acceleration (m/s²)", "Along")
-    return _axes_figure(times[shown], curves, labels, linewidth=1.2)
-
-
 def _rotation_figure(result: gyroscope.RotationAlignment) -> Figure:
     """Draw X, Y and roll from frame to frame, measured in the images and by the gyroscope, and their differences."""
     figure, panels = _panels(8, 7.2, 3, sharex=True)
@@ -733,7 +724,6 @@ FIGURES.update(
         (gyroscope.ClockAlignment, 0): lambda result: motion_figure(result.motion),
         (gyroscope.RotationAlignment, 0): _rotation_figure,
         (gyroscope.MotionCheck, 0): _check_figure,
-        (gyroscope.AccelerometerComparison, 0): _accelerometer_figure,
         (Vibration, 0): motion_figure,
         (FreeMotion, 0): motion_figure,
         (MtfCurve, 0): lambda curve: mtf_figure(

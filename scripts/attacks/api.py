@@ -120,14 +120,11 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     figure = rsv.motion_figure(vibration)
     tracker = rsv.VibrationTracker(rsv.SensorTiming(1e-4, 6, 104), window=2)
     tracked = [tracker.update(frame) for frame in frames][-1]
-    tones = [torch.full((1,), 0.1, dtype=torch.float64)] * 8
-    record = (torch.tensor([True]), 5e-6, 1e-9, 0.0, 1e-6, (), times, path, path)
-    accelerometer = rsv.AccelerometerComparison(("x",), *tones, *record)
     camera = rsv.Camera(300.0, (3.0, -2.0), (-0.1, 0.02, 1e-3, -2e-3, 0.0))
     components = torch.zeros(2, 3, dtype=torch.float64)
     # values of the parameters of all functions and methods, by name
     pool: dict[str, Any] = {"frames": frames, "timing": timing, "vibration": vibration, "motion": recorded, **BANDS}
-    pool |= {"recorded": recorded, "acceleration": path, "offsets": (-0.001, 0.001), "camera": camera, "info": info}
+    pool |= {"recorded": recorded, "offsets": (-0.001, 0.001), "camera": camera, "info": info}
     pool |= {"manifest": manifest, "detected": detected, "detection": detected, "result": detected}
     pool |= {"restored": restored, "figure": figure, "psf": psf}
     pool |= {"scene": scene, "noise": sensor_noise, "image": image, "reference": image, "roi": edge, "rim": 4}
@@ -228,7 +225,7 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     result["RollingShutterVibration.drawn_vibration"] = call(augmentation.drawn_vibration)
     report = rsv.process_stack(stack, folder / "again.npy", timing, **windows)
     described = (detected.std, curve, optics, sensor_noise, slanted, info, report, verdict, calibration, camera)
-    described += (accelerometer, tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
+    described += (tracked, rsv.Margins(1, 2, 3, 4), rsv.restoration_mtf(frames, timing, vibration))
     described += (detected.spectrum(), rsv.CameraMode("A", "B", "", 1920, 1080, 30.0, 0.01, 1e-4, 3, "forward", 1080))
     of_frame = {one.name: getattr(detected, one.name) for one in fields(rsv.FollowedVibration) if one.name != "times"}
     described += (rsv.FollowedVibration(**of_frame, times=times[0]),)

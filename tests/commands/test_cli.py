@@ -314,7 +314,6 @@ def test_usage_errors(capsys, tmp_path):
     detect = ("detect", "f.tif", "--out", tmp_path)
     for arguments, message in (
         (("detect", "f.tif"), "Missing option '--out'"),
-        (("compare", "a.json", "b.csv"), "Missing option '--unit'. Choose from: g, m/s2"),
         ((*detect, "--exposure", "1ms"), "the camera is not described: give --row-time, --frame-rate, or --config"),
         ((*detect, "--row-time", "20um"), "expected a time such as 14.5us, 1/500 or 2e-5"),
         ((*detect, "--frame-rate", "fast"), "expected a number such as 29.97 or 30000/1001"),

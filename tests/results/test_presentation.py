@@ -200,7 +200,7 @@ def test_results_are_drawn(results, tmp_path):
         if name not in DRAWN:
             with pytest.raises(
                 TypeError,
-                match=r"has no figure; these have one: AccelerometerComparison, ClockAlignment, DetectionResult, D",
+                match=r"has no figure; these have one: ClockAlignment, DetectionResult, D",
             ):
                 result.plot(path)
         elif name in ("OffsetCurve", "Vibration") and result.batch_shape:
