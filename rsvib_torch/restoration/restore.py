@@ -179,6 +179,9 @@ def restore(
             _warn_if_worse(prepared, restored, motion, options.joint)
     if camera is not None:
         restored = sharpened(restored, camera, options.scale)
+    if left_alone and not bool((moves := vibration.moving_axes().any(-1)).all()):  # as such a stack alone
+        as_taken = _as_taken(prepared, options.joint, options.scale)
+        restored = torch.where(moves[:, None, None, None, None], restored, as_taken)
     return prepared.from_row_order(restored)
 
 

@@ -73,8 +73,10 @@ class ChangingTones:
         return self.coefficients @ hats * np.exp(2j * math.pi * self.frequencies * time), float(self.velocity @ hats)
 
 
-def moving_parts(curve: OffsetCurve) -> list[slice]:
-    """The runs of two and more frames that vibrate all the time, of a record whose vibration starts and stops suddenly.
+def moving_parts(curve: OffsetCurve) -> tuple[list[slice], Array]:
+    """Runs of two and more frames that vibrate all the time, where a vibration starts or stops suddenly.
+
+    The second result is (T,) bool, frames at rest.
 
     A tone that stops between two knots looks like further tones: of 12 frames with 2 px before 12 at rest, none was
     reliable.
@@ -87,13 +89,14 @@ def moving_parts(curve: OffsetCurve) -> list[slice]:
     level = np.sqrt(valid_mean(np.square(offsets - slope * centred[:, None]), 1)).max(-1)
     # 2. Pairs at rest beside which it changes suddenly. The frame before them and the one after may rest in part.
     least = max(_MIN_SIZE, _AT_REST * float(level.max()))
-    moves = np.ones(len(level) + 1, dtype=bool)
+    at_rest, moves = np.zeros(len(level) + 1, dtype=bool), np.ones(len(level) + 1, dtype=bool)
     for rest in _runs(level < least):
         beside = np.concatenate([level[max(rest.start - 2, 0) : rest.start], level[rest.stop : rest.stop + 2]])
         if beside.max(initial=0.0) > _SUDDEN * least:
+            at_rest[rest.start : rest.stop + 1] = True
             moves[max(rest.start - 1, 0) : rest.stop + 2] = False
     # 3. The runs between them.
-    return [run for run in _runs(moves) if run.stop - run.start > 1]
+    return [run for run in _runs(moves) if run.stop - run.start > 1], at_rest
 
 
 def _runs(values: Array) -> list[slice]:

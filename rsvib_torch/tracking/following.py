@@ -146,12 +146,14 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
     against = scene_reasons(curve, stack.images.shape[-1])[0]
     if against:
         raise ValueError(str(against[0]))
-    number = stack.images.shape[1]
-    starts = table(rows.frame_starts(number))
+    starts = table(rows.frame_starts(stack.images.shape[1]))
     images = stack.images[0] if stack.valid is None else stack.images[0].masked_fill(~stack.valid[0], math.nan)
-    at_rest: list[_Judged] = [(None, (Reason("no_tone", name),)) for name in AXIS_NAMES[:2]]
-    judged: list[list[_Judged]] = [at_rest] * number
-    for part in moving_parts(curve):
+    parts, at_rest = moving_parts(curve)
+    judged: list[list[_Judged]] = [
+        [(None, (Reason("no_tone" if rests else "not_followed", name),)) for name in AXIS_NAMES[:2]]
+        for rests in at_rest
+    ]
+    for part in parts:
         judged[part] = _followed_part(images[part], starts[part], _of_pairs(curve, part), rows, options)
     return _assembled(judged, starts, stack)
 

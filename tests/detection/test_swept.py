@@ -113,6 +113,19 @@ def test_aliases_are_tried_and_blind_tones_refused(rate, hertz, codes):
         assert found.frequency[axis].item() == pytest.approx(hertz[axis], abs=0.01)
 
 
+def test_a_tone_that_sweeps_through_a_blind_frequency_is_known(scene):
+    """Its frequency is twice the frame rate in the middle of the record, and 1.8 and 2.2 times at the ends."""
+    rate, count = NEAR_BLIND.frame_rate, 8
+    start, chirp = 1.8 * rate, 0.4 * rate**2 / count
+    frames = take_frames(
+        scene[: 192 + 2 * MARGIN, : 128 + 2 * MARGIN], NEAR_BLIND, tone(1.3, start, chirp=chirp), count, 0.004
+    )
+    found = rsv.detect_swept_tone(frames, NEAR_BLIND)
+    assert found.reliable.all()
+    for name, true in (("amplitude", 1.3), ("frequency", start), ("chirp", chirp)):
+        assert ((getattr(found, name) - true).abs() < 4 * found.std[name] + 0.002 * true).all(), name
+
+
 @pytest.mark.parametrize("contrast", [0.02, 0.3])  # of the scene; without the check 4.20 ± 0.08 px for 0.02
 def test_noise_that_hides_the_scene_is_refused(scene, contrast):
     flat = 0.5 + contrast * (torch.from_numpy(take_frames(scene, TIMING, tone(0.5, 60.0), 3, 0.0)) - 0.5)

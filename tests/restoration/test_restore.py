@@ -149,6 +149,18 @@ def test_reliability_applies_to_each_stack_of_a_batch(scene_and_frames):
     torch.testing.assert_close(found[1, :, 0], only_y, rtol=0, atol=1e-6)
 
 
+def test_a_stack_of_a_batch_without_a_known_motion_is_left_as_taken(scene_and_frames):
+    """As alone; the method would remove its blur and noise."""
+    _, frames = scene_and_frames
+    both = Vibration.stacked([MOTION.vibration()] * 2)
+    of_second = ((True, True), (False, False)), (((), ()), (("blind",), ("blind",)))
+    uncertain = detection_of(both, reliable=of_second[0], reasons=of_second[1])
+    with pytest.warns(RestorationWarning, match="stack 1: x is not restored"):
+        found = restore(torch.stack([frames, frames])[:, :, None], TIMING, uncertain, check=False)
+    assert torch.equal(found[1, :, 0], frames)
+    assert not torch.equal(found[0, :, 0], frames)
+
+
 def test_warnings_are_issued_for_wrong_vibrations_only(scene_and_frames):
     _, frames = scene_and_frames
     vibration = MOTION.vibration()

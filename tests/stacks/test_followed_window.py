@@ -96,6 +96,18 @@ def test_the_frames_before_a_vibration_stops_are_restored(tmp_path):
     assert [one.code for one in found.findings[15][0]] == ["no_tone"]
 
 
+def test_a_frame_at_rest_contradicts_the_tones_of_the_others():
+    """The rows of seven frames outweigh those of the last one, which restoration would make worse by 20 dB."""
+    stop = 7 * TIMING.frame_period - 1e-3
+
+    def moved(times):
+        return AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * times[..., None] + PHASE) * (times < stop)[..., None]
+
+    found = rsv.detect_vibration(take_frames(SCENE, TIMING, Curve(moved), 8, noise=0.003), TIMING)
+    assert not found.reliable.any()
+    assert all("rows_unexplained" in [one.code for one in of_axis] for of_axis in found.findings)
+
+
 def test_frequencies_of_a_sweep_are_within_their_standard_deviations():
     """A tracker is late; the one that runs backwards is early."""
     start, rate = np.array([31.0, 52.0]), 1.5  # Hz, Hz/s

@@ -533,7 +533,10 @@ def _report(fitted: _Fitted, timing: SensorTiming, step: float) -> SweptTone:
         elif present and (other := fitted.others[axis]) is not None:
             details = {"frequency": float(other[2]), "decay": float(other[3])}
             against.append(Reason("other_swept_tone", name, details=details))
-        gain = float(offset_gain(np.abs([float(fit[2])]), fitted.intervals)[0])
+        # of the pairs of frames: a sweep passes through blind frequencies
+        between = np.cumsum(fitted.intervals) - 0.5 * (fitted.intervals + fitted.intervals.sum())
+        frequencies = np.abs(float(fit[2]) + float(fit[4]) * between)
+        gain = float(np.sqrt(np.square(offset_gain(frequencies, fitted.intervals[:, None])).mean()))
         if present and gain < MIN_GAIN:
             against.append(Reason("tone_blind", name, gain, MIN_GAIN, {"frequency": float(fit[2])}))
         uncertain, size = float(fitted.uncertain[axis]), float(fitted.moved[axis])
