@@ -81,15 +81,19 @@ def grey_frames(
     if timed:
         prepared.timing.check_span(prepared.images.shape[1], prepared.images.shape[-2])
     images, valid = prepared.filled, None
+
+    def of_stack(index: int) -> str:
+        return f" of stack {index}" if prepared.batched else ""
+
     # registration needs measured pixels in every frame
     if prepared.missing is not None:
         valid = ~prepared.missing.any(2)
         fraction = valid.float().mean((-2, -1))
         if bool((fraction < min_valid_fraction).any()):
-            where = (fraction < min_valid_fraction).nonzero()[0].tolist()
+            stack, frame = (fraction < min_valid_fraction).nonzero()[0].tolist()
             raise ValueError(
-                f"frame {where[-1]} has only {fraction[*where]:.1%} of pixels with data, {min_valid_fraction:.0%} are "
-                "needed; mark fewer pixels by NaN or ignore"
+                f"frame {frame}{of_stack(stack)} has only {fraction[stack, frame]:.1%} of pixels with data, "
+                f"{min_valid_fraction:.0%} are needed; mark fewer pixels by NaN or ignore"
             )
         # single pixels are interpolated: the rows of a frame without one pixel in twenty could not be registered
         around = torch.nn.functional.avg_pool2d(valid.to(images.dtype), 3, 1, 1)
@@ -99,16 +103,18 @@ def grey_frames(
     if bool(constant.any()):
         constant = _constant(images)
         if bool(constant.any()):
-            raise ValueError(constant_frame(constant.nonzero()[0].tolist()[-1]))
+            stack, frame = constant.nonzero()[0].tolist()
+            raise ValueError(constant_frame(f"{frame}{of_stack(stack)}"))
     # a copy of a frame was exposed at another time than its place in the stack states
     repeated = _repeated(images[..., ::16, :])
     if bool(repeated.any()):
         repeated = _repeated(images)
         if bool(repeated.any()):
-            first = repeated.nonzero()[0].tolist()[-1]
+            stack, first = repeated.nonzero()[0].tolist()
             raise ValueError(
-                f"frames {first} and {first + 1} are identical: one of them is a copy (video converters repeat "
-                "frames), and its time is wrong; remove copies and state the times of the others in frame_start_times"
+                f"frames {first} and {first + 1}{of_stack(stack)} are identical: one of them is a copy (video "
+                "converters repeat frames), and its time is wrong; remove copies and state the times of the others in "
+                "frame_start_times"
             )
     # all channels show the same displacement; the pattern of a colour mosaic does not move with the scene
     images = images.mean(2) if images.shape[2] > 1 else without_mosaic(images[:, :, 0])
@@ -125,9 +131,9 @@ def without_mosaic(images: Tensor) -> Tensor:
     return torch.where(mosaic[:, None, None, None], mosaic_free(images), images)
 
 
-def constant_frame(index: int) -> str:
+def constant_frame(place: int | str) -> str:
     """Message for a frame whose pixels are equal."""
-    return f"frame {index} is constant and cannot be registered; remove this frame"
+    return f"frame {place} is constant and cannot be registered; remove this frame"
 
 
 def _constant(frames: Tensor) -> Tensor:

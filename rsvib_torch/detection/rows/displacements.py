@@ -411,16 +411,22 @@ def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, wei
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
     The gradients are those of all groups of B ``stacks``; sums are taken over ``rows`` rows. The weights of each
-    contrast are those of the parts.
+    contrast are those of the parts. Noise also scatters the mean, of which two standard deviations are subtracted: of
+    48 axes of pairs of 192 rows with noise of 0.025, 11 seemed to roll.
     """
-    excesses = []
+    found = []
     for of_group in gradients:
         residual, noise, regular = displacements_of_parts(of_group, rows, len(weights[0]))
         contrasts = residual.new_tensor(weights)
-        excess = ((contrasts @ residual).square() - contrasts.square() @ noise).sum(2)
-        excess = torch.where(regular[..., None], excess, torch.nan)
-        excesses.append(_of_stacks(excess, len(excess) // stacks))
-    return np.sqrt(np.maximum(trimmed_mean(table(torch.cat(excesses, 1))), 0.0))
+        variance = contrasts.square() @ noise
+        excess = ((contrasts @ residual).square() - variance).sum(2)
+        both = torch.cat([excess, 2 * variance.square().sum(2)], -1)  # and the variance of the excess
+        both = torch.where(regular[..., None], both, torch.nan)
+        found.append(_of_stacks(both, len(both) // stacks))
+    both_of_blocks = table(torch.cat(found, 1))
+    excess_of_stacks, variance_of_stacks = np.split(trimmed_mean(both_of_blocks), 2, -1)
+    count = np.maximum((~np.isnan(both_of_blocks[..., :2])).sum(1), 1)
+    return np.sqrt(np.maximum(excess_of_stacks - 2 * np.sqrt(variance_of_stacks / count), 0.0))
 
 
 def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:

@@ -82,7 +82,8 @@ class MotionDetection(
         displacement: (..., T, R, 2) px, the motion there, less its mean over the record.
         std: (..., T, R, 2) px, its standard deviation.
         std_seen: (..., 2) px, rms standard deviation of the visible component: the displacement of the rows that
-            contain one scene row, less its mean over the frames.
+            contain one scene row, less its mean over the frames. Of scene rows within eight rows of the rims, which are
+            not measured, errors are up to ten times larger; ``std`` contains them.
         unseen: (..., 2) px, rms standard deviation of that mean, the warp.
         unexplained: (..., 2) px, rms displacement of rows that the motion does not explain, beyond their noise.
         reliable: (..., 2) bool, whether the motion explains the measurements.
