@@ -1,11 +1,11 @@
 """Stated standard deviations compared with errors and with the Cramér-Rao bound, on simulated recordings.
 
 Seeds follow from the version. Every recording has a scene, motion and noise of its own. Tones have 0.3 to 4 px and 0.3
-to 5 times the frame rate, exposures 1 to 200 rows of 2048; roll and zoom 0.2 to 2 px at half the width. Free motions
-are random walks, smooth motions, sums of three tones, and single tones within 8 % of the frequency at which all frames
-have the same displacement; the error is that of the part of the motion that differs between frames, and of the whole
-motion. Row times from light have random row times and LED frequencies, in front of a plain wall, with 20 times the
-noise, of textured scenes in one frame, strong and weak, and in four frames.
+to 5 times the frame rate, exposures 1 to 200 rows of 2048; roll and zoom 0.2 to 2 px at half the width. Followed tones
+decay or sweep. Free motions are random walks, smooth motions, sums of three tones, and single tones within 8 % of the
+frequency at which all frames have the same displacement; the error is that of the part of the motion that differs
+between frames, and of the whole motion. Row times from light have random row times and LED frequencies, in front of a
+plain wall, with 20 times the noise, of textured scenes in one frame, strong and weak, and in four frames.
 
 Other kinds have one motion and another noise in every recording: tones of all axes, and row times from motion, relative
 to the true one.
@@ -55,6 +55,7 @@ FRAMES, ROWS, COLUMNS, NOISE, RIM = 5, 192, 160, 0.005, 12
 TONES = {"tone, 2 frames": 2, "tone, 4 frames": 4, "tone, 8 frames": 8}
 TURNS = {"roll, 4 frames": "roll", "zoom, 4 frames": "zoom"}
 TRACKED = "tracker, 12 frames"
+FOLLOWED = {"followed: decay, 16 frames": (3.0, 0.0), "followed: sweep, 16 frames": (0.0, 3.0)}  # largest 1/s, Hz/s
 FIXED = {  # amplitudes (px, px, rad, 1) and frequencies of the axes
     "amplitudes of 0.2 and 0.13 px": ((0.2, 0.13), (155.0, 155.0)),
     "no roll": ((3.0, 5.0), (90.0, 61.0)),
@@ -75,7 +76,7 @@ BY_MOTION: dict[str, tuple[Any, Any, Any, Any]] = {  # amplitudes, frequencies, 
     "row time by motion: smooth motion": (None, np.tile(np.linspace(0.5, 24.0, 50), (2, 1)), (0.4, 1.3), None),
     "row time by motion: random tones": (None, None, None, None),
 }
-KINDS = (*TONES, *TURNS, TRACKED, *FREE, *(f"row time: {kind}" for kind in CALIBRATIONS), *FIXED, *BY_MOTION)
+KINDS = (*TONES, *TURNS, TRACKED, *FOLLOWED, *FREE, *(f"row time: {kind}" for kind in CALIBRATIONS), *FIXED, *BY_MOTION)
 OPTIONS = {
     "bar_kinds": (KINDS, "error_bars: kinds of recordings", KINDS),
     "bar_recordings": (200, "error_bars: recordings of each kind"),
@@ -177,6 +178,34 @@ def tones(kind: str, number: int, size: int) -> Iterator[Error]:
             error = math.remainder(value - truth, 2 * math.pi) if quantity == "phase" else value - truth
             least = math.nan if bound is None else float(getattr(bound, quantity)[axis, 0])
             yield f"{name} {quantity}", error, std, least
+
+
+def followed(kind: str, number: int) -> Iterator[Error]:
+    """Errors at every fifth frame of a tone of each axis that decays or sweeps, and of the rows, rms over the rows."""
+    draw = generator_of(kind, number)
+    tone = np.concatenate([one_tone(draw, 0.5, 3.0) for _ in range(2)])
+    decay, sweep = (draw.uniform(0.1, 1, 2) * largest for largest in FOLLOWED[kind])
+
+    def moved(times: Array) -> Array:
+        turns = (tone[:, 1] * FRAME_PERIOD / TIMING.frame_period + 0.5 * sweep * times[..., None]) * times[..., None]
+        return tone[:, 0] * np.exp(-decay * times[..., None]) * np.sin(2 * np.pi * turns + tone[:, 2])
+
+    scene = draw_scene(ROWS + 80, COLUMNS + 80, int(draw.integers(1000)))
+    clean = take_frames(scene, TIMING, Curve(moved), 16, 0.0)
+    noisy = torch.from_numpy(clean + NOISE * draw.standard_normal(clean.shape)).float()
+    found = rsv.follow_vibration(noisy, TIMING)
+    moments = TIMING.row_starts(16, ROWS) + 0.5 * TIMING.exposure_time
+    for frame in range(0, 16, 5):
+        shown, middle = found.vibration[frame], float(moments[frame].mean())
+        left = shown.translation().displacement(moments[frame]).numpy() - moved(moments[frame].numpy())
+        true = {"amplitude": tone[:, 0] * np.exp(-decay * middle)}
+        true["frequency"] = tone[:, 1] * FRAME_PERIOD / TIMING.frame_period + sweep * middle
+        for axis in found.reliable[frame].nonzero()[:, 0].tolist():
+            for name, truth in true.items():
+                value, std = (float(getattr(part, name)[frame, axis, 0]) for part in (found.vibration, found.std))
+                yield f"x, y {name}", value - truth[axis], std, math.nan
+            size = float(rms((left - left.mean(0))[:, axis, None])[0])
+            yield "rms displacement of rows", size, float(found.std.displacement[frame, axis]), math.nan
 
 
 # Free motion
@@ -293,8 +322,8 @@ def by_motion(kind: str, number: int, size: int) -> Iterator[Error]:
 
 def errors_of(kind: str, number: int, size: int) -> list[Error]:
     """All errors of a recording."""
-    if kind in FREE:
-        return list(free_motion(kind, number))
+    if kind in FREE or kind in FOLLOWED:
+        return list((free_motion if kind in FREE else followed)(kind, number))
     if kind.startswith("row time: "):
         return list(calibration(kind, number))
     measure: Callable[[str, int, int], Iterator[Error]] = by_motion if kind in BY_MOTION else tones
