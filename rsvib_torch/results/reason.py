@@ -302,10 +302,11 @@ _FOLLOWED = {
         "rms difference of the displacements that both trackers find, above 0.01 px, 3 % and 4 standard deviations",
     ),
     "tones_contradicted": ReasonKind(
-        "in {value:.0%} of the frames the rows contradict the tones, {limit:.0%} are allowed: tones are missing",
+        "in {value:.0%} of the frames the rows contradict the tones, or tones are nearly blind; {limit:.0%} are "
+        "allowed",
         "use more frames, or frames at shorter intervals",
-        "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ or "
-        "not_followed, above 7 %",
+        "part of the frames with rows_unexplained, neighbours_unexplained, halves_apart, directions_differ, "
+        "not_followed or tone_blind, above 7 %",
     ),
     "other_tone": ReasonKind(
         "a tone of {frequency:.4g} Hz explains the frames as well", "use more frames, or frames at other intervals"

@@ -264,8 +264,12 @@ class _AxisOffsets:
             parts = solved[count:].reshape(-1, 2, count)
             coefficients = parts[:, 0] + 1j * parts[:, 1]
             if not last:  # what turns the phase from knot to knot belongs to the frequency
+                spacing = self.record.knots[1] - self.record.knots[0]
                 turn = np.angle((coefficients[:, 1:] * coefficients[:, :-1].conj()).sum(1))
-                frequencies = frequencies + turn / (2 * math.pi * (self.record.knots[1] - self.record.knots[0]))
+                frequencies = frequencies + turn / (2 * math.pi * spacing)
+                # two that become equal would cancel each other, with amplitudes of 1e6 px
+                apart = np.abs(np.subtract.outer(frequencies, frequencies)) > 1 / (_STEPS * spacing)
+                frequencies = frequencies[(apart | ~np.tri(len(frequencies), k=-1, dtype=bool)).all(1)]
         kept = np.prod([np.sinc(frequencies * seconds) for seconds in self.record.averaged], 0)
         coefficients = coefficients / np.maximum(kept, 0.1)[:, None]
         explained = columns @ solved / np.sqrt(np.maximum(self.weights, 1e-300))

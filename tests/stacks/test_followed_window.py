@@ -108,6 +108,23 @@ def test_a_frame_at_rest_contradicts_the_tones_of_the_others():
     assert all("rows_unexplained" in [one.code for one in of_axis] for of_axis in found.findings)
 
 
+def test_a_large_vibration_that_decays_fast_is_followed():
+    """The first frame is known to one tracker, half a frame period from the pair that it is measured in."""
+
+    def moved(times):
+        turned = 2 * np.pi * FREQUENCY * times[..., None] + PHASE
+        return 2.5 * AMPLITUDE * np.exp(-2.5 * times[..., None]) * np.sin(turned)
+
+    found = rsv.follow_vibration(take_frames(SCENE, TIMING, Curve(moved), 12, noise=0.003), TIMING)
+    reliable = found.reliable.numpy()
+    assert reliable.sum() > 20
+    assert reliable[0].all()
+    middles = np.arange(12)[:, None] * TIMING.frame_period + 64e-4 + 0.5 * TIMING.exposure_time
+    z = found.vibration.amplitude[..., 0].numpy() - 2.5 * AMPLITUDE * np.exp(-2.5 * middles)
+    z /= found.std.amplitude[..., 0].numpy()
+    assert np.abs(z[reliable]).max() < 4
+
+
 def test_frequencies_of_a_sweep_are_within_their_standard_deviations():
     """A tracker is late; the one that runs backwards is early."""
     start, rate = np.array([31.0, 52.0]), 1.5  # Hz, Hz/s
