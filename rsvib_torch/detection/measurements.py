@@ -229,7 +229,9 @@ class Measurements:
 
         The displacement of a group as a whole does not count. Clouds may cover half of its rows.
         """
-        rows = split_axis(np.where(self.distances(residual)[:, :, None] >= 0, residual, np.nan), 1, self.groups, -1)
+        rows = split_axis(
+            np.where(np.isnan(self.distances(residual))[:, :, None], np.nan, residual), 1, self.groups, -1
+        )
         rows = rows - median(rows, 2, keepdims=True)  # (B, groups, rows, G, 2)
         product = (rows[:, :, 1:] * rows[:, :, :-1]).sum(3)
         differences = np.maximum(split_axis(self.num_differences, 1, self.groups, -1)[:, :, 1:, None], 1.0)
@@ -324,7 +326,7 @@ class OtherMotion:
         unexplained, common = measurements.unexplained(residual), measurements.common_of_groups(residual)
         return cls(
             size=size,
-            unexplained=np.where(common > _AT_OTHERS * size, np.maximum(unexplained, common), unexplained),
+            unexplained=np.maximum(unexplained, np.where(common > _AT_OTHERS * size, common, 0.0)),
             correlated=measurements.correlated(residual),
             differential=differential,
             measured=measured.astype(np.float64).sum(1) / np.maximum(visible.astype(np.float64).sum(1), 1.0),

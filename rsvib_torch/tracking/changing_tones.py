@@ -19,7 +19,7 @@ from rsvib_torch.detection.rows.displacements import BLOCK_ROWS
 from rsvib_torch.detection.start import measurements_of_curve
 from rsvib_torch.detection.tones.fit import MIN_GAIN
 from rsvib_torch.motion.timing import RowTiming
-from rsvib_torch.numerics.tables import Array, table, valid_mean
+from rsvib_torch.numerics.tables import Array, table, true_runs, valid_mean
 from rsvib_torch.options import MAX_TONES, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 
@@ -90,21 +90,13 @@ def moving_parts(curve: OffsetCurve) -> tuple[list[slice], Array]:
     # 2. Pairs at rest beside which it changes suddenly. The frame before them and the one after may rest in part.
     least = max(_MIN_SIZE, _AT_REST * float(level.max()))
     at_rest, moves = np.zeros(len(level) + 1, dtype=bool), np.ones(len(level) + 1, dtype=bool)
-    for rest in _runs(level < least):
-        beside = np.concatenate([level[max(rest.start - 2, 0) : rest.start], level[rest.stop : rest.stop + 2]])
+    for start, end in true_runs(level < least).tolist():
+        beside = np.concatenate([level[max(start - 2, 0) : start], level[end : end + 2]])
         if beside.max(initial=0.0) > _SUDDEN * least:
-            at_rest[rest.start : rest.stop + 1] = True
-            moves[max(rest.start - 1, 0) : rest.stop + 2] = False
+            at_rest[start : end + 1] = True
+            moves[max(start - 1, 0) : end + 2] = False
     # 3. The runs between them.
-    return [run for run in _runs(moves) if run.stop - run.start > 1], at_rest
-
-
-def _runs(values: Array) -> list[slice]:
-    """The runs of entries that are True."""
-    change = np.diff(np.concatenate([[0], values.astype(int), [0]]))
-    return [
-        slice(int(start), int(end)) for start, end in zip(*(np.flatnonzero(change == d) for d in (1, -1)), strict=True)
-    ]
+    return [slice(start, end) for start, end in true_runs(moves).tolist() if end - start > 1], at_rest
 
 
 def changing_tones(

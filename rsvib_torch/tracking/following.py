@@ -55,10 +55,15 @@ _MAX_APART = (0.01, 0.03, 4.0)
 # 16 axes with two tones that decay, 4 had wrong displacements in frames whose rows do not contradict them.
 _MAX_CONTRADICTED = 0.07
 _UNCERTAIN = {"displacement_ambiguous", "displacement_uncertain"}  # by the tracker that knows an axis less well
-_CONTRADICTED = {"rows_unexplained", "neighbours_unexplained", "halves_apart", "directions_differ", "not_followed"}
-_CONTRADICTED |= {
-    "tone_blind"
-}  # trackers that begin with a tone that sweeps out of a blind frequency were wrong by 1 px
+# "tone_blind": trackers that begin with a tone that sweeps out of a blind frequency were wrong by 1 px
+_CONTRADICTED = {
+    "rows_unexplained",
+    "neighbours_unexplained",
+    "halves_apart",
+    "directions_differ",
+    "not_followed",
+    "tone_blind",
+}
 
 
 class _Follower(VibrationTracker):
@@ -200,9 +205,10 @@ def _followed_part(
             for known, one, frequency in zip(tones, found, missing, strict=True)
         ]
         # 3. What both trackers agree on, at each frame and axis.
+        of_record = _frequencies(tones)
         both_trackers: Iterable[list[_AtFrame | None]] = (
             [
-                None if one is None else _at_frame(one, _frequencies(tones), start, origin, rows, height, sign)
+                None if one is None else _at_frame(one, of_record, start, origin, rows, height, sign)
                 for one, start, origin in zip(tracked, starts, origins, strict=True)
             ]
             for tracked, origins, sign in ((forwards, starts, 1), (backwards, ends, -1))
@@ -277,8 +283,8 @@ def _at_frame(
     without_drift = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
     moved = table(without_drift.mean_displacement(tensor(exposures), rows.exposure_time))
     order = [
-        linear_sum_assignment(np.abs(np.subtract.outer(of_record, found)))[1]
-        for of_record, found in zip(frequencies, table(vibration.frequency), strict=True)
+        linear_sum_assignment(np.abs(np.subtract.outer(expected, found)))[1]
+        for expected, found in zip(frequencies, table(vibration.frequency), strict=True)
     ]
     places = torch.from_numpy(np.array(order))
     values, stds = (

@@ -322,8 +322,10 @@ def by_motion(kind: str, number: int, size: int) -> Iterator[Error]:
 
 def errors_of(kind: str, number: int, size: int) -> list[Error]:
     """All errors of a recording."""
-    if kind in FREE or kind in FOLLOWED:
-        return list((free_motion if kind in FREE else followed)(kind, number))
+    if kind in FREE:
+        return list(free_motion(kind, number))
+    if kind in FOLLOWED:
+        return list(followed(kind, number))
     if kind.startswith("row time: "):
         return list(calibration(kind, number))
     measure: Callable[[str, int, int], Iterator[Error]] = by_motion if kind in BY_MOTION else tones
