@@ -35,12 +35,20 @@ from rsvib_torch.options import FollowOptions, RegistrationOptions
 from rsvib_torch.registration import OffsetCurve
 from rsvib_torch.results.presentation import AXIS_NAMES
 from rsvib_torch.results.reason import Reason
-from rsvib_torch.tracking.changing_tones import ChangingTones, changing_tones, moving_parts, tones_of_rows
+from rsvib_torch.tracking.changing_tones import (
+    ChangingTones,
+    changing_tones,
+    moving_parts,
+    of_frames,
+    sudden_change,
+    tones_of_rows,
+)
 from rsvib_torch.tracking.tracked_frame import TrackedTones, displacement_std_at_frame, vibration_at_frame
 from rsvib_torch.tracking.tracker import PATIENCE, TrackerState, VibrationTracker
 
 _BANDS = RegistrationOptions()
 _SLOWEST = 1.25  # frame rates; slower tones are not distinguished from a drift that changes, which trackers follow
+_MIN_FRAMES = 4  # before or behind a sudden change
 _BEGIN = 3  # frames at the start of a tracker, whose rows are measured around a less accurate motion
 _TONE = ("amplitude", "frequency", "phase")
 _DRIFT = ("image_motion", "image_acceleration")
@@ -159,34 +167,24 @@ def _followed(stack: GreyFrames, options: FollowOptions) -> FollowedVibration:
     starts = table(rows.frame_starts(stack.images.shape[1]))
     images = stack.images[0] if stack.valid is None else stack.images[0].masked_fill(~stack.valid[0], math.nan)
     parts, at_rest = moving_parts(curve)
-    judged: list[list[_Judged]] = [
-        [(None, (Reason("no_tone" if rests else "not_followed", name),)) for name in AXIS_NAMES[:2]]
-        for rests in at_rest
-    ]
+    judged = [_unknown("no_tone" if rests else "not_followed") for rests in at_rest]
     for part in parts:
-        judged[part] = _followed_part(images[part], starts[part], _of_pairs(curve, part), rows, options)
+        judged[part] = _followed_part(images[part], starts[part], of_frames(curve, part), rows, options)
     return _assembled(judged, starts, stack)
 
 
-def _of_pairs(curve: OffsetCurve, frames: slice) -> OffsetCurve:
-    """The offsets between some frames."""
-    pairs = slice(frames.start, frames.stop - 1)
-    return replace(
-        curve,
-        pairs=curve.pairs[pairs] - frames.start,
-        times=curve.times[pairs],
-        later_times=curve.later_times[pairs],
-        offsets=curve.offsets[:, pairs],
-        quality=curve.quality[:, pairs],
-    )
+def _unknown(code: str) -> list[_Judged]:
+    """Both axes of a frame of which nothing is known."""
+    return [(None, (Reason(code, name),)) for name in AXIS_NAMES[:2]]
 
 
 def _followed_part(
     images: Tensor, starts: Array, curve: OffsetCurve, rows: RowTiming, options: FollowOptions
 ) -> list[list[_Judged]]:
-    """Each axis at each of T frames (T, H, W) with their starts in s."""
+    """Each axis at each of T frames (T, H, W) with their starts in s, and the offsets of their row bands."""
     number, height = images.shape[:2]
     tones: Sequence[ChangingTones] = changing_tones(curve, starts, rows, _BANDS)
+    sensor = rows
     rows = replace(rows, frame_start_times=None)
     ends = starts + (height - 1) * rows.row_time + rows.exposure_time
     best: tuple[int, list[list[_Judged]]] = (-1, [])
@@ -225,6 +223,15 @@ def _followed_part(
         if last or missing == [None, None]:
             break
         tones = [known if one is None else other for known, other, one in zip(tones, found, missing, strict=True)]
+    # 5. Where few frames are known, the vibration may change suddenly: the frames before and behind it on their own.
+    changed = sudden_change(curve, starts, sensor, _BANDS) if best[0] < number else None
+    if changed is not None:
+        divided = [_unknown("not_followed") for _ in range(number)]
+        for part in (slice(0, changed), slice(changed + 1, number)):
+            if part.stop - part.start >= _MIN_FRAMES:
+                divided[part] = _followed_part(images[part], starts[part], of_frames(curve, part), sensor, options)
+        if sum(not against for of_frame in divided for _, against in of_frame) > best[0]:
+            return divided
     return best[1]
 
 
