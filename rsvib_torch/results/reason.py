@@ -206,7 +206,7 @@ _TONES = {
     ),
     "tones_alias": ReasonKind(
         "tones of {value:.5g} and {limit:.5g} Hz are a multiple of the frame rate apart: both explain one motion, "
-        "because the rows are read in another time than stated",
+        "because the rows are read in another time than stated, or the camera vibrates in roll",
         "check row_time and the readout direction",
         "frequencies of two tones of a video, whose difference is a multiple of the frame rate",
         "Hz",
@@ -313,6 +313,17 @@ _FOLLOWED = {
     ),
 }
 _SHAPES = {
+    "frames_repeated": ReasonKind(
+        "{value:.0%} of the frames are constant or copies, {limit:.0%} are allowed: the video does not have the times "
+        "of the camera",
+        "use the video as the camera recorded it",
+        "part of the frames of a video that are constant or copies of the frame before, above 5 %",
+    ),
+    "rows_differ": ReasonKind(
+        "{value:.0%} of a tone is left in a third of the rows, {limit:.0%} is allowed: a part of the picture moves by "
+        "itself",
+        compares="largest part of a tone of a video that is left in a third of the rows, above 25 %",
+    ),
     "corners_unexplained": _px(
         "corners move by {value:.3g} px that no path of the camera and no tones explain, {limit:.2g} px are allowed",
         compares="standard deviation of the offsets of corners in a window of a video",

@@ -229,6 +229,18 @@ class StackManifest(Result, file_format="rsvib stack", units=_UNITS):
                 window, note = next(iter(notes.items()))
                 where = number_of(len(notes), "window")
                 restoration.append(wrapped(f"{name} unchanged in {where}; in window {window}: {note['text']}"))
+        if "video" in self.settings and not still:
+            for axis, name in enumerate(AXIS_NAMES[:2]):
+                against = {
+                    record.window: [one for one in record.detection.findings[axis] if one.code != "no_tone"]
+                    for record in self.windows
+                    if record.detection is not None and record.detection.vibration.amplitude[axis].any()
+                }
+                refused = {number: "; ".join(map(str, why)) for number, why in against.items() if why}
+                if refused:
+                    number, why = next(iter(refused.items()))
+                    text = f"{name} is restored as measured, but its tones are not reliable in"
+                    vibration.append(wrapped(f"{text} {number_of(len(refused), 'window')}; in window {number}: {why}"))
         if data["errors"]:
             window, error = next(iter(data["errors"].items()))
             failed = f"detection or restoration failed in {number_of(len(data['errors']), 'window')}"

@@ -43,6 +43,10 @@ _MIN_RATIO = 60.0  # of the variance that a tone explains and that of the rest; 
 _MIN_EXPLAINED = 0.03  # px rms, of the offsets that a tone explains; smaller ones are not visible in a video
 _LOWEST = 0.6  # of the frame rate; the path follows slower motion
 _MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate hardly change from frame to frame
+# Tones of at most this gain of which more is left in a third of the rows are left out: 0.1 to 0.8 of 20 of 24 tones by
+# objects that move in some rows, below 0.03 of tones of cameras at such frequencies
+_NEARLY_BLIND, _MAX_APART = 0.5, 0.1
+_SIGNIFICANT = 3.0  # standard deviations of a tone
 _MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
@@ -83,6 +87,7 @@ class WindowTone:
     slope: float = 0.0  # Hz/s, by which the frequency changes
     amplitude_std: float = math.inf  # px
     frequency_std: float = math.inf  # Hz
+    apart: float = 0.0  # largest part of the tone that is left in a third of the rows
 
     def at(self, time: float, origin: float, weight: float = 1.0) -> Tone:
         """The tone as it is at a time in s, with the time origin of its phase, multiplied by a weight."""
@@ -159,6 +164,11 @@ def _differences(index: NDArray[np.int64], factors: Array, count: int) -> Array:
     """(N, count), differences between both times (N, 2) of the B-splines from ``spline_taps``."""
     basis = _basis(index, factors, count)
     return np.asarray(basis[:, 1] - basis[:, 0])
+
+
+def _gain(frequency: Array | float, interval: float) -> Array:
+    """Offset from frame to frame by a tone of amplitude 1."""
+    return np.asarray(np.abs(2 * np.sin(math.pi * frequency * interval)))
 
 
 def _wave_columns(waves: NDArray[np.complex128], values: Array) -> Array:
@@ -337,6 +347,38 @@ class _WindowFit:
         other.solve()
         return other
 
+    def has_blind_tone(self, interval: float) -> bool:
+        """Whether the frequency of a tone has been corrected to one that frames do not show."""
+        return any(_gain(tone.frequency, interval) < _MIN_GAIN for tone in self.tones if abs(tone.slope) <= _FAST)
+
+    def keep_tones(self, interval: float) -> None:
+        """Leave out insignificant tones, and those near blind frequencies that thirds of the rows contradict."""
+        waves, residual = [], self.corners.offsets - self.explained(self.knots)
+        for tone in self.tones:
+            index, factors = self._envelope(self.times)
+            wave = tone.waves(self.times, self.averaged) * (factors * tone.knots[index]).sum(-1)
+            waves.append(wave[:, 1] - wave[:, 0])
+            residual[:, tone.axis] -= waves[-1].real
+        root = np.sqrt(self.weights)
+        thirds = (3 * self.corners.rows).astype(np.int64)
+        for tone, wave in zip(self.tones, waves, strict=True):
+            columns = root[:, None] * np.stack([wave.real, -wave.imag], -1)
+            left = root * residual[:, tone.axis]
+            fits = (np.linalg.lstsq(columns[thirds == third], left[thirds == third]) for third in range(3))
+            tone.apart = max(float(np.hypot(*solution)) for solution, *_ in fits)
+
+        def is_kept(tone: WindowTone, wave: NDArray[np.complex128]) -> bool:
+            least = _NEARLY_BLIND if tone.apart > _MAX_APART else _MIN_GAIN
+            is_visible = abs(tone.slope) > _FAST or _gain(tone.frequency, interval) > least
+            size = math.sqrt(np.square(np.abs(tone.knots)).mean())
+            return bool(
+                is_visible
+                and size > _SIGNIFICANT * tone.amplitude_std
+                and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
+            )
+
+        self.tones = [tone for tone, wave in zip(self.tones, waves, strict=True) if is_kept(tone, wave)]
+
     def is_apart(self, axis: int, frequencies: Array) -> NDArray[np.bool_]:
         """Whether frequencies are those of none of the tones of an axis, nor of a change of their amplitudes."""
         resolved = max(2.0 / (self.times.max() - self.times.min()), 0.5 / self.envelope_step)
@@ -422,19 +464,20 @@ def fit_window(
     """
     fit = _WindowFit(corners, interval, averaged)
     fit.solve(_ROUNDS)
-    # Frequencies above those that the path follows, up to those that rows and exposure resolve, without blind ones.
+    # Frequencies above those that the path follows, up to those that rows resolve, without blind ones.
     step = 0.3 / (fit.times.max() - fit.times.min())
-    highest = min(0.5 * _CELLS / readout, 1.0 / max(*averaged, 1e-9))
-    frequencies = np.arange(_LOWEST / interval, highest, step)
-    is_resolved = np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1) > _MIN_SINC
-    is_visible = is_resolved & (np.abs(2 * np.sin(math.pi * frequencies * interval)) > _MIN_GAIN)
+    frequencies = np.arange(_LOWEST / interval, 0.5 * _CELLS / readout, step)
+    is_resolved = np.abs(np.prod(np.sinc(frequencies[:, None] * np.array(averaged)), 1)) > _MIN_SINC
+    is_visible = is_resolved & (_gain(frequencies, interval) > _MIN_GAIN)
     axes = [0, 1] if has_tones and is_visible.sum() > 2 else []
     # Strongest tones by axis and slope. A tone of one axis does not change those of the other.
     found: dict[tuple[int, float], tuple[float, float, float]] = {}
+    left_out = np.zeros((2, len(frequencies)), bool)
     while axes:
         for axis, slope in ((axis, float(slope)) for axis in axes for slope in slopes):
             if (axis, slope) not in found:
                 wanted = fit.is_apart(axis, frequencies) & (is_resolved if abs(slope) > _FAST else is_visible)
+                wanted &= ~left_out[axis]
                 found[axis, slope] = fit.strongest(axis, slope, frequencies, wanted)
         (axis, slope), (frequency, ratio, offsets) = max(found.items(), key=lambda item: item[1][1])
         if ratio < _MIN_RATIO or offsets < _MIN_EXPLAINED:
@@ -444,11 +487,23 @@ def fit_window(
         aliases = frequency + np.arange(-_ALIASES, _ALIASES + 1) / interval
         inside = (aliases > frequencies[is_visible][0]) & (aliases < frequencies[is_visible][-1])
         trials = [fit.with_tone(axis, float(alias), slope) for alias in aliases[inside & fit.is_apart(axis, aliases)]]
-        fit = min(trials, key=lambda trial: trial.unexplained)
-        fit.solve()
+        best = min(trials, key=lambda trial: trial.unexplained)
+        best.solve()
         found = {of: value for of, value in found.items() if of[0] != axis}
+        if best.has_blind_tone(interval):
+            # A part of the picture that moves by itself displaces the same rows again and again: without vibration, it
+            # became tones of up to 70 px at the frame rate.
+            blind = round(frequency * interval) / interval
+            left_out[axis] |= np.abs(frequencies - blind) <= abs(frequency - blind) + step
+            continue
+        fit = best
         axes = [axis for axis in (0, 1) if sum(one.axis == axis for one in fit.tones) < _MOST_TONES]
-    fit.solve()
+    # Tones that others explain in the end, or that are none of all rows.
+    number = -1
+    while len(fit.tones) != number:
+        number = len(fit.tones)
+        fit.solve()
+        fit.keep_tones(interval)
     knots = fit.knots.T / np.array([1.0, 1.0, fit.reach, fit.reach])
     return WindowPath(fit.origin, fit.start, fit.step, knots, tuple(fit.tones), fit.sigma)
 
@@ -518,7 +573,9 @@ def camera_path(
     def swept(window: WindowPath) -> list[WindowPath]:
         """Short windows with tones that sweep, from the windows before on, if they explain the corners."""
         found: list[WindowPath] = []
-        if not has_tones or window.residual < allowed:
+        # behind a tone that sweeps, three steady ones may explain the last frames as well
+        continued = bool(windows) and any(tone.slope for tone in windows[-1].tones)
+        if not has_tones or (window.residual < allowed and not continued):
             return found
         for first in range(0, len(waiting) - _SHORT_FRAMES // 2, _SHORT_FRAMES // 2):
             known = [pair for pair in waiting[first : first + _SHORT_FRAMES] if pair is not None]
@@ -527,7 +584,8 @@ def camera_path(
             joined = Corners.joined(known)
             if not windows or joined.times.mean() > windows[-1].origin:
                 found.append(fit_window(joined, timing.frame_period, averaged, readout, slopes=_SLOPES))
-        return found if found and np.median([one.residual for one in found]) < 0.5 * window.residual else []
+        share = 1.2 if continued else 0.5
+        return found if found and np.median([one.residual for one in found]) < share * window.residual else []
 
     fitted = 0
     for pair in pairs:

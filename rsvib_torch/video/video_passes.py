@@ -1,11 +1,13 @@
 """Passes through a video: the motion of all frames, where they are moved to, verdict and record of the parts."""
 
 import math
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -33,7 +35,7 @@ from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.video import Margins
-from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, camera_path, shake
+from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, WindowPath, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
@@ -46,6 +48,12 @@ _GAIN_ERROR = 0.02  # of an amplitude: the mean over the patch of a corner is kn
 # path. 36 tones of 33 to 177 Hz and 0.4 to 2.5 px behind 4 ms: 0.07 to 0.34, amplitudes were up to 15 % too large
 _BLUR_BIAS = 0.15
 _SAME_ALIAS = 0.01  # periods per frame; tones are separated from 0.02 on in a window of 96 frames
+_MAX_APART = 0.25  # of a tone, left in a third of the rows: tones of cameras have up to 0.14, in clips at night
+# Of the usual change from frame to frame: at least 0.18 in 36 clips that a hand holds, and at most 0.12 of copies in a
+# video of 24 frames per second that is stored as 30
+_COPY, _MEMORY = 0.15, 8
+_IS_COPY = ", or a copy of the frame before"
+_MAX_COPIES = 0.05  # of the frames; with more, frames were taken at other times than stored: 143 Hz became 149 Hz
 _SMALLEST = 0.02  # px at the corners; roll and zoom below are left out, because restoration is faster without
 
 
@@ -141,6 +149,7 @@ class VideoPasses:
         """Of every frame, the corners between it and the usable frame before, if there is one; fills the tables."""
         chosen = compared_pairs(len(self.starts)) if self.rates is not None else ()
         before: tuple[int, NDArray[np.uint8]] | None = None
+        changes: deque[float] = deque(maxlen=_MEMORY)  # counts, of the frames before
         follower = CornerFollower(self.frames.job.timing)
         with closing(self.decoded()) as frames:
             for index, frame in enumerate(frames):
@@ -149,10 +158,14 @@ class VideoPasses:
                     yield ()
                     continue
                 grey = self.frames.grey(frame)
-                if grey.min() == grey.max() or (before is not None and np.array_equal(grey, before[1])):
-                    faults[index] = f"frame {index} is constant, or a copy of the frame before"
+                changed = math.inf if before is None else cv2.norm(grey, before[1], cv2.NORM_L1) / grey.size
+                usual = float(np.median(changes)) if len(changes) >= _MEMORY // 2 else 0.0
+                if grey.min() == grey.max() or changed <= _COPY * usual:
+                    faults[index] = f"frame {index} is constant{_IS_COPY}"
                     yield ()
                     continue
+                if before is not None:
+                    changes.append(changed)
                 corners = follower.next(grey, self.starts[index])
                 if before is not None:
                     if corners is not None and before[0] == index - 1:
@@ -272,12 +285,16 @@ class VideoPasses:
     ) -> WindowRecord:
         """The record of a part of the video, the first frames of which are given as written."""
         path = motion.path
-        detection = self._detection(path, motion.times, tracks) if isinstance(path, CameraPath) else None
-        left = [
-            Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
-            for name, why in zip(AXIS_NAMES, detection.reasons if detection else (), strict=False)
-            if why
-        ]
+        detection = self._detection(path, motion, tracks) if isinstance(path, CameraPath) else None
+        left = []
+        if detection is not None and self.steady == 0:  # the rows of axes without tones are not moved
+            left = [
+                Reason("axis_not_reliable", name, details={"action": "restored", "why": "; ".join(map(str, why))})
+                for name, why, sizes in zip(
+                    AXIS_NAMES[:2], detection.reasons, detection.vibration.amplitude, strict=True
+                )
+                if not sizes.any()
+            ]
         return WindowRecord.of(
             verdict,
             {track.index: track.fault for track in tracks if track.fault is not None},
@@ -288,13 +305,14 @@ class VideoPasses:
             last=tracks[-1].index,
             start_time=tracks[0].time,
             written=len(tracks),
-            left_alone=tuple(left),
+            left_alone=tuple(left),  # tones are removed as they were measured, whatever explains them
             error=None,
             shaking=self.shaking(motion, tracks[0].index, first_frames),
         )
 
-    def _detection(self, path: CameraPath, times: Array, tracks: list[FrameTrack]) -> DetectedVibration:
+    def _detection(self, path: CameraPath, motion: VideoMotion, tracks: list[FrameTrack]) -> DetectedVibration:
         """The vibration in the middle of a part; its time origin is the start of the first frame of the part."""
+        times = motion.times
         middle = float(times[tracks[len(tracks) // 2].index])
         window = path.nearest(middle)
         tones = [tone.at(middle - window.origin, tracks[0].time - window.origin) for tone in window.tones]
@@ -310,10 +328,15 @@ class VideoPasses:
         begin = times[[tracks[0].index]]
         velocity, acceleration = (path.derivatives(begin, order)[0, :2] for order in (1, 2))
         vibration = Vibration(amplitude, frequency, phase, velocity, acceleration)
-        findings = tuple(self._findings(axis, tones) for axis in (0, 1))
-        if window.residual > path.allowed:
-            unexplained = Reason("corners_unexplained", None, window.residual, path.allowed)
-            findings = tuple((*(one for one in of if one.code != "no_tone"), unexplained) for of in findings)
+        findings = self._findings(tones, window)
+        copies = sum(fault.endswith(_IS_COPY) for fault in motion.faults.values()) / len(times)
+        for code, value, allowed in (
+            ("corners_unexplained", window.residual, path.allowed),
+            ("frames_repeated", copies, _MAX_COPIES),
+        ):
+            if value > allowed:
+                against = Reason(code, None, value, allowed)
+                findings = tuple((*(one for one in of if one.code != "no_tone"), against) for of in findings)
         timing, std = self.frames.job.timing, VibrationStd(*(torch.from_numpy(np.array(value)) for value in values))
         coefficients = amplitude * np.exp(1j * (phase - 0.5 * math.pi))
         fit = ToneFit(
@@ -352,20 +375,33 @@ class VideoPasses:
             true = true - (true + cubic * true**3 - amplitude) / (1.0 + 3.0 * cubic * true**2)
         return true
 
-    def _findings(self, axis: int, tones: list[Tone]) -> tuple[Reason, ...]:
-        """Reasons against an axis: no tone, or two that only a wrong row time tells apart.
+    def _findings(self, tones: list[Tone], window: WindowPath) -> tuple[tuple[Reason, ...], ...]:
+        """Reasons against each axis.
 
-        Between frames, tones of f and f + n / T are the same. With a row time that is wrong by 5 to 40 %, a tone of
-        93 Hz was explained by two, of 93 and 63 or 123 Hz.
+        Between frames, tones of f and f + n / T are the same; the times of the rows tell them apart. With a row time
+        that is wrong by 5 to 50 %, a tone of 93 Hz was explained by two, of 93 and 63 or 123 Hz, and one of 87 Hz along
+        the other axis was 57 Hz.
         """
-        frequencies = [tone.frequency for tone in tones if tone.axis == axis]
-        if not frequencies:
-            return (Reason("no_tone", AXIS_NAMES[axis]),)
-        for first, second in combinations(frequencies, 2):
-            cycles = abs(first - second) * self.frames.job.timing.frame_period
-            if round(cycles) > 0 and abs(cycles - round(cycles)) < _SAME_ALIAS:
-                return (Reason("tones_alias", AXIS_NAMES[axis], first, second),)
-        return ()
+        timing = self.frames.job.timing
+        aliases = [
+            Reason("tones_alias", AXIS_NAMES[first.axis], first.frequency, second.frequency)
+            for first, second in combinations(tones, 2)
+            if first.axis == second.axis
+            and (cycles := abs(first.frequency - second.frequency) * timing.frame_period) > 0.5
+            and abs(cycles - round(cycles)) < _SAME_ALIAS
+        ]
+        findings = []
+        for axis, name in enumerate(AXIS_NAMES[:2]):
+            of_axis = [tone for tone in tones if tone.axis == axis]
+            apart = max((tone.apart for tone in window.tones if tone.axis == axis), default=0.0)
+            against = aliases[:1] if of_axis else [Reason("no_tone", name)]
+            if apart > _MAX_APART:
+                against.append(Reason("rows_differ", name, apart, _MAX_APART))
+            fastest = max((tone.frequency for tone in of_axis), default=0.0)
+            if fastest * timing.exposure_time > 1:
+                against.append(Reason("tone_averaged_out", name, fastest, 1 / timing.exposure_time))
+            findings.append(tuple(against))
+        return tuple(findings)
 
 
 def tone_tables(tones: list[Tone], axes: int) -> Array:

@@ -117,7 +117,8 @@ def test_every_frame_is_restored_with_times_and_sound(clip, tmp_path):
 def test_a_part_that_restoration_makes_worse_is_left_as_it_is(frames, tmp_path):
     """The frames by which the second part is judged do not vibrate; the tones are those of all frames."""
     paused = frames.copy()
-    paused[PART : PART + 4] = (255 * STILL).round().transpose(1, 2, 0)
+    noise = np.random.default_rng(1).normal(0, 3, paused[PART : PART + 4].shape)  # without it, they are copies
+    paused[PART : PART + 4] = ((255 * STILL).transpose(1, 2, 0) + noise).round().clip(0, 255)
     clip = write(tmp_path / "clip.mp4", paused)
     report = process_video(clip, tmp_path / "still.mp4", TIMING, **OPTIONS)
     windows = read_manifest(report.manifest).windows
@@ -242,6 +243,16 @@ def test_copies_and_constant_frames_repeat_the_frame_before(frames, tmp_path):
     assert report.bad_frames == 1
     assert decibel(restored[12], STILL, 16) > 30
     assert decibel(restored[13], STILL, 16) > 30
+
+
+def test_frames_that_were_repeated_do_not_have_the_times_of_the_file(frames, tmp_path):
+    """24 frames per second, stored as 30: the encoder changes the copies."""
+    source = write(tmp_path / "clip.mp4", frames[np.arange(40) * 24 // 30], options={"crf": "20", "threads": "1"})
+    assert sum(np.array_equal(*pair) for pair in itertools.pairwise(pixels(source))) < 4
+    report = process_video(source, tmp_path / "still.mp4", TIMING, **OPTIONS)
+    assert report.bad_frames == 7  # the first one cannot be known
+    for found in read_manifest(report.manifest).detections():
+        assert [[one.code for one in of_axis][-1] for of_axis in found.findings] == ["frames_repeated"] * 2
 
 
 def test_columns_that_are_read_one_after_another(frames, tmp_path):
