@@ -87,7 +87,6 @@ from .restoration import trusted_vibration as trusted_vibration
 from .restoration import visible_pixels as visible_pixels
 from .row_time import RowTimeCalibration as RowTimeCalibration
 from .row_time import calibrate_row_time as calibrate_row_time
-from .row_time import calibrate_row_time_by_exposure as calibrate_row_time_by_exposure
 from .row_time import calibrate_row_time_by_motion as calibrate_row_time_by_motion
 from .stacks import StackReport as StackReport
 from .stacks import VibrationCorrector as VibrationCorrector

@@ -56,7 +56,6 @@ SECTIONS: dict[str, Section] = {  # in the order of the page
     "orbit": Section("Vibrations measured in orbit"),
     "verdict": Section("Verdict on restorations", by_default=False),
     "honesty": Section("Reliable results that are wrong", by_default=False),
-    "timing": Section("Mistakes of the timing", by_default=False),
     "error_bars": Section("Standard deviations", by_default=False, page="verdicts.md"),
     "reproduction": Section("The paper's tables", by_default=False),
 }

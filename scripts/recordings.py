@@ -5,8 +5,6 @@ They are not part of this project. FOLDER holds those that are used:
 
 * gyroflow_rollingshutter/frame_example.png (github.com/gyroflow/rollingshutter): a 1000 Hz LED, readout
   15.730 +- 0.004 ms published,
-* hearv_strobe/rolling0.png, rolling1.png (github.com/jia-kai/hearv): a strobe at exposures of 1/1000 and 1/4000 s; 15.7
-  and 18.3 us are published, the latter from the heights of bands at seven exposures,
 * phone_gyro (github.com/lhaippp/gyro-video-stabilization): 61 frames of a phone behind a windscreen with its gyroscope,
 * drone_gyro/karma.mp4 (github.com/gopro/gpmf-parser): a flying drone with a GPMF track,
 * revas/tslo-dark.avi, tslo-stim.avi (github.com/lowvisionresearch/ReVAS): scanned videos of a moving eye, 512 rows,
@@ -16,7 +14,6 @@ They are not part of this project. FOLDER holds those that are used:
 
 import argparse
 import csv
-import itertools
 import statistics
 import sys
 from collections.abc import Callable
@@ -50,7 +47,7 @@ WINDOW, WINDOWS = 10, 6  # frames of a row time, and row times of a recording
 
 
 def light(folder: Path) -> None:
-    """Row time from an LED and from a strobe, compared with the published values."""
+    """Row time from an LED, compared with the published value."""
     frame = rsv.read_stack(folder / "gyroflow_rollingshutter" / "frame_example.png")
     rows = frame.shape[-2]
     found = rsv.calibrate_row_time(frame, 1000.0)
@@ -60,15 +57,6 @@ def light(folder: Path) -> None:
         print(f"     readout {name}: {readout:.4f} ms, {100 * (readout / 15.730 - 1):+.3f} % from 15.730 +- 0.004 ms")
     found = rsv.calibrate_row_time(frame, 1000.0, on_fraction=0.5, gamma=2.2)
     print(f"     exposure 1/{1 / (found.exposure_time or 1):.0f} s, with gamma 2.2 and a square wave")
-    strobe = torch.cat([rsv.read_stack(folder / "hearv_strobe" / f"rolling{number}.png") for number in (0, 1)])
-    for gamma in (1.0, 1.5):
-        found = rsv.calibrate_row_time_by_exposure(strobe, [1 / 1000, 1 / 4000], gamma=gamma)
-        result = f"{1e6 * found.row_time:.2f} +- {1e6 * found.row_time_std:.2f} us per row"
-        print(f"strobe, with gamma {gamma:g}: {result} (published: 15.7 to 18.3 us)")
-    lit = (strobe.mean((1, 3)) >= 10 / 255).tolist()
-    heights = [max(sum(rows) for _, rows in itertools.groupby(of_frame)) for of_frame in lit]  # of the tallest bands
-    by_height = 1e6 * (1 / 1000 - 1 / 4000) / (heights[0] - heights[1])
-    print(f"        by the heights of bands, {heights[0]} and {heights[1]} rows: {by_height:.2f} us")
 
 
 # Row time from motion
@@ -318,7 +306,7 @@ def jitter(folder: Path) -> None:
 
 
 RECORDINGS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {  # function, and what it needs in the folder
-    "light": (light, ("gyroflow_rollingshutter", "hearv_strobe")),
+    "light": (light, ("gyroflow_rollingshutter",)),
     "row_times": (row_times, ("phone_gyro", "drone_gyro")),
     "phone": (phone, ("phone_gyro",)),
     "drone": (drone, ("drone_gyro",)),

@@ -272,9 +272,8 @@ class CalibrateOptions(shared.RangeOptions):
     """One or more stacks of frames: TIFF, PNG, video ..."""
     flicker_frequency: float | None = option(None, "--frequency")
     """Flicker frequency in Hz; a mains-powered light flickers at twice the mains frequency."""
-    exposure: list[float] | None = option(None, **shared.TIME)
-    """Exposure time, e.g. 1/1000, given once per frame, for a strobe of unknown frequency; with --by-motion once, if
-    known."""
+    exposure: float | None = option(None, **shared.TIME)
+    """With --by-motion, if known: exposure time, e.g. 1/1000."""
     by_motion: bool = False
     """Use the motion of the camera instead of a light."""
     row_time: list[float] | None = option(
@@ -312,8 +311,7 @@ def calibrate(given: CalibrateOptions) -> Answer:
         shared.check_new([given.out], given.overwrite, [file for path in paths for file in io.stack_files(path)])
         check_writable(given.out)
     infos = [io.read_stack_info(path) for path in paths]
-    strobe = bool(given.exposure) and not given.by_motion  # an exposure for each frame
-    if not strobe and given.frame_range is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
+    if given.frame_range is None and infos[0].shape[0] > _CALIBRATED_FRAMES:
         note(f"the first {_CALIBRATED_FRAMES} of {infos[0].shape[0]} frames are used; --frames selects others")
         paths = [path.with_name(f"{path.name}[0:{_CALIBRATED_FRAMES}]") for path in paths[:1]]
         infos = [io.read_stack_info(path) for path in paths]
@@ -333,17 +331,14 @@ def calibrate(given: CalibrateOptions) -> Answer:
                 stack,
                 frame_rate=frame_rate,
                 row_time=(given.row_time[0], given.row_time[1]) if given.row_time else None,
-                exposure_time=given.exposure[0] if given.exposure else None,
+                exposure_time=given.exposure,
                 scan_axis=axis,
                 readout_direction=given.readout_direction,
             )
-        elif given.flicker_frequency is None:
-            exposures = given.exposure or []
-            result = row_time.calibrate_row_time_by_exposure(stack, exposures, scan_axis=axis, gamma=given.gamma)
         else:
             result = row_time.calibrate_row_time(
                 stack,
-                given.flicker_frequency,
+                given.flicker_frequency or 0.0,
                 frame_rate=given.frame_rate,
                 on_fraction=given.on_fraction,
                 light_contrast=given.light_contrast,
@@ -377,19 +372,14 @@ def calibrate(given: CalibrateOptions) -> Answer:
 def _check_given(given: CalibrateOptions) -> None:
     """Raise an error for options of ``calibrate`` that do not fit a flickering light, or ``--by-motion``."""
     if not given.by_motion:
-        if given.row_time or given.readout_direction is not None:
-            raise ValueError("--row-time and --readout-direction of calibrate are limits for --by-motion")
-        if (given.flicker_frequency is None) == (not given.exposure):
-            raise ValueError(
-                "give --frequency of the flicker, --exposure once per frame for a strobe of unknown frequency, or "
-                "--by-motion for frames of a vibrating camera"
-            )
+        if given.row_time or given.exposure is not None or given.readout_direction is not None:
+            raise ValueError("--row-time, --exposure and --readout-direction of calibrate are for --by-motion")
+        if given.flicker_frequency is None:
+            raise ValueError("give --frequency of the flicker, or --by-motion for frames of a vibrating camera")
         return
     light = {"--frequency": given.flicker_frequency, "--on-fraction": given.on_fraction}
     for name, value in (light | {"--light-contrast": given.light_contrast}).items():
         if value is not None:
             raise ValueError(f"{name} describes a flickering light; leave it out with --by-motion")
-    if given.exposure and len(given.exposure) > 1:
-        raise ValueError("--by-motion takes one --exposure, that of all frames")
     if given.row_time and len(given.row_time) != 2:
         raise ValueError("give --row-time twice: the shortest and the longest possible row time")

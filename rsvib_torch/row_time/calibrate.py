@@ -1,7 +1,6 @@
 """Row time, readout direction and exposure of a camera from frames of flickering light."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -198,61 +197,6 @@ def calibrate_row_time(
     )
 
 
-@checks_arguments
-def calibrate_row_time_by_exposure(
-    frames: FramesOrFiles,
-    exposure_times: Sequence[Annotated[float, Field(gt=0, le=10)]],
-    *,
-    scan_axis: ScanAxis = -2,
-    gamma: Gamma = 1.0,
-    full_scale: float | None = None,
-    channels: Channels = None,
-) -> RowTimeCalibration:
-    """Row time from frames of a strobe of unknown frequency taken with different known exposures.
-
-    A row is lit if its exposure overlaps the pulse: the height of a bright band is the sum of pulse and exposure, and a
-    longer exposure increases it by ``(T_e2 - T_e1) / T_row`` rows. The overlap of pulse and exposure is fitted to
-    the brightness of the rows of all frames, with pulse, period and row time in common. ``exposure_times`` are those of
-    the frames in seconds, not all the same; the other arguments are as in ``calibrate_row_time``, and ``gamma`` matters
-    here.
-
-    Returns:
-        Row time with its standard deviation, and the frequency of the strobe.
-    """
-    exposures = [float(exposure) for exposure in exposure_times]
-    profiles = row_profiles(frames, scan_axis, full_scale, gamma, channels)
-    if len(exposures) != len(profiles.rows):
-        raise ValueError(f"{len(exposures)} exposure times do not fit {len(profiles.rows)} frames; one a frame")
-    if max(exposures) < 1.05 * min(exposures):
-        raise ValueError(
-            f"exposure_times {exposures} must differ by at least 5 %: the row time follows from the change of the bands"
-        )
-    # the waveform depends on the exposure, so each frame is fitted by itself
-    singles = [
-        find_bands(Profiles(r[None], p[None], 0.0))[0] for r, p in zip(profiles.rows, profiles.parts, strict=True)
-    ]
-    period = sum(s.period / s.period_std**2 for s in singles) / sum(1 / s.period_std**2 for s in singles)
-    phases = np.concatenate([s.phases for s in singles])
-    fit = fit_strobe(profiles.rows, period, phases, np.array(exposures))[0]
-    fit.check_shape()
-    row_time = max(exposures) / fit.exposure_rows
-    shortest = int(np.argmin(exposures))
-    return RowTimeCalibration(
-        row_time=row_time,
-        row_time_std=row_time * fit.exposure_std / fit.exposure_rows,
-        period_rows=fit.period,
-        contrast=float(np.abs(singles[shortest].coefficients[0, 0])),
-        flicker_frequency=1 / (fit.period * row_time),
-        frame_rows=None,
-        readout_direction=None,
-        exposure_time=exposures[shortest],
-        exposure_time_std=0.0,
-        notes=("readout direction unknown: it requires the flicker frequency and the frame rate",),
-        light=torch.from_numpy(np.concatenate([s.fitted + s.residual for s in singles])),
-        fitted_light=torch.from_numpy(np.concatenate([s.fitted for s in singles])),
-    )
-
-
 def _check_readout(row_time: float, frequency: float, height: int, frame_rate: float) -> None:
     """Raise if the rows do not fit into a frame, or if another row time would cause the same bands."""
     longest = 1 / (frame_rate * height)
@@ -337,7 +281,7 @@ def _exposure_rows(
     other_gamma = 2.2 if gamma < 1.5 else 1.0
     try:
         fits, others = (
-            fit_strobe(power, bands.period, bands.phases, np.ones(len(even)), on_fraction=on_fraction, fixed=fixed)
+            fit_strobe(power, bands.period, bands.phases, on_fraction, fixed=fixed)
             for power in (even, even ** (other_gamma / gamma))
         )
         fits[0].check_shape()

@@ -31,7 +31,7 @@ class StrobeFit:
     """Bands of an on-off light, in rows."""
 
     period: float  # P
-    exposure_rows: float  # rows read during the longest exposure of a row
+    exposure_rows: float  # rows read during the exposure of a row
     exposure_std: float  # its standard deviation
     other_light: float  # constant light over that of the on-off light while it is on
     misfit: float  # root mean square of the residuals over the brightness
@@ -48,31 +48,27 @@ def fit_strobe(
     brightness: Array,
     period: float,
     phases: Array,
-    exposures: Array,
+    on_fraction: float,
     *,
-    on_fraction: float | None = None,
     fixed: bool = False,
 ) -> list[StrobeFit]:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row, and constant light.
 
     ``brightness`` (T, H) is in proportion to light; ``period`` in rows, and ``phases`` (T,) of the fundamental, ``cos(2
-    pi i / P - phase)``, are start values. ``exposures`` (T,) have any unit. The fraction of the period that the light
-    is on is estimated from different exposures unless it is given. The scene is a cubic along the rows of each frame,
-    or the same in all frames (``fixed``).
+    pi i / P - phase)``, are start values. The light is on for ``on_fraction`` of the period. The scene is a cubic along
+    the rows of each frame, or the same in all frames (``fixed``).
 
-    Without ``on_fraction`` the result is the best fit. With it, exposures are shorter than a period, because a whole
-    number of periods more adds constant light and nothing else; the result has all fits that explain the bands.
+    Exposures are shorter than a period, because a whole number of periods more adds constant light and nothing else;
+    the result has all fits that explain the bands.
     """
     values = brightness / brightness.mean(1, keepdims=True) if not fixed else brightness
     count, height = values.shape
     rows = np.arange(height)
     smooth = np.polynomial.chebyshev.chebvander(2 * rows / (height - 1) - 1, 3)
-    relative = exposures[:, None] / exposures.max()
 
     def residuals(parameters: Array) -> Array:
         """Residuals of the bands times the scene, which is fitted to the brightness."""
-        long, middles = parameters[1] * relative, parameters[-count:, None]
-        lit = float(parameters[3] if on_fraction is None else on_fraction * parameters[0])
+        long, middles, lit = parameters[1], parameters[-count:, None], float(on_fraction * parameters[0])
         # the brightest row is exposed symmetrically about the pulse
         shape = lit_fraction(rows - middles - 0.5 * long + 0.5 * lit, long, lit, parameters[0]) + parameters[2]
         if fixed:
@@ -80,25 +76,21 @@ def fit_strobe(
             return left.ravel()
         return unexplained(smooth * shape[..., None], values).ravel()
 
-    # period, longest exposure, constant light and on-time in rows, and the brightest row of each frame
-    kept = [0, 1, 2, *([3] if on_fraction is None else []), *range(4, 4 + count)]
+    # period, exposure and constant light in rows, and the brightest row of each frame
     middles = phases / (2 * math.pi) * period
-    longest = 3.0 if on_fraction is None else 0.95  # start in periods
     dark, bright = np.quantile(values / values.mean(), (0.02, 0.98))
     other = max(1e-3, dark / max(bright - dark, 1e-3))
-    lower = np.array([0.8 * period, 1e-3, 0.0, 1e-3, *(middles - period)])[kept]
-    upper = np.array(
-        [1.25 * period, (4 if on_fraction is None else 1) * period, np.inf, 1.1 * period, *(middles + period)]
-    )[kept]
+    lower = np.array([0.8 * period, 1e-3, 0.0, *(middles - period)])
+    upper = np.array([1.25 * period, period, np.inf, *(middles + period)])
     trials = []
     for part in np.linspace(0.1, 1.0, 9) ** 2:
-        start = np.array([period, longest * period * part, other, 0.3 * period, *middles])[kept]
+        start = np.array([period, 0.95 * period * part, other, *middles])
         trials.append(least_squares(residuals, start, bounds=(lower, upper), x_scale=np.maximum(np.abs(start), 1e-12)))
     trials.sort(key=lambda trial: trial.cost)
     fits: list[StrobeFit] = []
     for trial in trials:
         misfit = math.sqrt(2 * trial.cost / values.size) / float(values.mean())
-        if fits and (misfit > _SAME_MISFIT * fits[0].misfit or on_fraction is None):
+        if fits and misfit > _SAME_MISFIT * fits[0].misfit:
             break
         if any(abs(trial.x[1] - fit.exposure_rows) < 0.01 * period for fit in fits):
             continue

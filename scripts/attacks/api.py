@@ -159,7 +159,6 @@ def calls(folder: Path) -> dict[str, Call]:  # noqa: PLR0915 - values of all par
     different: dict[str, dict[str, Any]] = {  # values that differ from the pool, by function
         "align_motion": {"camera": None, "fit_gain": True},
         "calibrate_row_time": {"frames": stripes},
-        "calibrate_row_time_by_exposure": {"frames": stripes},
         "calibrate_row_time_by_motion": {"row_time": (5e-5, 2e-4)},
         "comparison_figure": {"size": 32, "restored": restored[0]},
         "detect_motion": {"iterations": 1},

@@ -12,7 +12,7 @@ from truth import draw_scene
 
 from rsvib_torch.config import read_config
 from rsvib_torch.io import write_stack
-from rsvib_torch.row_time import calibrate_row_time, calibrate_row_time_by_exposure
+from rsvib_torch.row_time import calibrate_row_time
 
 ROW_TIME = 14.578e-6
 HEIGHT, WIDTH = 480, 160
@@ -179,17 +179,6 @@ def test_exposure_with_gamma_of_photographs():
     assert without_gamma.row_time == pytest.approx(ROW_TIME, rel=5e-4)
     assert without_gamma.exposure_time is None
     assert any("agree with gamma=2.2" in note for note in without_gamma.notes)
-
-
-def test_row_time_from_two_exposures_of_an_unknown_strobe():
-    exposures = [1e-3, 0.25e-3]
-    frames = record_frames(lambda t: blink(t, 300.0, 0.3), exposure=exposures, scene=shaded(720), frame_rate=8.1)
-    found = calibrate_row_time_by_exposure(frames, exposures)
-    assert found.row_time == pytest.approx(ROW_TIME, rel=0.01)
-    assert abs(found.row_time - ROW_TIME) < 5 * found.row_time_std
-    assert found.flicker_frequency == pytest.approx(300.0, rel=0.01)
-    refuses(lambda: calibrate_row_time_by_exposure(frames, [1e-3, 1e-3]), "must differ")
-    refuses(lambda: calibrate_row_time_by_exposure(frames, [1e-3]), "do not fit 2 frames")
 
 
 @pytest.mark.parametrize(("seed", "count"), [(0, 1), (1, 2)])
