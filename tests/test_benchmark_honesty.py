@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks import honesty, timing
+from benchmarks import honesty
 from benchmarks.honesty_camera import FINER, MARGIN, OPTICS, fine_shape, layer, take_frames
 from benchmarks.honesty_cases import recording
 
@@ -63,12 +63,3 @@ def test_outcomes_of_an_axis_follow_the_criteria():
     assert louder[0]["largest_z"] == pytest.approx(0.03 * float(true[0][0]) / 1e-4)
     inverted = outcome(rsv.Vibration(*true[:2], true[2] + np.pi), True, True)
     assert [(axis["wrong_parameter"], axis["wrong_displacement"]) for axis in inverted] == [(False, True)] * 2
-
-
-def test_a_mistake_of_the_timing_is_not_right():
-    """Two frames with correct timing and with the image height as frame_rows."""
-    taken = timing.take("city", 0, 128)
-    cases = {name: timing.judge_mistake(taken, name, 2) for name in ("none", "frame_rows = image height")}
-    assert cases["none"]["outcomes"] == ["right", "right"]
-    assert cases["none"]["restored_db"] > cases["none"]["raw_db"] + 6
-    assert "right" not in cases["frame_rows = image height"]["outcomes"]

@@ -116,7 +116,7 @@ def run_command(arguments: Sequence[str]) -> int:
             except typer.Abort:
                 code = _INTERRUPTED
         if code == _INTERRUPTED:
-            kept = "; the completed windows are kept, --resume continues" if "run" in arguments[:1] else ""
+            kept = "; --resume continues behind the windows that are complete" if "run" in arguments[:1] else ""
             error_line(f"stopped{kept}")
         return code if isinstance(code, int) else 0
     except Exception as error:

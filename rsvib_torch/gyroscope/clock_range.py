@@ -14,8 +14,8 @@ def offset_range(
     low, high = start - first, end - last
     if high < low:
         raise ValueError(
-            f"the recording of {end - start:.4g} s is shorter than the frames, {last - first:.4g} s; "
-            "are its times in another unit?"
+            f"the recording of {end - start:.7g} s is shorter than the frames, which take {last - first:.7g} s with "
+            "their readout; use fewer frames, or check the unit of its times"
         )
     if limits is not None:
         bounds = (check_number("offsets", limits[0]), check_number("offsets", limits[1]))

@@ -46,7 +46,7 @@ _MIN_GAIN = 0.15  # |2 sin(pi f T)|; tones close to a multiple of the frame rate
 # Tones of at most this gain of which more is left in a third of the rows are left out: 0.1 to 0.8 of 20 of 24 tones by
 # objects that move in some rows, below 0.03 of tones of cameras at such frequencies
 _NEARLY_BLIND, _MAX_APART = 0.5, 0.1
-_SIGNIFICANT = 3.0  # standard deviations of a tone
+SIGNIFICANT = 3.0  # standard deviations of a tone
 _MIN_SHARE = 2e-3  # of the largest variance that a tone of 1 px causes; others are hidden by the path
 _MIN_SINC = 0.1  # of the amplitude that remains in the mean over the exposure
 # rows of the patch of a corner, over which its displacement is a mean: amplitudes of 52 to 205 Hz are then right within
@@ -94,8 +94,14 @@ class WindowTone:
         index, factors = spline_taps(np.array([time]), self.start, self.step, len(self.knots))
         frequency = self.frequency + self.slope * time
         turns = frequency * origin - 0.5 * self.slope * time**2
-        turned = weight * (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
-        return Tone(self.axis, frequency, complex(turned), weight * self.amplitude_std, self.frequency_std)
+        turned = (factors * self.knots[index]).sum() * np.exp(2j * math.pi * turns)
+        # What a spline does not follow: behind a blow that decays with 0.1 s, amplitudes were wrong by 6 to 20 std.
+        bent = 0.25 * float(np.abs(np.diff(self.knots[index.min() : index.max() + 1], 2)).max())
+        bent = math.sqrt(max(bent**2 - 0.375 * min(self.amplitude_std, 1e9) ** 2, 0.0))  # without that of noise
+        size_std = math.hypot(self.amplitude_std, bent)
+        phase = bent / max(abs(turned), bent, 1e-30)
+        rate_std = math.hypot(self.frequency_std, phase / (2 * math.pi * self.step * (len(self.knots) - 3)))
+        return Tone(self.axis, frequency, complex(weight * turned), weight * size_std, rate_std)
 
     def waves(self, times: Array, averaged: Averaged) -> NDArray[np.complex128]:
         """Values at times, averaged over the exposure and the patch of a corner, of an amplitude of 1."""
@@ -373,7 +379,7 @@ class _WindowFit:
             size = math.sqrt(np.square(np.abs(tone.knots)).mean())
             return bool(
                 is_visible
-                and size > _SIGNIFICANT * tone.amplitude_std
+                and size > SIGNIFICANT * tone.amplitude_std
                 and 0.5 * np.square(np.abs(wave)).mean() > _MIN_EXPLAINED**2
             )
 

@@ -35,7 +35,7 @@ from rsvib_torch.stacks.recorded_motion import compared_pairs
 from rsvib_torch.stacks.window_restoration import pair_verdict
 from rsvib_torch.stacks.windows import WindowRecord
 from rsvib_torch.video import Margins
-from rsvib_torch.video.camera_path import WINDOW_FRAMES, CameraPath, Tone, WindowPath, camera_path, shake
+from rsvib_torch.video.camera_path import SIGNIFICANT, WINDOW_FRAMES, CameraPath, Tone, WindowPath, camera_path, shake
 from rsvib_torch.video.recorded_rotation import RecordedRotation
 from rsvib_torch.video.steadying import steady_shifts
 from rsvib_torch.video.video_frames import Frame, FrameTrack, VideoFrames
@@ -394,7 +394,8 @@ class VideoPasses:
         for axis, name in enumerate(AXIS_NAMES[:2]):
             of_axis = [tone for tone in tones if tone.axis == axis]
             apart = max((tone.apart for tone in window.tones if tone.axis == axis), default=0.0)
-            against = aliases[:1] if of_axis else [Reason("no_tone", name)]
+            known = any(abs(tone.coefficient) > SIGNIFICANT * tone.amplitude_std for tone in of_axis)
+            against = aliases[:1] if known else [Reason("no_tone", name)]
             if apart > _MAX_APART:
                 against.append(Reason("rows_differ", name, apart, _MAX_APART))
             fastest = max((tone.frequency for tone in of_axis), default=0.0)
