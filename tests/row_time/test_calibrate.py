@@ -181,6 +181,15 @@ def test_exposure_with_gamma_of_photographs():
     assert any("agree with gamma=2.2" in note for note in without_gamma.notes)
 
 
+def test_a_multiple_of_the_period_is_not_the_period():
+    """Texture beside the bands looks like a fundamental of three periods: the row time was a third."""
+    row_time, frequency, scene = 21.65252404e-6, 572.6430877, 0.5 * draw_scene(HEIGHT, WIDTH, 481)
+    options = {"row_time": row_time, "start": 0.900165, "noise": 0.003, "seed": 500564}
+    found = calibrate_row_time(record_frames(lambda t: sine(t, frequency, 0.5), scene=scene, **options), frequency)
+    assert abs(found.row_time - row_time) < 3 * found.row_time_std
+    assert found.row_time == pytest.approx(row_time, rel=0.01)
+
+
 @pytest.mark.parametrize(("seed", "count"), [(0, 1), (1, 2)])
 def test_frames_without_flicker_are_refused(seed, count):
     frames = record_frames(np.ones_like, frames=count, scene=0.8 * draw_scene(HEIGHT, WIDTH, seed), noise=0.01)
