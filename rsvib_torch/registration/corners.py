@@ -34,6 +34,14 @@ _MIN_SHARE, _MIN_FOLLOWED = 0.25, 0.4
 # a twelfth of the rows have in common beside it. With 3 px from the affine motion alone, rows that vibrate by more were
 # left out: in five clips with tones of 2.4 and 1.7 px, restored rows moved by 0.05 to 0.08 px instead of 0.02 to 0.04
 _WOBBLE, _AGREE, _PARTS = 12.0, 3.0, 12
+# px, from one similarity, of half of the corners that decide; corners are of the layer up to twice as far from it. With
+# 1 px as the least, a subject on 40 % of the frame moves the path by 0.2 px rms, with 0.7 px by 0.05 px
+_LAYER_LIMITS = np.array([0.7, 1.4, 2.8, 5.6])
+# From the motion of the layer, in units of its limit, beyond which a corner moves apart from it; and the part of the
+# corners that must: where a subject moves like the scene for a moment, nothing is learned about it
+_APART, _LEAST_APART = 2.0, 0.1
+_DECIDING = 0.1  # of the corners; with 0.25, the path changed between a scene that vibrates and a subject
+_NO_CORNERS = np.zeros((0, 2)), np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +53,7 @@ class Corners:
     times: Array  # (N, 2) s, middle of the exposure of their rows in both frames
     places: Array  # (N, 2) px from the centre of the frame, (x, y), mean of both frames
     offsets: Array  # (N, 2) px
+    layer: NDArray[np.bool_]  # (N,) whether they move with the part of the scene that most corners have moved with
 
     @property
     def factors(self) -> Array:
@@ -56,7 +65,7 @@ class Corners:
     def joined(parts: Sequence["Corners"]) -> "Corners":
         """The corners of all pairs."""
         pairs = np.concatenate([np.full(len(part.rows), number) for number, part in enumerate(parts)])
-        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets"))
+        rest = ([getattr(part, name) for part in parts] for name in ("rows", "times", "places", "offsets", "layer"))
         return Corners(pairs, *(np.concatenate(values) for values in rest))
 
 
@@ -75,7 +84,7 @@ class CornerFollower:
         self._timing, self._most, self._consistent = timing, most, consistent
         self._start = 0.0  # s, of the frame before
         self._before: tuple[Grey, Grey | None] | None = None  # the frame before, of reduced size, and its mask
-        self._known: Points | None = None  # corners in it
+        self._known, self._votes = _NO_CORNERS  # corners in it, and the votes of each of them, see ``_from_layer``
 
     def next(self, grey: Grey, start: float, mask: Grey | None = None) -> Corners | None:
         """Corners between the frame before and this one (H, W), whose exposure starts at ``start`` in s.
@@ -86,17 +95,19 @@ class CornerFollower:
         # 1. Follow corners.
         (height, width), timing = grey.shape, self._timing
         scale = reduction(*grey.shape) if self._consistent else 1
-        before, known, second = self._before, self._known, _reduced(grey, scale)
+        before, known, voted, second = self._before, self._known, self._votes, _reduced(grey, scale)
         starts = np.array([self._start, start])
-        self._before, self._start, self._known = (second, mask), start, None
+        self._before, self._start = (second, mask), start
+        self._known, self._votes = _NO_CORNERS
         if before is None:
             return None
         found = find_corners(before[0], known, before[1], most=self._most)
+        votes, layer = np.pad(voted, (0, len(found) - len(voted))), np.ones(len(found), bool)
         ends, good = follow_corners(before[0], second, found)
         if mask is not None:
             x, y = ends[good].round().astype(np.int64).T
             good[good] = mask[y, x] > 0
-        found, ends = found[good], ends[good]
+        found, ends, votes, layer = found[good], ends[good], votes[good], layer[good]
         # 2. Keep those that follow one affine motion and the vibration of their rows.
         axis, count = (1, height) if timing.scan_axis == -2 else (0, width)
         if self._consistent:
@@ -104,15 +115,19 @@ class CornerFollower:
             least = min(_MIN_SHARE * len(good), _MIN_FOLLOWED * len(found))
             if agree.sum() < max(_MIN_CORNERS, least):
                 return None
-            found, ends = found[agree], ends[agree]
-            self._known = ends
+            found, ends, votes = found[agree], ends[agree], votes[agree]
+            distance = _from_layer(found, ends, votes, scale)
+            layer, apart = distance < 1, distance > _APART
+            if apart.mean() > _LEAST_APART:
+                votes = np.where(layer, votes + 1, np.where(apart, np.minimum(votes, 0) - 1, votes))
+            self._known, self._votes = ends, votes
         found, ends = ((points + 0.5) * scale - 0.5 for points in (found, ends))
         # 3. The times of their rows.
         rows = np.stack([found[:, axis], ends[:, axis]], -1)
         rows = rows if timing.readout_direction == "forward" else count - 1 - rows
         times = starts + rows * timing.row_time + 0.5 * timing.exposure_time
         places = 0.5 * (found + ends) - 0.5 * (np.array([width, height]) - 1)
-        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found)
+        return Corners(np.zeros(len(found), np.int64), rows[:, 0] / count, times, places, ends - found, layer)
 
 
 def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -> NDArray[np.bool_]:
@@ -136,6 +151,26 @@ def _agreeing(found: Points, ends: Points, axis: int, length: int, scale: int) -
     return agree
 
 
+def _from_layer(found: Points, ends: Points, votes: NDArray[np.int64], scale: int) -> Array:
+    """(N,) distance of corners from the motion of the layer that is followed, 1 at its limit; 0 if there is no layer.
+
+    A layer is a part of the scene that moves as one similarity. A vibration moves its rows apart: of several limits,
+    the smallest counts within which half of the corners that decide are. Frames are reduced by ``scale``; the ``votes``
+    of corners are the pairs in which they moved with the layer or, negative, apart from it.
+    """
+    # 1. The corners that decide: those that moved with the layer last, else those that did not move apart from it. A
+    # subject moves with the layer for a moment, and apart from it later.
+    least = max(_MIN_CORNERS, _DECIDING * len(votes))
+    decide = next((of for of in (votes > 0, votes >= 0) if of.sum() >= least), np.ones(len(found), bool))
+    # 2. The motion of the layer, and what moves like it.
+    for limit in _LAYER_LIMITS / scale:
+        similarity, inside = cv2.estimateAffinePartial2D(found[decide], ends[decide], ransacReprojThreshold=limit)
+        if similarity is not None and inside.mean() > 0.5:
+            rest = ends - found @ similarity[:, :2].T - similarity[:, 2]
+            return np.asarray(np.hypot(*rest.T) / (2 * limit))
+    return np.zeros(len(found))
+
+
 def reduction(height: int, width: int) -> int:
     """By how much the sides of frames are reduced before corners are followed."""
     return int(2 ** max(0, math.ceil(0.5 * math.log2(height * width / _MOST_PIXELS))))
@@ -149,9 +184,7 @@ def _reduced(frame: NDArray[np.uint8], scale: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def find_corners(
-    grey: NDArray[np.uint8], known: Points | None = None, mask: NDArray[np.uint8] | None = None, *, most: int
-) -> Points:
+def find_corners(grey: NDArray[np.uint8], known: Points, mask: NDArray[np.uint8] | None = None, *, most: int) -> Points:
     """The known corners (N, 2) of a frame (H, W), and new ones where a cell has less than half of its number.
 
     All cells of the frame have the same number; together, they have at most ``most`` corners. There are none where the
@@ -164,7 +197,6 @@ def find_corners(
     distance = max(3.0, 0.5 * side / math.sqrt(number))
     quality = cv2.cornerMinEigenVal(grey, 3)  # as in goodFeaturesToTrack
     floor = min(_NOISE * float(np.median(quality[::3, ::3])), _FAINT * float(quality.max()))
-    known = np.zeros((0, 2)) if known is None else known
     cells = np.floor(known / [width / columns, height / rows]).astype(int) @ [1, columns]
     filled = np.bincount(cells, minlength=rows * columns).reshape(rows, columns)
     corners = [known]
