@@ -21,7 +21,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import get_ident
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -52,21 +51,6 @@ _LEAST_VARIANCE = 0.01
 _NOISE_STEP = 4  # along the rows, every fourth frequency gives the noise power
 
 
-class _WarpedRows(Protocol):
-    """What ``row_gradients`` requires of the frames: ``RowSpectra``, or rows that were joined from strips."""
-
-    @property
-    def width(self) -> int: ...  # columns of a frame
-
-    @property
-    def length(self) -> int: ...  # of the transforms along the rows
-
-    @property
-    def frequencies(self) -> Tensor: ...  # (U,) cycles/px
-
-    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None: ...
-
-
 @dataclass(frozen=True, eq=False)
 class RowGradients:
     """Gradients of the scene for the rows of a group of G frames, and their products with the frames' differences."""
@@ -95,42 +79,40 @@ class RowGradients:
 
 
 def row_gradients(
-    spectra: _WarpedRows,
     warp: Callable[[slice], Tensor],
     runs: list[slice],
-    rows: Tensor,
     shift: Tensor,
     visible: Tensor,
-    *,
+    size: tuple[int, int],
+    valid: Tensor | None,
     factors: Callable[[slice], Tensor] | None = None,
 ) -> RowGradients:
     """Gradients of the scene, noise, and the weight of every pixel, from frames warped by a motion.
 
     Args:
-        spectra: The frames of a group.
-        warp: Function from a slice of the S rows of the scene to the frames warped to them, (B, G, s, U), as
+        warp: Function from a slice of the S rows of the scene to the frames of a group warped to them, (B, G, s, U), as
             ``RowSpectra.warped``. Threads call it.
         runs: Slices of the rows that are warped at a time.
-        rows: (B, G, S) frame rows of the S scene rows in each frame.
         shift: (B, G, S) px, displacement along the rows by which each was moved back.
         visible: (B, G, S) float64, 1 where a scene row is visible in a frame.
+        size: Columns of a frame, and length of the transforms along the rows.
+        valid: (B, S, W) bool, pixels of the scene that are valid in all frames; None for all.
         factors: Displacements (B, s, L, 2, A) of the pixels of some rows by unit components of the motion, x and y
             first; the derivatives by all of them are regressors. None if the displacement depends on the row only.
     """
-    length, width = spectra.length, spectra.width
-    compared = FrameComparison.of(warp, runs, visible)
-    detail, along, across, aliasing = scene_detail(compared, spectra.frequencies)
+    (batch, frames, count), (width, length) = visible.shape, size
+    mean, noise, different = _compared(warp, runs, visible)
+    detail, along, across, aliasing = _scene_detail(mean, noise, length)
     inner = functional.pad(inner_columns(width, shift, detail.real), (0, length - width))
-    valid = spectra.warped_valid(rows, shift)
-    parts = chunks(rows.shape[-1], 4 * length * len(rows) * (4 + rows.shape[1]), rows.device, multiple=BLOCK)
+    parts = chunks(count, 4 * length * batch * (4 + frames), visible.device, multiple=BLOCK)
     regressors = 3 if factors is None else 1 + factors(slice(0, 1)).shape[-1]
-    images_of_row = regressors + (1 if rows.shape[1] == 2 else rows.shape[1])
+    images_of_row = regressors + (1 if frames == 2 else frames)
     memory: dict[int, Tensor] = {}  # of each thread, used again
 
     def pixels(part: slice) -> _Rows:
         of_scene, part_visible = detail[:, part].contiguous(), visible[:, :, part]
         if get_ident() not in memory:
-            memory[get_ident()] = inner.new_empty(len(rows), parts[0].stop, images_of_row, length)
+            memory[get_ident()] = inner.new_empty(batch, parts[0].stop, images_of_row, length)
         planes = memory[get_ident()][:, : of_scene.shape[1]]
         planes[:, :, 0], planes[:, :, 1] = (
             torch.fft.irfft(one, n=length) for one in (of_scene * along, across[:, part])
@@ -139,7 +121,7 @@ def row_gradients(
             moved = factors(part).to(planes.dtype)
             by_component = moved[..., 0, :] * planes[:, :, 0, :, None] + moved[..., 1, :] * planes[:, :, 1, :, None]
             planes[:, :, : regressors - 1] = by_component.movedim(-1, 2)
-        for place, one in enumerate((of_scene, *compared.differences[:, :, part].unbind(1)), regressors - 1):
+        for place, one in enumerate((of_scene, *different[:, :, part].unbind(1)), regressors - 1):
             planes[:, :, place] = torch.fft.irfft(one, n=length)
         weight = inner * (part_visible.sum(1) > 1)[..., None].to(inner.dtype)
         if valid is not None:
@@ -147,8 +129,8 @@ def row_gradients(
         return _Rows(planes, weight, part_visible, regressors)
 
     edges = [width * number // 4 for number in range(1, 4)]
-    images = inner.new_empty(len(rows), rows.shape[-1], regressors, length)
-    fitted = in_parallel(lambda part: _fit_rows(pixels(part), edges, images[:, part]), parts, rows.device)
+    images = inner.new_empty(batch, count, regressors, length)
+    fitted = in_parallel(lambda part: _fit_rows(pixels(part), edges, images[:, part]), parts, visible.device)
     fits, blocks = ([part[place] for part in fitted] for place in (0, 1))
     block_weight = _block_weight(*(torch.cat(values, 1) for values in zip(*blocks, strict=True)))
     within = [slice(part.start // BLOCK, -(-part.stop // BLOCK)) for part in parts]
@@ -161,7 +143,7 @@ def row_gradients(
         weight = some.weight * spread[:, : some.weight.shape[1], :length]
         return _fit_rows(replace(some, weight=weight), edges, images[:, parts[place]])[0]
 
-    for place, fit in zip(reweighted, in_parallel(fit_again, reweighted, rows.device), strict=True):
+    for place, fit in zip(reweighted, in_parallel(fit_again, reweighted, visible.device), strict=True):
         fits[place] = fit
     sums, solution, square = (torch.cat(values, 1) for values in zip(*fits, strict=True))
     products, right = _products(sums.sum(2))
@@ -336,53 +318,48 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
     return torch.cat([products, change], dim=-1) * (visible[:, 0] * visible[:, -1])[..., None, None]
 
 
-@dataclass(frozen=True, eq=False)
-class FrameComparison:
-    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows."""
+def _compared(warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows.
 
-    # (B, R, U), over the frames in which a row is visible. R - S rows of zeros follow, so that transforms across rows
-    # are fast.
-    mean: Tensor
-    noise: Tensor  # (B, R, U / 4), a difference of two frames with the noise of their mean, at every fourth frequency
-    differences: Tensor  # (B, G, S, U), or (B, 1, S, U) of two frames, as from ``differences``
+    The mean (B, R, U) is over the frames in which a row is visible; R - S rows of zeros follow, so that transforms
+    across rows are fast. The noise (B, R, U / 4) is a difference of two frames with the noise of their mean, at every
+    fourth frequency. The differences are those of ``differences``; arguments as in ``row_gradients``.
+    """
 
-    @classmethod
-    def of(cls, warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> "FrameComparison":
-        """Compare frames warped to the scene; arguments as in ``row_gradients``."""
-
-        def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
-            warped, part_visible = warp(rows), visible[:, :, rows]
-            different = differences(warped, part_visible)
-            # half the difference of two frames has the noise of their mean
-            noise = (
-                different[:, 0, :, ::_NOISE_STEP]
-                if warped.shape[1] == 2
-                else _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
-            )
-            return mean_over_frames(warped, part_visible), noise, different
-
-        means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
-        missing = fast_length(visible.shape[2]) - visible.shape[2]
-        mean, noise = (
-            torch.cat([*parts, parts[0].new_zeros(len(visible), missing, parts[0].shape[-1])], 1)
-            for parts in (means, noises)
+    def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+        warped, part_visible = warp(rows), visible[:, :, rows]
+        different = differences(warped, part_visible)
+        # half the difference of two frames has the noise of their mean
+        noise = (
+            different[:, 0, :, ::_NOISE_STEP]
+            if warped.shape[1] == 2
+            else _noise_of_mean(warped[..., ::_NOISE_STEP], part_visible)
         )
-        return cls(mean, noise, torch.cat(different, 2))
+        return mean_over_frames(warped, part_visible), noise, different
+
+    means, noises, different = zip(*in_parallel(of_run, runs, visible.device), strict=True)
+    missing = fast_length(visible.shape[2]) - visible.shape[2]
+    mean, noise = (
+        torch.cat([*parts, parts[0].new_zeros(len(visible), missing, parts[0].shape[-1])], 1)
+        for parts in (means, noises)
+    )
+    return mean, noise, torch.cat(different, 2)
 
 
-def scene_detail(compared: FrameComparison, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _scene_detail(mean: Tensor, noise: Tensor, length: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Detail of the scene and its derivatives, by a Wiener filter ``1 - N / P`` of the mean of the frames.
 
     P is the power spectrum of the mean and N that of its noise, both smoothed over 16 x 16 frequencies. The pass band
     excludes shading (below 1/64 cycles/px) and the frequencies that interpolation attenuates; those that are aliased
-    are attenuated. ``u`` (U,) are the frequencies along rows in cycles/px. The result has the spectrum (B, R, U) of the
+    are attenuated. ``length`` is that of the transforms along rows. The result has the spectrum (B, R, U) of the
     detail, the factors (B, 1, U) in px^-1 that make of it the derivative along the rows, the spectrum (B, R, U) of the
     derivative across them, and the size of the bias (B,) in px by aliasing. Neighbours in memory belong to one
     frequency. Both derivatives have the size with which they predict the differences of the frames.
     """
     # 1. Powers. Transforms across rows leave the rows contiguous in memory, and all later loops run along them.
-    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (compared.mean, compared.noise))
-    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=u.device)
+    whole, noise = (torch.fft.fft(rows, dim=-2).transpose(-2, -1) for rows in (mean, noise))
+    u = torch.fft.rfftfreq(length, dtype=torch.float64, device=mean.device)
+    v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=mean.device)
     total, noise_power = _smoothed(whole, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
     of_blocks = _of_blocks(u), _of_blocks(v)
     bands = _pass_bands(*of_blocks)
@@ -463,7 +440,7 @@ def _aliasing_bias(scene_power: Tensor, u: Tensor, along: Tensor, across: Tensor
 
 
 def _of_blocks(frequencies: Tensor) -> Tensor:
-    """Mean sizes (U / 16,) of neighbouring frequencies (U,), as the powers in ``scene_detail``."""
+    """Mean sizes (U / 16,) of neighbouring frequencies (U,), as the powers in ``_scene_detail``."""
     means: Tensor = functional.avg_pool1d(frequencies.abs()[None], _SMOOTH, ceil_mode=True)[0]
     return means
 

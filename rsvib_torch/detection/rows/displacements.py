@@ -163,25 +163,13 @@ def measure_group(
     warp = warp_to_scene(spectra, positions, timing, motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     if gradients is None:
-        gradients = row_gradients(spectra, warp, runs_of_rows, positions.rows, positions.shift, visible)
+        valid = spectra.warped_valid(positions.rows, positions.shift)
+        size = spectra.width, spectra.length
+        gradients = row_gradients(warp, runs_of_rows, positions.shift, visible, size, valid)
         products = gradients.residual_products
     else:
         products = residual_products(warp, runs_of_rows, gradients, visible)
     return _measured(group, timing, motion, positions.exposure_starts, visible, gradients, products), gradients
-
-
-@dataclass(frozen=True, eq=False)
-class _JoinedRows:
-    """Rows of full width, joined from strips that were warped alone; as ``RowSpectra`` for ``row_gradients``."""
-
-    width: int  # columns of a frame
-    length: int  # of the transforms along the rows
-    frequencies: Tensor  # (U,) cycles/px
-    valid: Tensor | None  # (B, S, W) bool, pixels of the scene that are valid in all frames; None for all
-
-    def warped_valid(self, rows: Tensor, shift: Tensor) -> Tensor | None:
-        """``valid``: the strips have been warped."""
-        return self.valid
 
 
 def measure_strips(
@@ -228,20 +216,18 @@ def measure_strips(
 
     if gradients is None:
         valid = spectra.warped_valid(positions.rows, positions.shift)
-        whole = None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999
-        frequencies = torch.fft.rfftfreq(length, dtype=torch.float64, device=positions.rows.device)
-        shape = _JoinedRows(strips.frame_width, length, frequencies, whole)
-        x = torch.arange(length, device=frequencies.device) - 0.5 * (strips.frame_width - 1)
+        x = torch.arange(length, device=visible.device) - 0.5 * (strips.frame_width - 1)
         x = x - over_strips(positions.columns)[:, 0]  # (B, 1, L)
         y = over_strips(positions.scene_rows)[:, 0, 0, :, None] - 0.5 * (spectra.height - 1)
+        # a lens may displace invisible rows by any amount
+        largest_shift = over_strips(positions.shift).abs().amax(1) * (visible > 0)
         gradients = row_gradients(
-            shape,
             joined,
             runs_of_rows,
-            over_strips(positions.rows)[:, 0],
-            over_strips(positions.shift).abs().amax(1)
-            * (visible > 0),  # a lens may displace invisible rows by any amount
+            largest_shift,
             visible,
+            (strips.frame_width, length),
+            None if valid is None else strips.joined(valid.to(spectra.values.real.dtype)) > 0.999,
             factors=lambda part: factors(x, y[:, part]),
         )
         products = gradients.residual_products
