@@ -146,7 +146,7 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
     # 3. Uncertainty: what the residual does not contain. Fits with hardly more measurements than parameters are exact
     # for any errors; a part of the scene has the same errors in all frames; aliasing biases the displacements; the
     # record may contain a further tone. The displacement is that of every eighth row of all frames.
-    intervals = table(compared_intervals(timing, num_frames, method.max_group_frames))
+    intervals = compared_intervals(timing, num_frames, method.max_group_frames)
     row_starts = table(timing.row_starts(num_frames, height)[:, ::8].flatten())
     measurements = fitted.measurements
     if fitted.refined is None:
@@ -253,7 +253,7 @@ def fit_directly(
     """The fit to bands, refined on the images row by row."""
     # The gradients of rows reach a few tenths of a pixel, so that a start with an error of 0.15 px converges.
     fit = _tones_of_bands(start, timing, options, accuracy=0.15)
-    intervals = table(compared_intervals(timing, stacks.images.shape[1], MAX_GROUP_FRAMES))
+    intervals = compared_intervals(timing, stacks.images.shape[1])
     motion = motion_of_fit(shrunk(fit, intervals), stacks.images.device)
     scale, doubtful = hypothesis.scale, hypothesis.is_doubtful
     if scale.same_for_all_columns:

@@ -229,10 +229,9 @@ EVERY = 4  # rows; every fourth row is enough to estimate a column pattern
 # amplitudes by a tenth of their standard deviation; errors of interpolation of up to 6e-5 were subtracted as a pattern
 # in 5 of 36 recordings without one, which took up to 1.6 times as long
 _LEAST_PATTERN = 3e-4
-_Group = tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]
 
 
-def column_pattern(groups: list[_Group]) -> Tensor | None:
+def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]]) -> Tensor | None:
     """Spectrum (B, U), shrunk by its noise, of a pattern that is added to every row of every frame at the same columns.
 
     Such a pattern is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion,
@@ -244,12 +243,6 @@ def column_pattern(groups: list[_Group]) -> Tensor | None:
     some of their rows, and the residual variance (B M, S) of these rows. Rows whose variance exceeds three times the
     median (objects that move by themselves) are left out.
     """
-    # half of the rows are enough to find out that there is no pattern
-    return None if _pattern_of(groups, 2) is None else _pattern_of(groups, 1)
-
-
-def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
-    """``column_pattern`` from every ``step``-th row."""
     correlation, power, energy, count = (torch.zeros((), dtype=torch.float32, device="cpu") for _ in range(4))
     stacks = len(groups[0][0].values)
 
@@ -258,10 +251,9 @@ def _pattern_of(groups: list[_Group], step: int) -> Tensor | None:
         total: Tensor = values.unflatten(0, (stacks, -1)).sum(1)
         return total
 
-    for spectra, *places in groups:
-        rows, shift, visible, variance = (values[..., ::step] for values in places)
+    for spectra, rows, shift, shown, variance in groups:
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values
-        visible = visible * ((variance > 0) & (variance < 3.0 * typical))[:, None]
+        visible = shown * ((variance > 0) & (variance < 3.0 * typical))[:, None]
         visible = visible * (visible.sum(1, keepdim=True) > 1)
         # the ends of rows stay in place as well
         inner = inner_columns(spectra.width, shift, spectra.values.real)[:, None]

@@ -11,7 +11,7 @@ import torch
 
 from rsvib_torch.detection.measurements import OtherMotion
 from rsvib_torch.detection.refinement import refine
-from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
+from rsvib_torch.detection.rows.displacements import compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.tones.fit import MotionModel, ToneFit, motion_of_fit, residual_of, shrunk
@@ -185,7 +185,7 @@ def _measured_with(
     timing = clock.timing(size)
     curve = band_curve(stack.images, stack.valid, timing, options, mere_start=True)
     start, _ = robust_fit(measurements_of_curve(curve, timing, options.band_step), frequencies, active, MotionModel())
-    intervals, device = table(compared_intervals(timing, stack.images.shape[1], MAX_GROUP_FRAMES)), stack.images.device
+    intervals, device = compared_intervals(timing, stack.images.shape[1]), stack.images.device
     exposure = None
     for _ in range(4):
         rows = grouped_frames(stack.images, stack.valid, timing, motion_of_fit(shrunk(start, intervals), device))

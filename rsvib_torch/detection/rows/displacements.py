@@ -20,7 +20,6 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.warping import Positions, differently_blurred, second_moments, warp_to_scene
 from rsvib_torch.execution.chunking import chunks, runs
-from rsvib_torch.execution.progress import steps
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
@@ -78,12 +77,10 @@ class FrameGroups:
 # Groups of frames
 
 
-def compared_intervals(
-    timing: RowTiming, num_frames: int, max_group_frames: int, device: torch.device | None = None
-) -> Tensor:
+def compared_intervals(timing: RowTiming, num_frames: int, max_group_frames: int = MAX_GROUP_FRAMES) -> Array:
     """Times (M,) in seconds between all frames that are compared with each other in groups of limited size."""
-    starts = timing.frame_starts(num_frames, device)
-    return torch.cat([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
+    starts = table(timing.frame_starts(num_frames))
+    return np.concatenate([starts[step:] - starts[:-step] for step in range(1, min(num_frames, max_group_frames))])
 
 
 def stack_spectra(frames: Tensor, valid: Tensor | None, strips: ColumnStrips | None = None) -> RowSpectra:
@@ -312,26 +309,6 @@ def _in_blocks(values: Tensor) -> Tensor:
     return blocks
 
 
-def measure_groups(
-    groups: list[FrameGroups],
-    timing: RowTiming,
-    motion: Motion,
-    gradients: list[RowGradients] | None = None,
-    *,
-    keep_images: bool = True,
-) -> tuple[Measurements, list[RowGradients]]:
-    """``measure_group`` of all groups, the measurements as one record; ``keep_images`` for further rounds."""
-    known = [None] * len(groups) if gradients is None else gradients
-    measured, advance = [], steps(sum(group.count for group in groups), "groups")
-    for group, of_group in zip(groups, known, strict=True):
-        part, of_part = measure_group(group, timing, motion, of_group)
-        measured.append((part, of_part if keep_images else of_part.without_images()))
-        advance(group.count)
-    count = sum(group.count for group in groups)
-    measurements = joined_groups([part for part, _ in measured], timing.exposure_time, count)
-    return measurements, [of_group for _, of_group in measured]
-
-
 def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int = 1) -> Measurements:
     """Measurements of all groups as one record, by one transfer to the CPU.
 
@@ -375,34 +352,37 @@ def column_pattern_of(
     return column_pattern(parts)
 
 
-def differential_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
+_SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the rows are found
+
+
+def differential_motion(gradients: list[RowGradients], stacks: int) -> Array:
     """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
 
     Rotation of the camera and parallax move the halves differently. Arguments as in ``_rms_of_contrasts``.
     """
-    return _rms_of_contrasts(gradients, stacks, rows, [[-1.0, 1.0]])
+    return _rms_of_contrasts(gradients, stacks, [[-1.0, 1.0]])
 
 
-def uneven_motion(gradients: list[RowGradients], stacks: int, *, rows: int = 64) -> Array:
+def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
     """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
 
     Parallax, clouds and objects that move by themselves cause it, roll and zoom do not. Arguments as in
     ``_rms_of_contrasts``.
     """
     quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
-    return _rms_of_contrasts(gradients, stacks, rows, [quadratic, cubic])
+    return _rms_of_contrasts(gradients, stacks, [quadratic, cubic])
 
 
-def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, weights: list[list[float]]) -> Array:
+def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, weights: list[list[float]]) -> Array:
     """(B, 2) px, root of the trimmed mean of the sum of squared contrasts between the parts of the rows; without noise.
 
-    The gradients are those of all groups of B ``stacks``; sums are taken over ``rows`` rows. The weights of each
-    contrast are those of the parts. Noise also scatters the mean, of which two standard deviations are subtracted: of
-    48 axes of pairs of 192 rows with noise of 0.025, 11 seemed to roll.
+    The gradients are those of all groups of B ``stacks``. The weights of each contrast are those of the parts. Noise
+    also scatters the mean, of which two standard deviations are subtracted: of 48 axes of pairs of 192 rows with noise
+    of 0.025, 11 seemed to roll.
     """
     found = []
     for of_group in gradients:
-        residual, noise, regular = displacements_of_parts(of_group, rows, len(weights[0]))
+        residual, noise, regular = displacements_of_parts(of_group, len(weights[0]))
         contrasts = residual.new_tensor(weights)
         variance = contrasts.square() @ noise
         excess = ((contrasts @ residual).square() - variance).sum(2)
@@ -415,14 +395,14 @@ def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, rows: int, wei
     return np.sqrt(np.maximum(excess_of_stacks - 2 * np.sqrt(variance_of_stacks / count), 0.0))
 
 
-def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual displacements of 2 or 4 parts of the rows from first to last frame, from sums over ``rows`` rows.
+def displacements_of_parts(gradients: RowGradients, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
+    """Residual displacements of 2 or 4 parts of the rows from first to last frame, from sums over 64 rows.
 
     Returns:
         The differences of the displacements (B, N, parts, 2) in px, the variance of their noise, and (B, N) whether all
         parts have structure along both directions.
     """
-    sums = gradients.quarters.unflatten(2, (parts, -1)).sum(3)
+    sums, rows = gradients.quarters.unflatten(2, (parts, -1)).sum(3), _SUMMED_ROWS
     count = sums.shape[1] // rows * rows
     weight = torch.where(gradients.variance > 0, 1 / gradients.variance.clamp(min=1e-300), 0.0)[:, :count, None, None]
     hxx, hxy, hyy, bx, by = (sums[:, :count] * weight).unflatten(1, (-1, rows)).sum(2).unbind(-1)
@@ -437,23 +417,22 @@ def displacements_of_parts(gradients: RowGradients, rows: int, parts: int = 4) -
 # Contradictions of the exposure time
 
 _SCATTER_ROWS = 32  # px, rows whose errors of interpolation count as one
+_LOWEST, _HIGHEST = 1 / 64, 0.15  # cycles/px; shading lies below, and a blur of 2 px is expanded to 20 % above
 
 
-def blur_ratio(
-    groups: list[FrameGroups], timing: RowTiming, motion: Motion, *, block: int = 2, highest: float = 0.15
-) -> tuple[Tensor, Tensor, Tensor]:
+def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> Tensor:
     """Difference of the blur of neighbouring frames, relative to that of the exposure time and the motion.
 
     An exposure blurs a row to second order by ``1 + M : grad grad / 2`` with the second moments M of the path. The
     difference of two warped frames is fitted by ``ratio (M_2 - M_1) : grad grad m / 2 + gain m``, m their mean. The
     offsets determine the motion, so that ``ratio = (T_e / stated T_e)^2`` for slow tones. Only coarse detail is
-    compared, along and across rows: interpolation errors of fine detail increase the ratio. Three blocks of ``block``
-    rows are averaged with the weights 1/4, 1/2, 1/4; ``highest`` is in cycles/px along rows, below which the expansion
-    is used; a blur of 2 px is then expanded to 20 %.
+    compared, along and across rows: interpolation errors of fine detail increase the ratio. Three blocks of two rows
+    are averaged with the weights 1/4, 1/2, 1/4.
 
     Returns:
-        (B,) each: ratio, its standard deviation, and the size of the expected difference relative to m.
+        (B, 3): ratio, its standard deviation, and the size of the expected difference relative to m.
     """
+    block = 2
     parts: list[Tensor] = []
     counts: list[Tensor] = []
     for group in groups:
@@ -461,7 +440,7 @@ def blur_ratio(
         of_groups = group.motion_of_groups(motion)
         positions = Positions.of(group.starts_of_groups, group.spectra.height, timing, of_groups)
         u = group.spectra.frequencies
-        low = slice(int((u <= 1 / 64).sum()), int((u < highest).sum()))  # shading affects frequencies below 1/64
+        low = slice(int((u <= _LOWEST).sum()), int((u < _HIGHEST).sum()))
         low_spectra = group.spectra.band(low).in_groups(group.count)
 
         def averaged(values: Tensor) -> Tensor:
@@ -509,4 +488,4 @@ def blur_ratio(
     variance = 8 / 3 * inverse[:, 0, 0] * (square - (solution * right).sum(-1)).clamp(min=0.0) / count
     scores = products[:, :, :2, 2] - (products[:, :, :2, :2] @ solution[:, None, :, None])[..., 0]
     scatter = (scores @ inverse[:, 0, :, None]).square().sum((1, 2))
-    return solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]
+    return torch.stack([solution[:, 0], torch.maximum(variance, scatter).sqrt(), scale[:, 0] / scale[:, 1]], -1)

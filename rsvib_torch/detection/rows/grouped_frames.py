@@ -5,7 +5,7 @@ Invariant: the displacement depends on the row only (docs/architecture.md), in e
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -14,13 +14,14 @@ from torch import Tensor
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
 from rsvib_torch.detection.rows.displacements import (
     FrameGroups,
+    MeasuredGroup,
     blur_ratio,
     column_pattern_of,
     differential_motion,
     displacements_of_parts,
     frame_groups,
     joined_groups,
-    measure_groups,
+    measure_group,
     measure_strips,
     stack_spectra,
     uneven_motion,
@@ -91,16 +92,31 @@ class GroupedFrames:
     groups: list[FrameGroups]  # the frames
     timing: RowTiming  # the sensor, in row order
 
+    unit: ClassVar[str] = "groups"  # of the progress
+
     def measure(
-        self,
-        motion: Vibration | FreeMotion,
-        gradients: list[RowGradients] | None = None,
-        *,
-        keep_images: bool = True,
+        self, motion: Vibration | FreeMotion, gradients: list[RowGradients] | None = None, *, keep_images: bool = True
     ) -> MeasuredRows:
-        """Measurements around a motion, see ``measure_groups``."""
-        view = self.view(motion)
-        return MeasuredRows(*measure_groups(self.groups, self.timing, view, gradients, keep_images=keep_images))
+        """All groups measured around a motion, as one record; ``keep_images`` for further rounds."""
+        known = [None] * len(self.groups) if gradients is None else gradients
+        count, view = sum(group.count for group in self.groups), self.view(motion)
+        parts, found, advance = [], [], steps(count, self.unit)
+        for group, of_group in zip(self.groups, known, strict=True):
+            part, of_part = self.measure_group(group, motion, view, of_group)
+            parts.append(part)
+            found.append(of_part if keep_images else of_part.without_images())
+            advance(group.count)
+        return MeasuredRows(joined_groups(parts, self.timing.exposure_time, count), found, self.apart(found))
+
+    def measure_group(
+        self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None
+    ) -> tuple[MeasuredGroup, RowGradients]:
+        """``displacements.measure_group`` around a motion, which the measured stacks have the ``view`` of."""
+        return measure_group(group, self.timing, view, gradients)
+
+    def apart(self, gradients: list[RowGradients]) -> Array | None:
+        """``MeasuredRows.apart``."""
+        return None
 
     def view(self, motion: Vibration | FreeMotion) -> Motion:
         """The motion of the stacks that are measured, with two components."""
@@ -128,7 +144,7 @@ class GroupedFrames:
 
     def blur_ratio(self, motion: Vibration) -> Tensor:
         """(B, 3) ratio, standard deviation and size as in ``displacements.blur_ratio``."""
-        return torch.stack(blur_ratio(self.groups, self.timing, self.view(motion)), -1)
+        return blur_ratio(self.groups, self.timing, self.view(motion))
 
     def differently_blurred(self, motion: Vibration) -> Array:
         """Whether the frames of any group of each stack are blurred differently, (B,) bool, as in ``warping``."""
@@ -140,10 +156,15 @@ class GroupedFrames:
         return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in of_groups], 1).any(1))
 
 
-def grouped_frames(frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration) -> GroupedFrames:
-    """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given."""
-    spectra = stack_spectra(frames, valid)
-    return GroupedFrames(frame_groups(spectra, timing, motion, pairs="very different"), timing)
+def grouped_frames(
+    frames: Tensor, valid: Tensor | None, timing: RowTiming, motion: Vibration | FreeMotion
+) -> GroupedFrames:
+    """Frames (B, T, H, W) in groups for a motion of two components, of which a first estimate is given.
+
+    Pairs, whose blur can be equalised, are enough for tones; a free motion needs all frames that contain a row.
+    """
+    pairs: Literal["never", "very different"] = "never" if isinstance(motion, FreeMotion) else "very different"
+    return GroupedFrames(frame_groups(stack_spectra(frames, valid), timing, motion, pairs=pairs), timing)
 
 
 # Strips
@@ -166,30 +187,19 @@ class GroupedStrips(GroupedFrames):
     num_frames: int  # frames of a stack
     slide: float  # px, difference of the displacements of the middle of a strip and its ends
 
-    def measure(
-        self,
-        motion: Vibration | FreeMotion,
-        gradients: list[RowGradients] | None = None,
-        *,
-        keep_images: bool = True,
-    ) -> MeasuredRows:
-        """Components of the motion of every row (B, N, G, A)."""
-        known = [None] * len(self.groups) if gradients is None else gradients
-        view, measured, advance = self.view(motion), [], steps(len(self.groups), "groups of strips")
-        for group, of_group in zip(self.groups, known, strict=True):
-            factors = self.scale.factors
-            part, of_part = measure_strips(group, self.timing, motion, view, self.strips, factors, of_group)
-            measured.append((part, of_part if keep_images else of_part.without_images()))
-            advance()
-        gradients = [of_group for _, of_group in measured]
-        measurements = joined_groups([part for part, _ in measured], self.timing.exposure_time, len(self.groups))
-        return MeasuredRows(measurements, gradients, self._apart(gradients))
+    unit: ClassVar[str] = "groups of strips"
 
-    def _apart(self, gradients: list[RowGradients], *, rows: int = 64) -> Array:
-        """``MeasuredRows.apart``, from sums over parts of ``rows`` rows."""
+    def measure_group(
+        self, group: FrameGroups, motion: Motion, view: Motion, gradients: RowGradients | None
+    ) -> tuple[MeasuredGroup, RowGradients]:
+        """Components (B, N, G, A) of the motion of the rows of a group."""
+        return measure_strips(group, self.timing, motion, view, self.strips, self.scale.factors, gradients)
+
+    def apart(self, gradients: list[RowGradients]) -> Array:
+        """``MeasuredRows.apart``."""
         excesses = []
         for of_group in gradients:
-            residual, noise, regular = displacements_of_parts(of_group, rows)
+            residual, noise, regular = displacements_of_parts(of_group)
             share = 1 - 0.5 * self.scale.axes / residual.shape[2]  # the fit of the components takes part of both
             excess = 0.5 * (residual.square() - share * noise).mean(2) / share
             excesses.append(torch.where(regular[..., None], excess, torch.nan))

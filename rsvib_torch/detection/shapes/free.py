@@ -19,8 +19,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import frame_groups, stack_spectra
-from rsvib_torch.detection.rows.grouped_frames import GroupedFrames, GroupedStrips, MeasuredRows, grouped_strips
+from rsvib_torch.detection.rows.grouped_frames import (
+    GroupedFrames,
+    GroupedStrips,
+    MeasuredRows,
+    grouped_frames,
+    grouped_strips,
+)
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.start import band_curve, measurements_of_curve
 from rsvib_torch.detection.strips import FieldScale, camera_in_row_order
@@ -285,9 +290,7 @@ def measure_freely(
     measured = measurements_of_curve(curve, timing, bands.band_step)
     fit = _fit_spline(measured, max(spacing, 0.5 * bands.band_rows * timing.row_time), record)
     motion = _motion(fit)
-    rows = GroupedFrames(
-        frame_groups(stack_spectra(stack.images, stack.valid), timing, motion.to(stack.images.device)), timing
-    )
+    rows = grouped_frames(stack.images, stack.valid, timing, motion.to(stack.images.device))
     return *_rounds(rows, motion, spacing, record, iterations), spacing
 
 

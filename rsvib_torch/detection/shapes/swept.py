@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rsvib_torch.checks.arguments import check_shapes
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.rows.displacements import frame_groups, measure_groups, stack_spectra
+from rsvib_torch.detection.rows.grouped_frames import grouped_frames
 from rsvib_torch.detection.sensitivity import displacements_by_row_time
 from rsvib_torch.detection.shapes.free import (
     MAX_BAND_ERROR,
@@ -218,12 +218,11 @@ def _detect(
     def motion_of(values: Tensor) -> FreeMotion:
         return _motion(values, record, _step(values, record, rowwise))
 
-    groups = frame_groups(
-        stack_spectra(stack.images, stack.valid), rowwise, motion_of(fits).expanded(1).to(stack.images.device)
-    )
+    device = stack.images.device
+    frames = grouped_frames(stack.images, stack.valid, rowwise, motion_of(fits).expanded(1).to(device))
     for _ in range(iterations):
         motion = motion_of(fits)
-        measured, _ = measure_groups(groups, rowwise, motion.expanded(1).to(stack.images.device), keep_images=False)
+        measured = frames.measure(motion.expanded(1).to(device), keep_images=False).measurements
         weighed = measured.reweighted(residual_of_motion(measured, motion))
         starts = [_with_aliases(start, (record[1] - record[0]) / len(stack.images[0])) for start in starts]
         solved = [_settle(weighed, axis, record, starts[axis]) for axis in range(2)]
@@ -248,15 +247,15 @@ def _detect(
         changes = torch.linalg.lstsq(design, data[..., None], driver="gelsd").solution  # (2, 6, 1) of the parameters
         covariances = covariances + changes @ changes.mT
     uncertain = torch.stack([_rms_std(columns[i], covariances[i]) for i in range(2)])
-    moved, frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
+    moved, num_frames = tensor(rms_motion(measured, motion)), len(stack.images[0])
     against = bands_reasons(curve, stack.images.shape[-1], banded, motion)
     chance = _chance(banded, motion, pairs, _STARTS * ((record[1] - record[0]) * highest) ** 2)
     for axis, error in enumerate(band_errors(banded, motion)):
         if error > MAX_BAND_ERROR and chance[axis] > _MAX_CHANCE:
             against[axis].append(Reason("tone_of_chance", AXIS_NAMES[axis], chance[axis], _MAX_CHANCE))
     step_done()
-    intervals = np.diff(table(rowwise.frame_starts(frames)))
-    return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, frames, intervals)
+    intervals = np.diff(table(rowwise.frame_starts(num_frames)))
+    return _Fitted(fits, covariances, record, moved, rest, uncertain, against, others, num_frames, intervals)
 
 
 def _chance(banded: Measurements, motion: FreeMotion, pairs: int, candidates: float) -> list[float]:
