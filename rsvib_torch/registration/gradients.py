@@ -211,10 +211,9 @@ class _Rows:
 def _fit_rows(rows: _Rows, edges: list[int], out: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Least-squares fit of the differences of the frames by gradients, detail and a constant, row by row.
 
-    ``edges`` are the first columns of the parts of the rows but the first. The images of ``RowGradients`` are written
-    into ``out`` (B, s, A + 1, L). The result has the products from ``_sums_of_parts``, the coefficients (B, s, G, A +
-    2) of the fit and the weighted sum (B, s) of its squared residuals in one frame; and the arguments of
-    ``_block_weight``.
+    The images of ``RowGradients`` are written into ``out`` (B, s, A + 1, L). The result has the products from
+    ``_sums_of_parts``, whose ``edges`` are given, the coefficients (B, s, G, A + 2) of the fit and the weighted sum (B,
+    s) of its squared residuals in one frame; and the arguments of ``_block_weight``.
     """
     images, residual = rows.planes[:, :, : rows.regressors], rows.planes[:, :, rows.regressors :]
     weighted = torch.mul(images, rows.weight[:, :, None], out=out)
@@ -250,7 +249,7 @@ def _means(products: Tensor) -> Tensor:
 def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
     """Products (B, s, parts, A + 2, A + 2 + G) float64 of weighted images and ones with images, differences and ones.
 
-    ``weighted`` (B, s, A + 1, L) is weight times images; ``edges`` as in ``_fit_rows``.
+    ``edges`` are the first columns of the parts of the rows but the first.
     """
     count, parts = weighted.shape[2], len(edges) + 1
     sums = weighted.new_empty(*weighted.shape[:2], parts, count + 1, 1 + rows.planes.shape[2], dtype=torch.float64)
@@ -267,10 +266,7 @@ def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
 
 
 def _solve(products: Tensor, right: Tensor) -> Tensor:
-    """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail.
-
-    ``products`` (B, s, A + 2, A + 2) are those of images and ones, ``right`` (B, s, G, A + 2) those with differences.
-    """
+    """Coefficients (B, s, G, A + 2) of the fit, with a relative regularisation of 1e-6; 0 for rows without detail."""
     diagonal = products.diagonal(dim1=-2, dim2=-1)
     usable = (diagonal > 0).all(-1)[..., None]
     scale = torch.where(usable, diagonal.clamp(min=1e-300).rsqrt(), 0.0)
@@ -298,8 +294,8 @@ def _block_weight(energy: Tensor, slope: Tensor, share: Tensor) -> Tensor:
     """Weight (B, N, M) in 0 ... 1 of blocks, small where the residual exceeds noise and a small shift.
 
     Objects that move by themselves, clouds and parallax leave such residuals. The weight is ``1 / (1 + (r - 1)^2)`` for
-    r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``. ``energy`` and ``slope`` (B, N,
-    M) are weighted sums of the squared residual and gradient over each block, ``share`` is that of the weights.
+    r > 1, with r the mean square of the residual over ``9 median + (0.15 px)^2 |g|^2``. Over each block, ``energy`` and
+    ``slope`` are sums of the squared residual and gradient, ``share`` is that of the weights.
     """
     used = share > 0
     mean, slope = energy / share.clamp(min=1e-6), slope / share.clamp(min=1e-6)
@@ -319,11 +315,9 @@ def _quarters(sums: Tensor, solution: Tensor, visible: Tensor) -> Tensor:
 
 
 def _compared(warp: Callable[[slice], Tensor], runs: list[slice], visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean of the frames of a group, its noise and the differences of the frames: spectra along S scene rows.
+    """Mean (B, R, U) of warped frames, its noise (B, R, U / 4) and their ``differences``, spectra along S scene rows.
 
-    The mean (B, R, U) is over the frames in which a row is visible; R - S rows of zeros follow, so that transforms
-    across rows are fast. The noise (B, R, U / 4) is a difference of two frames with the noise of their mean, at every
-    fourth frequency. The differences are those of ``differences``; arguments as in ``row_gradients``.
+    R - S rows of zeros follow, so that transforms across rows are fast. Every fourth frequency gives the noise.
     """
 
     def of_run(rows: slice) -> tuple[Tensor, Tensor, Tensor]:
@@ -361,25 +355,24 @@ def _scene_detail(mean: Tensor, noise: Tensor, length: int) -> tuple[Tensor, Ten
     u = torch.fft.rfftfreq(length, dtype=torch.float64, device=mean.device)
     v = torch.fft.fftfreq(whole.shape[-1], dtype=torch.float64, device=mean.device)
     total, noise_power = _smoothed(whole, _SMOOTH), _smoothed(noise, _SMOOTH // _NOISE_STEP)
-    of_blocks = _of_blocks(u), _of_blocks(v)
-    bands = _pass_bands(*of_blocks)
+    x, y = (functional.avg_pool1d(f.abs()[None], _SMOOTH, ceil_mode=True)[0] for f in (u, v))  # means of blocks
+    bands = _pass_bands(x, y)
     # 2. The filter.
     wiener = (1 - noise_power / total.clamp(min=torch.finfo(total.dtype).tiny)).clamp(min=0.0)
-    filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, of_blocks[0], *bands)
+    filtered = wiener * _with_little_aliasing(total - noise_power, noise_power, x, *bands)
     torch.view_as_real(whole).mul_(_in_pass_band(filtered, u, v)[..., None])
     # 3. A filter that attenuates frequencies of the scene makes derivatives d too small for least squares: with the
     # true ones g, the sum of ``d g`` is larger than that of ``d^2``.
     passed = filtered * torch.outer(*bands).to(filtered.dtype)
     products, squares = passed * wiener * total, passed.square() * total
-    x, y = (f.square().to(filtered.dtype) for f in of_blocks)
     larger_x, larger_y = (
         ((products * f).sum((1, 2)) / (squares * f).sum((1, 2)).clamp(min=1e-30)).clamp(min=1.0)[:, None, None]
-        for f in (x[:, None], y)
+        for f in (x.square().to(filtered.dtype)[:, None], y.square().to(filtered.dtype))
     )
     detail = torch.fft.ifft(whole)
     whole *= (2j * math.pi * v).to(whole.dtype) * larger_y
     across = torch.fft.ifft(whole)
-    aliasing = _aliasing_bias(total - noise_power, of_blocks[0], *bands)
+    aliasing = _aliasing_bias(total - noise_power, x, *bands)
     along = (2j * math.pi * u).to(whole.dtype) * larger_x
     return detail.transpose(-2, -1), along, across.transpose(-2, -1), aliasing
 
@@ -415,12 +408,15 @@ def _with_little_aliasing(scene_power: Tensor, noise_power: Tensor, u: Tensor, a
 
 
 def _pass_bands(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Low passes of the gradients along and across rows.
+    """Low passes of the gradients along rows, where detail may be aliased, and across them, where splines attenuate it.
 
-    Along rows, interpolation is exact, but detail near 0.5 cycles/px may be aliased; across rows, the spline
-    attenuates it earlier.
+    They are 1 below a frequency in cycles/px, 0 above another one, and half a cosine between.
     """
-    return _low_pass(u, 0.40, 0.48), _low_pass(v, 0.24, 0.34)
+    along, across = (
+        0.5 + 0.5 * torch.cos(math.pi * ((frequency.abs() - low) / (high - low)).clamp(0.0, 1.0))
+        for frequency, low, high in ((u, 0.40, 0.48), (v, 0.24, 0.34))
+    )
+    return along, across
 
 
 def _aliasing_bias(scene_power: Tensor, u: Tensor, along: Tensor, across: Tensor) -> Tensor:
@@ -439,17 +435,6 @@ def _aliasing_bias(scene_power: Tensor, u: Tensor, along: Tensor, across: Tensor
     return bias.clamp(max=1.0)  # px; without a scene, its power is that of rounding
 
 
-def _of_blocks(frequencies: Tensor) -> Tensor:
-    """Mean sizes (U / 16,) of neighbouring frequencies (U,), as the powers in ``_scene_detail``."""
-    means: Tensor = functional.avg_pool1d(frequencies.abs()[None], _SMOOTH, ceil_mode=True)[0]
-    return means
-
-
-def _low_pass(frequency: Tensor, low: float, high: float) -> Tensor:
-    """1 below ``low``, 0 above ``high`` (cycles/px), half a cosine between."""
-    return 0.5 + 0.5 * torch.cos(math.pi * ((frequency.abs() - low) / (high - low)).clamp(0.0, 1.0))
-
-
 def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
     """Mean power (B, U / frequencies, S / 16) of blocks of a spectrum (B, U, S), up to a factor."""
     parts = torch.view_as_real(spectrum).flatten(-2)
@@ -464,10 +449,7 @@ def _smoothed(spectrum: Tensor, frequencies: int) -> Tensor:
 
 
 def _noise_of_mean(warped: Tensor, visible: Tensor) -> Tensor:
-    """Difference (B, S, U) of the first and last frame in which a row is visible, with the noise of their mean.
-
-    It is 0 where a row is visible in one frame only.
-    """
+    """Difference (B, S, U) of the first and last frame that contain a row, with the noise of their mean; or 0."""
     count = visible.shape[1]
     order = torch.arange(count, device=visible.device)[:, None]
     first = torch.where(visible > 0, order, count).amin(1, keepdim=True)

@@ -30,45 +30,30 @@ def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
     The contract is that of ``BAND_METHODS``.
     """
     factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
-    reach = -(-task.search // factor)
-    width = task.width // factor
-    binned = [
-        take_windows(image, torch.zeros_like(left), left, image.shape[-2], columns * factor)[:, 0]
-        .unflatten(-1, (columns, factor))
-        .mean(-1)
-        for image, left, columns in (
-            (task.first, task.left[:, None], width),
-            (task.second, (task.left + task.coarse[:, 0])[:, None] - reach * factor, width + 2 * reach),
-        )
-    ]
-    places = task.places
-    rows = places[..., 1]
-    surface = _correlate_bands(
-        binned[0],
-        binned[1],
-        torch.stack([torch.zeros_like(rows), rows], -1),
-        torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1),
-        size=(task.height, width),
-        reach=(task.search, reach),
-    )
+    reach, width, height = -(-task.search // factor), task.width // factor, task.first.shape[-2]
+
+    def binned(image: Tensor, left: Tensor, columns: int) -> Tensor:
+        whole = take_windows(image, torch.zeros_like(left), left, height, columns * factor)[:, 0]
+        means: Tensor = whole.unflatten(-1, (columns, factor)).mean(-1)
+        return means
+
+    first = binned(task.first, task.left[:, None], width)
+    left = (task.left + task.coarse[:, 0])[:, None] - reach * factor
+    second = binned(task.second, left, width + 2 * reach)
+    places, rows = task.places, task.places[..., 1]
+    of_first = torch.stack([torch.zeros_like(rows), rows], -1)
+    of_second = torch.stack([torch.full_like(rows, reach), rows + task.coarse[:, None, 1]], -1)
+    surface = _correlate_bands(first, second, of_first, of_second, (task.height, width), (task.search, reach))
     lag, inside = whole_pixel_peak(surface, factor)
     shift = task.start + lag
     moved = places + shift
-    surface = _correlate_bands(
-        task.first, task.second, places, moved, size=(task.height, task.width), reach=(LAGS, LAGS)
-    )
+    surface = _correlate_bands(task.first, task.second, places, moved, (task.height, task.width), (LAGS, LAGS))
     inside &= (moved[..., 1] >= LAGS) & (moved[..., 1] + task.height + LAGS <= task.first.shape[-2])
     return fine_offsets(task, shift, surface, inside)
 
 
 def _correlate_bands(
-    first: Tensor,
-    second: Tensor,
-    places: Tensor,
-    later_places: Tensor,
-    *,
-    size: tuple[int, int],
-    reach: tuple[int, int],
+    first: Tensor, second: Tensor, places: Tensor, later_places: Tensor, size: tuple[int, int], reach: tuple[int, int]
 ) -> Tensor:
     """Zero-mean normalised cross-correlation of windows of one image (L, H, W) with windows of another (L, H, V).
 
@@ -218,18 +203,13 @@ def _phase_surface(
     weight = low_pass * twice / (magnitude + 10.0 * noise + torch.finfo(first.dtype).tiny)
     full = (magnitude * weight).sum((-2, -1))
     transforms = []
-    for size, frequency in ((reach[0], v), (reach[1], u)):
-        angle = (
-            2
-            * torch.pi
-            * torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)[:, None]
-            * frequency
-        )
+    for size, frequency in zip(reach, (v, u), strict=True):
+        lags = torch.arange(-size, size + 1, dtype=frequency.dtype, device=first.device)
+        angle = 2 * torch.pi * lags[:, None] * frequency
         transforms.append(torch.polar(torch.ones_like(angle), angle))
-    surface: Tensor = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
-    surface = surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]
-    lags: Tensor = surface.unflatten(0, shape)
-    return lags
+    surface = (transforms[0] @ ((cross * weight) @ transforms[1].T)).real
+    lags_of_bands: Tensor = (surface / full.clamp(min=torch.finfo(first.dtype).tiny)[:, None, None]).unflatten(0, shape)
+    return lags_of_bands
 
 
 # Gray projection (Sec. 2.2 of Liu et al. 2023)
@@ -261,15 +241,12 @@ def _search_rows(task: BandTask) -> Tensor:
     tall = min(max(task.height, 8 * task.search), num_rows // 2)
     tops = (task.tops + (task.height - tall) // 2).clamp(0, num_rows - tall)
     reach = task.search + LAGS - 1
-    row_means = [
-        functional.pad(
-            _differences(take_windows(image, torch.zeros_like(left), left, num_rows, task.width).mean(-1)), (1, 1)
-        )[:, 0]
-        for image, left in (
-            (task.first, task.left[:, None]),
-            (task.second, (task.left + task.coarse[:, 0])[:, None]),
-        )
+    lefts = task.left[:, None], (task.left + task.coarse[:, 0])[:, None]
+    windows = [
+        take_windows(image, torch.zeros_like(left), left, num_rows, task.width)[:, 0]
+        for image, left in zip((task.first, task.second), lefts, strict=True)
     ]
+    row_means = [functional.pad(_differences(window.mean(-1)), (1, 1)) for window in windows]
     begin = tops + task.coarse[:, 1:] - reach
     later = take_windows(row_means[1][..., None], begin, torch.zeros_like(begin), tall + 2 * reach, 1)[..., 0]
     template = row_means[0][:, tops[:, None] + torch.arange(tall, device=begin.device)]
@@ -293,17 +270,10 @@ def _smooth_course(course: Tensor) -> Tensor:
 
 def _band_profiles(task: BandTask, places: Tensor, shift: Tensor, reach: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Offset of bands beyond ``shift`` along the axis whose ``reach`` (rows, columns) is not 0, (L, N), and quality."""
-    summed = -1 if reach[0] else -2
-    moved = places + shift
-    width = task.width
-    first = take_windows(task.first, places[..., 1], places[..., 0], task.height, width)
-    second = take_windows(
-        task.second,
-        moved[..., 1] - reach[0],
-        moved[..., 0] - reach[1],
-        task.height + 2 * reach[0],
-        width + 2 * reach[1],
-    )
+    summed, moved, height, width = (-1 if reach[0] else -2), places + shift, task.height, task.width
+    first = take_windows(task.first, places[..., 1], places[..., 0], height, width)
+    top, left = moved[..., 1] - reach[0], moved[..., 0] - reach[1]
+    second = take_windows(task.second, top, left, height + 2 * reach[0], width + 2 * reach[1])
     surface = _correlate_profiles(_differences(first.mean(summed)), _differences(second.mean(summed)))
     lags = torch.arange(-reach[0], reach[0] + 1, device=surface.device)
     begin = moved[..., 1, None] + lags
@@ -321,8 +291,8 @@ def _differences(profile: Tensor) -> Tensor:
 def _profile_peak(surface: Tensor) -> tuple[Tensor, Tensor]:
     """Sub-pixel lag of the peaks of correlations (L, N, 2 reach + 1), NaN where there is none, and quality.
 
-    The search range is ``reach - LAGS + 1``, and -infinity marks lags that leave the frame. A peak at the edge of the
-    search range, or next to a lag of -infinity, gives NaN and quality 0.
+    -infinity marks lags that leave the frame. A peak next to one, or at the edge of the search range of ``reach - LAGS
+    + 1``, is none.
     """
     flat = surface.flatten(0, 1)[..., None]
     place, _ = integer_peak(flat)

@@ -82,10 +82,7 @@ class RowSpectra:
         return part
 
     def in_groups(self, count: int) -> "RowSpectra":
-        """Spectra (B M, G) of M = ``count`` groups of the frames of each stack, see ``overlapping``.
-
-        ``values`` stay those of the frames.
-        """
+        """Spectra (B M, G) of ``count`` groups of each stack, see ``overlapping``; ``values`` stay those of frames."""
         if count == 1:
             return self
         part = copy(self)
@@ -114,15 +111,11 @@ class RowSpectra:
         both = copy(self)
         both.values = torch.cat([self.values, later.values], 1)
         both._index_rows()
-        if self.valid is not None or later.valid is not None:
-            masks = [part.all_valid() if part.valid is None else part.valid for part in (self, later)]
-            both.valid = torch.cat(masks, 1)
+        masks = [part.valid for part in (self, later)]
+        if any(mask is not None for mask in masks):
+            everything = self._first_rows.new_ones(1, 1, self.height, self.width, dtype=torch.bool)
+            both.valid = torch.cat([everything if mask is None else mask for mask in masks], 1)
         return both
-
-    def all_valid(self) -> Tensor:
-        """(B, T, H, W) bool mask of frames without invalid pixels."""
-        shape = (*self.values.shape[:2], self.height, self.width)
-        return torch.ones(shape, dtype=torch.bool, device=self.values.device)
 
     def warped(self, rows: Tensor, shift: Tensor) -> Tensor:
         """Spectra (B, T, S, U) of frames at fractional rows, moved back by ``shift`` px; both (B, T, S)."""
@@ -206,8 +199,7 @@ def mean_over_frames(spectra: Tensor, visible: Tensor) -> Tensor:
 def differences(spectra: Tensor, visible: Tensor) -> Tensor:
     """Differences (B, G, S, U) of the rows of each frame from their mean over the frames in which they are visible.
 
-    Of two frames, only the difference of the first, (B, 1, S, U): that of the second is its negative. The difference is
-    0 where a row is not visible.
+    Of two frames, only that of the first, (B, 1, S, U), the negative of the other. 0 where a row is not visible.
     """
     if spectra.shape[1] == 2:
         half = 0.5 * visible.prod(1, keepdim=True)
@@ -232,16 +224,16 @@ _LEAST_PATTERN = 3e-4
 
 
 def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor]]) -> Tensor | None:
-    """Spectrum (B, U), shrunk by its noise, of a pattern that is added to every row of every frame at the same columns.
+    """Spectrum (B, U), shrunk by its noise, of a pattern that every row of every frame has at the same columns.
 
-    Such a pattern is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion,
-    the pattern p appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of the
-    frames d are therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene: ``p(u) =
-    sum conj(r) d / sum |r|^2``. None if no pattern is significant, or if it is too weak to bias displacements.
+    It is fixed to the sensor and biases displacements towards zero. In frames warped back by the motion, the pattern p
+    appears as ``p(x + shift)`` while the scene stands still. For each frequency u, the differences of the frames d are
+    therefore regressed on the differences r of ``exp(2 pi i u shift)``, which excludes the scene: ``p(u) = sum conj(r)
+    d / sum |r|^2``. None if no pattern is significant, or if it is too weak to bias displacements.
 
     The groups are spectra of frames, M of each stack, with the rows, shifts and visibility (B M, G, S each) that warp
-    some of their rows, and the residual variance (B M, S) of these rows. Rows whose variance exceeds three times the
-    median (objects that move by themselves) are left out.
+    some of their rows, and the residual variance (B M, S) of these rows. Objects that move by themselves are left out:
+    rows whose variance exceeds three times the median.
     """
     correlation, power, energy, count = (torch.zeros((), dtype=torch.float32, device="cpu") for _ in range(4))
     stacks = len(groups[0][0].values)

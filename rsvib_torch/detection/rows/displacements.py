@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements, trimmed_mean
-from rsvib_torch.detection.rows.warping import Positions, differently_blurred, second_moments, warp_to_scene
+from rsvib_torch.detection.rows.warping import Positions, differently_blurred, exposure_paths, moments, warp_to_scene
 from rsvib_torch.execution.chunking import chunks, runs
 from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.motion.motion import Motion
@@ -59,11 +59,6 @@ class FrameGroups:
     def starts_of_groups(self) -> Tensor:
         """(B M, G) s."""
         return overlapping(self.starts, self.count)
-
-    @property
-    def spectra_of_groups(self) -> RowSpectra:
-        """Spectra (B M, G)."""
-        return self.spectra.in_groups(self.count)
 
     def motion_of_groups(self, motion: Motion) -> Motion:
         """The motion (B) for each group (B M)."""
@@ -111,12 +106,10 @@ def frame_groups(
     pairs: Literal["never", "different", "very different"] = "never",
     one_at_a_time: bool = False,
 ) -> list[FrameGroups]:
-    """Frames in groups of at most ``MAX_GROUP_FRAMES``, each sharing one frame with the next group.
+    """Frames in groups of at most ``MAX_GROUP_FRAMES`` that have half of a frame in common in spite of an image motion.
 
-    An image motion limits how many frames contain the same part of the scene. ``pairs``: form pairs if exposures blur
-    the frames differently, or very differently: only the blur of two frames can then be equalised. Pairs are enough for
-    a tone; a free motion needs all frames that contain a row. As many groups as fit in the cache are measured together,
-    unless ``one_at_a_time``.
+    ``pairs``: whether to form pairs if exposures blur the frames differently, or very differently: only the blur of two
+    frames can then be equalised. As many groups as fit in the cache are measured together, unless ``one_at_a_time``.
     """
     stacks, count = spectra.values.shape[:2]
     starts = timing.frame_starts(count, spectra.values.device).expand(stacks, -1)
@@ -150,18 +143,16 @@ def measure_group(
 ) -> tuple["MeasuredGroup", RowGradients]:
     """Displacements of blocks of scene rows in the frames of groups, measured around a motion of each stack.
 
-    The displacement of the motion is added to the measured residual displacement, so that the measurements do not
-    depend on the motion to first order. The gradients (B M) of the scene are computed unless those of a motion that
-    differs by much less than a pixel are given; they are returned with the measurements, for the next call.
+    The measurements do not depend on the motion to first order. The gradients (B M) of the scene are computed unless
+    those of a motion that differs by much less than a pixel are given; they are returned for the next call.
     """
-    spectra, motion = group.spectra_of_groups, group.motion_of_groups(motion)
+    spectra, motion = group.spectra.in_groups(group.count), group.motion_of_groups(motion)
     positions = Positions.of(group.starts_of_groups, spectra.height, timing, motion)
     visible = positions.visible(spectra.height, BLOCK_ROWS)
     warp = warp_to_scene(spectra, positions, timing, motion)
     runs_of_rows = spectra.runs(positions.rows.shape[-1], 2)
     if gradients is None:
-        valid = spectra.warped_valid(positions.rows, positions.shift)
-        size = spectra.width, spectra.length
+        valid, size = spectra.warped_valid(positions.rows, positions.shift), (spectra.width, spectra.length)
         gradients = row_gradients(warp, runs_of_rows, positions.shift, visible, size, valid)
         products = gradients.residual_products
     else:
@@ -178,21 +169,12 @@ def measure_strips(
     factors: Callable[[Tensor, Tensor], Tensor],
     gradients: RowGradients | None = None,
 ) -> tuple["MeasuredGroup", RowGradients]:
-    """``measure_group`` for a motion with roll or zoom, from frames (B S) that are cut into S strips of columns.
+    """``measure_group`` for a motion (B) with roll or zoom, from frames (B S) that are cut into S strips of columns.
 
-    Every strip is warped by the motion of its middle. Strips are joined with weights that are linear between middles,
-    which moves the columns between them by the amount between: exactly to first order of the difference. Rows of full
-    width then measure all A components of the motion at once, with the derivatives of the scene by roll and zoom as
-    further regressors.
-
-    Args:
-        group: The strips of the frames of one group.
-        timing: The sensor, in row order.
-        motion: Motion (B) whose components are measured.
-        of_strips: The motions (B S) of the middles of the strips.
-        strips: The strips.
-        factors: Function of positions x and y in px from the centre to displacements (..., 2, A) by unit components.
-        gradients: As in ``measure_group``.
+    Every strip is warped by the motion ``of_strips`` (B S) of its middle. Strips are joined with weights that are
+    linear between middles, which moves the columns between them by the amount between: exactly to first order. Rows of
+    full width then measure all A components of the motion at once. ``factors`` are the displacements (..., 2, A) by
+    unit components at positions x and y in px from the centre.
     """
     spectra, count = group.spectra, len(strips.firsts)
     positions = Positions.of(group.starts, spectra.height, timing, of_strips)
@@ -253,11 +235,7 @@ def _measured(
     gradients: RowGradients,
     products: Tensor,
 ) -> MeasuredGroup:
-    """Measurements of blocks from the products of the gradients with the differences of the frames.
-
-    The motion (B M) has the components that are measured; ``exposure_starts`` (B M, G, S) are in s, ``visible`` (B M,
-    G, S) is 1 where a scene row is visible in a frame, ``products`` as ``RowGradients.residual_products``.
-    """
+    """Measurements of blocks of rows (B M, G, S) around a motion (B M) from ``RowGradients.residual_products``."""
     residual, information = _solved(*row_equations(products, gradients, visible))
     exposure_starts = _in_blocks(exposure_starts).mean(3)
     # a fit of frames with a wrong timing may place rows at any distance; they are invisible, but their times would make
@@ -280,10 +258,7 @@ def _of_stacks(values: Tensor, groups: int) -> Tensor:
 
 
 def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A), from the equations of rows.
-
-    Blocks with structure along one direction only have a singular matrix; both are 0 then.
-    """
+    """Displacements (B, G, N, A) of blocks and their information (B, N, A, A); 0 with structure along one direction."""
     information = _in_blocks(information[:, None]).sum(3)[:, 0]
     right = _in_blocks(right).sum(3)
     xx, yy = information[..., 0, 0], information[..., 1, 1]
@@ -310,10 +285,7 @@ def _in_blocks(values: Tensor) -> Tensor:
 
 
 def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int = 1) -> Measurements:
-    """Measurements of all groups as one record, by one transfer to the CPU.
-
-    Smaller groups get frames in which no row is visible.
-    """
+    """Measurements of all groups as one record; smaller groups get frames in which no row is visible."""
     arrays = tables(*(value for part in parts for value in vars(part).values()))
     starts, displacements, visible, information = (arrays[first::4] for first in range(4))
     most = max(part.shape[2] for part in starts)
@@ -338,17 +310,14 @@ def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int 
 def column_pattern_of(
     groups: list[FrameGroups], timing: RowTiming, motion: Motion, gradients: list[RowGradients]
 ) -> Tensor | None:
-    """Spectrum (B, U) of a pattern of columns that is fixed to the sensor; None if there is none.
-
-    The pattern would pull all displacements to zero.
-    """
+    """``column_pattern`` of every fourth row of all groups."""
     parts = []
     for group, of_group in zip(groups, gradients, strict=True):
-        starts, of_groups = group.starts_of_groups, group.motion_of_groups(motion)
-        positions = Positions.of(starts, group.spectra.height, timing, of_groups, EVERY)
-        visible = positions.visible(group.spectra.height, BLOCK_ROWS // EVERY)
-        variance = of_group.variance[:, ::EVERY]
-        parts.append((group.spectra_of_groups, positions.rows, positions.shift, visible, variance))
+        height, of_groups = group.spectra.height, group.motion_of_groups(motion)
+        positions = Positions.of(group.starts_of_groups, height, timing, of_groups, EVERY)
+        visible, variance = positions.visible(height, BLOCK_ROWS // EVERY), of_group.variance[:, ::EVERY]
+        spectra = group.spectra.in_groups(group.count)
+        parts.append((spectra, positions.rows, positions.shift, visible, variance))
     return column_pattern(parts)
 
 
@@ -356,18 +325,14 @@ _SUMMED_ROWS = 64  # rows of a sum from which the displacements of parts of the 
 
 
 def differential_motion(gradients: list[RowGradients], stacks: int) -> Array:
-    """(B, 2) px, rms difference of the residual displacements of the two halves of the rows, without its noise.
-
-    Rotation of the camera and parallax move the halves differently. Arguments as in ``_rms_of_contrasts``.
-    """
+    """(B, 2) px, rms difference of the displacements of the halves of the rows, by rotation or parallax; no noise."""
     return _rms_of_contrasts(gradients, stacks, [[-1.0, 1.0]])
 
 
 def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
     """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
 
-    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not. Arguments as in
-    ``_rms_of_contrasts``.
+    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not.
     """
     quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
     return _rms_of_contrasts(gradients, stacks, [quadratic, cubic])
@@ -449,7 +414,7 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
             return 0.5 * of_blocks[:, :, 1:-1] + 0.25 * (of_blocks[:, :, :-2] + of_blocks[:, :, 2:])
 
         spectra = averaged(low_spectra.warped(positions.rows, positions.shift))
-        moments = averaged(second_moments(positions.exposure_starts, timing, of_groups))
+        second = averaged(moments(*exposure_paths(positions.exposure_starts, timing, of_groups), 2))
         visible = averaged(positions.visible(group.spectra.height, BLOCK_ROWS))
         both = (visible[:, 1:] * visible[:, :-1] == 1).double()
         mean, difference = 0.5 * (spectra[:, 1:] + spectra[:, :-1]), spectra[:, 1:] - spectra[:, :-1]
@@ -461,7 +426,7 @@ def blur_ratio(groups: list[FrameGroups], timing: RowTiming, motion: Motion) -> 
         by_x = (2j * math.pi * u[low]).to(mean.dtype)
         by_y = 8 / 12 * (below - above) - 1 / 12 * (below_2 - above_2)
         by_yy = 16 / 12 * (below + above) - 1 / 12 * (below_2 + above_2) - 30 / 12 * here
-        change = (0.5 * (moments[:, 1:] - moments[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
+        change = (0.5 * (second[:, 1:] - second[:, :-1]))[:, :, 2:-2, None].to(by_x.dtype)
         expected = (change[..., 0, 0] * by_x.square()) * here
         expected += (2 * change[..., 0, 1] / block * by_x) * by_y
         expected += (change[..., 1, 1] / block**2) * by_yy
