@@ -264,8 +264,8 @@ def _coarse_offsets(frames: Tensor) -> Tensor:
     whole = frames[..., : height // factor * factor, : width // factor * factor]
     reduced = _standardised(functional.avg_pool2d(whole, factor))
     rows, columns = reduced.shape[-2:]
-    kind = {"dtype": reduced.dtype, "device": reduced.device}
-    windows = (torch.hann_window(size, periodic=False, **kind) for size in (rows, columns))
+    dtype, device = reduced.dtype, reduced.device
+    windows = (torch.hann_window(size, periodic=False, dtype=dtype, device=device) for size in (rows, columns))
     spectra = torch.fft.rfft2(reduced * torch.outer(*windows).sqrt())
     cross = spectra[:, 1:] * spectra[:, :-1].conj()
     magnitude = cross.abs()

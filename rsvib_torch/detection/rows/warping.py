@@ -37,7 +37,7 @@ class Positions:
 
     @classmethod
     def of(cls, starts: Tensor, height: int, timing: RowTiming, motion: Motion, step: int = 1) -> "Positions":
-        """Positions of every ``step``-th scene row that the middle of a group of frames from ``starts`` (B, G) contains."""
+        """Positions of every ``step``-th scene row that the middle of a group of frames contains."""
         rows = torch.arange(0, height, step, dtype=torch.float64, device=starts.device)
         # an image motion carries the group away from the first frame: rows and columns follow it by whole pixels
         middle = starts.mean(-1, keepdim=True) + 0.5 * height * timing.row_time
