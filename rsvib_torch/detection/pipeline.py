@@ -14,7 +14,7 @@ import numpy as np
 
 from rsvib_torch.detection.assemble import offset_curve
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.refinement import FittedRows, covariance_of_changes, refine, with_better
+from rsvib_torch.detection.refinement import FittedRows, refine, with_better
 from rsvib_torch.detection.rows.displacements import MAX_GROUP_FRAMES, compared_intervals
 from rsvib_torch.detection.rows.grouped_frames import grouped_frames, grouped_strips
 from rsvib_torch.detection.start import BandStart, band_start, field_start
@@ -199,7 +199,7 @@ def _with_errors_of_scene(
     """The rows in which aliasing has less weight, and the fit with what it and the scene add to its uncertainty."""
     measurements = with_weak_aliasing(refined.measurements, fit)
     fit = fitted_again(measurements, fit)
-    fit = replace(fit, covariance=fit.covariance + covariance_of_changes(refined.unknown))
+    fit = replace(fit, covariance=fit.covariance + refined.unknown)
     fit = with_errors_of_blocks(measurements, fit)
     fit = without_aliasing(measurements, fit, refined.aliasing)
     unexplained = refined.other_motion.unexplained

@@ -580,24 +580,22 @@ def strongest_only(fit: ToneFit) -> ToneFit:
 
 def with_tones(fit: ToneFit, count: int) -> ToneFit:
     """The fit with room for ``count`` tones on each axis; the further ones do not exist."""
-    axes, tones = fit.active.shape[1:]
-    further = ((0, 0), (0, 0), (0, count - tones))
-    covariance = split_axis(split_axis(fit.covariance, 2, axes, -1), 1, axes, -1)
-    covariance = with_tone_parameters(with_tone_parameters(covariance, 2, tones, count), 4, tones, count)
+    further = ((0, 0), (0, 0), (0, count - fit.active.shape[-1]))
     return replace(
         fit,
         coefficients=np.pad(fit.coefficients, further),
         frequencies=np.pad(fit.frequencies, further),
         active=np.pad(fit.active, further),
-        covariance=covariance.reshape(len(covariance), axes * covariance.shape[2], -1),
+        covariance=covariance_with_tones(fit.covariance, fit, count),
     )
 
 
-def with_tone_parameters(values: Array, axis: int, tones: int, count: int) -> Array:
-    """Values with the parameters of an axis, of ``tones`` tones and the drift, as those of ``count`` tones; 0 there."""
-    of_tones, of_drift = np.split(values, [3 * tones], axis)
-    further = np.zeros((*values.shape[:axis], 3 * (count - tones), *values.shape[axis + 1 :]))
-    return np.concatenate([of_tones, further, of_drift], axis)
+def covariance_with_tones(covariance: Array, fit: ToneFit, count: int) -> Array:
+    """A covariance (B, A P, A P) of the parameters of a fit as that of ``count`` tones on each axis; 0 for others."""
+    axes, tones = fit.active.shape[1:]
+    added = np.full(axes, 3 * (count - tones))
+    places = np.repeat((np.arange(axes) + 1) * (covariance.shape[-1] // axes) - fit.drift.shape[-1], added)
+    return np.insert(np.insert(covariance, places, 0.0, 1), places, 0.0, 2)
 
 
 def with_axes(fit: ToneFit, axes: int) -> ToneFit:
