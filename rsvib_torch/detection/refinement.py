@@ -270,7 +270,7 @@ class Refinement:
         if self.round > 1:  # after the first round, the search is still to come
             self.search_round = self.round
             self._sizes = []
-            self._acceleration.clear()
+            self._acceleration = Acceleration()
         return True
 
     def accelerate(self) -> None:

@@ -52,7 +52,9 @@ def timing_sensitivity(fit: ToneFit, timing: RowTiming, num_frames: int, num_row
     largest_first = (-fit.amplitude).argsort(-1, stable=True)
     size = np.where(fit.amplitude > 1e-9, fit.amplitude, 1.0)  # px or rad; a tone that has decayed does not count
     for name in ("row_time", "frame_rows", "exposure_rows"):
-        lower, higher = (model_displacements(record(_scaled(timing, name, 1 + sign * _STEP)), fit) for sign in (-1, 1))
+        stated = getattr(timing, name)
+        timings = [replace(timing, **{name: stated * (1 + sign * _STEP)}) for sign in (-1, 1)]
+        lower, higher = (model_displacements(record(one), fit) for one in timings)
         change = (higher - lower) / (2 * _STEP)
         moved = -inverses @ np.moveaxis(change, -1, 1).reshape(batch, axes, -1, 1)
         by_tones = split_axis(moved[:, :, : 3 * tones, 0], -1, tones, 3)
@@ -98,11 +100,6 @@ def displacements_by_row_time(measured: Measurements, motion: Motion, timing: Ro
     later = times + (timing.row_time_std / timing.row_time) * (times - starts[np.maximum(frames, 0)])
     moved = [table(motion.mean_displacement(tensor(at), measured.exposure_time)) for at in (times, later)]
     return measured.relative(moved[1] - moved[0])
-
-
-def _scaled(timing: RowTiming, name: str, factor: float) -> RowTiming:
-    """The timing with one of its times multiplied by a factor."""
-    return replace(timing, **{name: getattr(timing, name) * factor})
 
 
 def assumptions(

@@ -64,16 +64,11 @@ class FieldScale:
 
     def std(self, fitted: VibrationStd) -> VibrationStd:
         """The same for standard deviations."""
-        if self.same_for_all_columns:
-            return fitted
         factor = self.units(fitted.amplitude)
-        return replace(
-            fitted,
-            amplitude=fitted.amplitude * factor[:, None],
-            image_motion=fitted.image_motion * factor,
-            image_acceleration=fitted.image_acceleration * factor,
-            displacement=None if fitted.displacement is None else fitted.displacement * factor,
-        )
+        of_axes = ("image_motion", "image_acceleration", "displacement")
+        values = {name: getattr(fitted, name) for name in of_axes}
+        scaled = {name: value * factor for name, value in values.items() if value is not None}
+        return replace(fitted, amplitude=fitted.amplitude * factor[:, None], **scaled)
 
     def factors(self, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
@@ -81,11 +76,7 @@ class FieldScale:
         return factors
 
 
-def camera_in_row_order(
-    options: ProjectionOptions,
-    size: tuple[int, int],
-    timing: SensorTiming,
-) -> Camera | None:
+def camera_in_row_order(options: ProjectionOptions, size: tuple[int, int], timing: SensorTiming) -> Camera | None:
     """Camera of frames of ``size`` (rows, columns) in row order, from the options of ``detect_vibration``."""
     principal_point, distortion = options.principal_point, options.distortion
     if options.focal_length is None:
