@@ -107,8 +107,8 @@ def unexplained(matrix: Array, values: Array) -> Array:
 def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
     """Standard deviations (N,) of fitted parameters, with the correlation of residuals within ``reach`` rows.
 
-    The derivatives of the model are (T, H, N), the residuals (T, H). The covariance of the residuals is weighted by
-    Bartlett's window. The result is not smaller than for residuals without correlation.
+    The derivatives of the model are (T, H, N), the residuals (T, H), weighted by Bartlett's window. The result is not
+    smaller than for residuals without correlation.
     """
     information = np.linalg.pinv(np.einsum("tin,tim->nm", jacobian, jacobian))
     score = jacobian * residual[..., None]
@@ -125,8 +125,8 @@ def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
 def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
     """Fit bands to the brightness (T, H) of rows, with the number of harmonics that maximises the evidence.
 
-    The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; of a ``"fixed"`` scene
-    that times a texture of the rows, which is the same in all frames while the bands move. None if the fit diverges.
+    The brightness of a ``"smooth"`` scene is a polynomial along the rows, one for each frame; that of a ``"fixed"``
+    scene has a texture of the rows as well, which is the same in all frames. None if the fit diverges.
     """
     best: BandFit | None = None
     worse = 0  # numbers in a row; a square wave has no even harmonics

@@ -44,14 +44,7 @@ class StrobeFit:
             )
 
 
-def fit_strobe(
-    brightness: Array,
-    period: float,
-    phases: Array,
-    on_fraction: float,
-    *,
-    fixed: bool = False,
-) -> list[StrobeFit]:
+def fit_strobe(brightness: Array, period: float, phases: Array, on_fraction: float, *, fixed: bool) -> list[StrobeFit]:
     """Fit the bands of an on-off light: the overlap of its pulses with the exposure of each row, and constant light.
 
     ``brightness`` (T, H) is in proportion to light; ``period`` in rows, and ``phases`` (T,) of the fundamental, ``cos(2
@@ -101,13 +94,10 @@ def fit_strobe(
 
 
 def exposure_from_shape(fits: list[StrobeFit], on_fraction: float) -> tuple[float, float, str]:
-    """Exposure in rows with its standard deviation, and a note on other light, from fits of one exposure.
+    """Exposure in rows with its standard deviation, and a note on other light; an error if several explain the bands.
 
     Without other light the mean brightness over that of the bands determines the number of whole periods. Other light
     increases the mean, so exposures that it implies are upper limits.
-
-    Raises:
-        ValueError: If several exposures explain the bands.
     """
     found = []  # exposure in periods, share of other light, fit
     for fit in fits:

@@ -19,18 +19,11 @@ _TINY = 1e-300  # keeps equations solvable where nothing was measured
 # --- Periodogram ---
 
 
-def _grid(duration: float, sample_interval: float) -> tuple[float, int, int]:
-    """Step in Hz, first and number of the multiples of it from half a period up to the Nyquist limit of the samples."""
-    step = 1.0 / (_OVERSAMPLING * (duration + sample_interval))
-    first = _OVERSAMPLING // 2
-    return step, first, max(1, int(0.5 / sample_interval / step) - first + 1)
-
-
 def _power(measurements: Measurements, grid: tuple[float, int, int], weights: Array) -> Array:
     """Decrease (B, S, A, F) of the weighted sum of squares by a tone of each frequency and a uniform image motion.
 
-    A weak prior on the amplitude suppresses blind frequencies, where a huge tone would fit noise. ``weights`` (B, S, N,
-    A) are several weightings of the displacements.
+    A weak prior on the amplitude suppresses blind frequencies, where a huge tone would fit noise. The grid is that of
+    ``fourier_sums``; ``weights`` (B, S, N, A) are several weightings of the displacements.
 
     All sums over waves ``E = exp(2 pi i f t)`` are transforms. With ``A = sum_g E_g`` over the n frames that contain a
     row, the squares of the cosine and of the sine relative to their means over these frames are ``(R + Re Q) / 2`` and
@@ -95,8 +88,9 @@ def strongest_frequencies(
     Measurements are ``sample_interval`` seconds apart; the powers of ``harmonics`` multiples are added up; the search
     is made with each of S ``weights`` (B, S, N, 2).
     """
-    grid = _grid(float(measurements.duration.max()), sample_interval)
-    window = _OVERSAMPLING // 2
+    # multiples of a step, from half a period up to the Nyquist limit of the samples
+    step, window = 1.0 / (_OVERSAMPLING * (float(measurements.duration.max()) + sample_interval)), _OVERSAMPLING // 2
+    grid = step, window, max(1, int(0.5 / sample_interval / step) - window + 1)
     stacks, weightings = weights.shape[:2]
     at_once, count = max(1, _MAX_POWERS // grid[2]), min(count, grid[2])
     places = np.empty((stacks, weightings, weights.shape[-1], count), np.int64)
@@ -168,8 +162,8 @@ def best_candidate(
 
     The peaks of the periodogram of the ``residual`` (B, N, G, 2) px of the fit ``before`` are fitted roughly, each with
     the tones of that fit. ``weighed`` are the measurements with its weights, ``active`` (B, 2, K) its tones and the
-    further one (or family). With ``leave_out``, fits without a stretch of the record are tried as well: clouds and
-    objects that move by themselves cover stretches of rows, without which the other rows agree.
+    further one (or family). With ``leave_out``, fits without a stretch of the record, which may be covered by clouds or
+    objects that move by themselves, are tried as well.
     """
     # 1. The parts of the record that are searched: all rows, and the rows without a stretch.
     model, harmonics = before.model, before.model.harmonics
@@ -205,13 +199,9 @@ def best_candidate(
         place = best.reshape(-1, 1, best.shape[-1], *(1,) * (tried.ndim - 3))
         return np.moveaxis(np.take_along_axis(tried, place, 1)[:, 0], 1, axis)
 
-    coefficients, frequencies, drift = (
-        chosen(values, 1) for values in (rough.coefficients, rough.frequencies, rough.drift)
-    )
-    fit, residual = (
-        ToneFit(coefficients, frequencies, active, drift, rough.covariance[:0], before.centre, model),
-        chosen(residuals, 3),
-    )
+    best_tones = {name: chosen(getattr(rough, name), 1) for name in ("coefficients", "frequencies", "drift")}
+    fit = ToneFit(**best_tones, active=active, covariance=rough.covariance[:0], centre=before.centre, model=model)
+    residual = chosen(residuals, 3)
     # 4. Without a stretch: steps towards the least absolute residuals of all rows.
     for _ in range(3 if leave_out else 0):
         fit, residual = fit_roughly(measurements.for_least_absolute(residual), fit, active, model)
