@@ -86,10 +86,7 @@ def assembled(
 def offset_curve(
     measurements: Measurements, fit: ToneFit, robust_weights: Array, group_frames: Sequence[int], device: torch.device
 ) -> tuple[OffsetCurve, Array]:
-    """Measured offsets between consecutive frames, and those (B, P, N, A) in px that a fit predicts.
-
-    The measurements have the rows of all groups behind each other; neighbouring groups of ``group_frames`` share one.
-    """
+    """Measured offsets between consecutive frames of groups, and those (B, P, N, A) in px that a fit predicts."""
     count = measurements.displacements.shape[1] // len(group_frames)
     parts = [
         (slice(number * count, (number + 1) * count), slice(frame, frame + 2))

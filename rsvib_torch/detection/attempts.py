@@ -144,10 +144,7 @@ def _without_parallax(stacks: GreyFrames, timing: RowTiming, options: DetectionO
 
 
 def _moving_axes(found: Attempt, least: int) -> int:
-    """Number of components up to the last one with a significant tone in any stack, at least ``least``.
-
-    A given number of tones is fitted to all components, also to those that do not move.
-    """
+    """Number of components up to the last one with a significant tone in any stack, at least ``least``."""
     significant = found.vibration.amplitude > MIN_SIGNIFICANCE * found.std_if_hidden_tone.amplitude
     moving = significant.any(0).any(-1).tolist()
     return max([least, *(axis + 1 for axis in range(2, len(moving)) if moving[axis])])

@@ -25,10 +25,7 @@ from rsvib_torch.results.reason import Reason
 
 
 def other_timings(stacks: GreyFrames, timing: SensorTiming, found: Attempt) -> dict[int, Reason]:
-    """The reasons against all axes of stacks that agree with another timing, by the index of the stack.
-
-    ``found`` is the attempt with the stated timing, in image order.
-    """
+    """The reasons against all axes of stacks that agree with another timing than the attempt, by index of the stack."""
     if found.fitted.refined is None:
         return {}
     diagnoses, rotates = {}, halves_move_apart(found.fitted.refined.other_motion).tolist()

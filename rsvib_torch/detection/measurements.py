@@ -108,11 +108,7 @@ class Measurements:
 
     @property
     def _expected(self) -> Array:
-        """(B, N, A) inverse variances that residuals of each axis are compared with.
-
-        x and y of a row are nearly independent. With roll, the displacement along x determines ``X - theta y``, so that
-        the information of x alone is far above its inverse variance at large y.
-        """
+        """(B, N, A) inverse variances that residuals are compared with; x determines roll, but hardly y, of a row."""
         return self.weights if self.information.shape[-1] == 2 else self.inverse_variances
 
     @property
@@ -257,10 +253,7 @@ class Measurements:
         return np.minimum(apparent / np.maximum(actual, 1e-300), 1.0)
 
     def _biweight_argument(self, residual: Array) -> Array:
-        """(B, N, 2) rms residual over 6 robust standard deviations, at most 1; 1 where nothing was measured.
-
-        With this limit the biweight is 98 % efficient for Gaussian errors.
-        """
+        """(B, N, 2) rms residual over 6 robust standard deviations (98 % efficient), at most 1; 1 if not measured."""
         size = self._sizes_for_weights(residual)
         spread = 1.4826 * median(size, 1, keepdims=True)
         return np.minimum(without_nan(size / (6.0 * np.maximum(without_nan(spread, 1.0), 1e-9)), 1.0), 1.0)

@@ -76,10 +76,7 @@ def refine(
     may_abandon: bool = False,
     has_pattern: bool | None = None,
 ) -> FittedRows:
-    """Refine a motion, found in the offsets of row bands, on the images: the last measurements and the fit to them.
-
-    ``intervals`` (M,) are the times in s between the frames that are compared; other arguments as in ``Refinement``.
-    """
+    """Refine a motion of row bands on the images: the last measurements and the fit; arguments as in ``Refinement``."""
     # Rounds of measuring and fitting from the given start.
     refined = _rounds(frames, intervals, start, tones, may_abandon, has_pattern)
     # A long exposure can make the start choose the wrong side of a blind frequency: the other side is tried as well,
@@ -274,10 +271,7 @@ class Refinement:
         return True
 
     def accelerate(self) -> None:
-        """Continue with a faster step where the last one was too long or too short.
-
-        The gradients of the scene are used again if the motion changes little.
-        """
+        """Continue with a faster step where the last one was inexact, with the same gradients after a short step."""
         if self._gradients is None:  # it has just begun again
             return
         measurements = self._measured.measurements

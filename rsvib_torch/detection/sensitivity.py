@@ -91,10 +91,7 @@ def with_row_time_std(
 
 
 def displacements_by_row_time(measured: Measurements, motion: Motion, timing: RowTiming, num_frames: int) -> Array:
-    """Change (1, N, G, A) in px of the displacements by a motion if the row time is wrong by its standard deviation.
-
-    The motion is not a batch and on the CPU. Rows are then exposed at other times after the starts of their frames.
-    """
+    """Change (1, N, G, A) in px of the displacements by a motion (no batch) for a row time wrong by its deviation."""
     times, starts = measured.exposure_starts, table(timing.frame_starts(num_frames))
     frames = np.searchsorted(starts, times + 0.5 * timing.row_time, "right") - 1
     later = times + (timing.row_time_std / timing.row_time) * (times - starts[np.maximum(frames, 0)])
@@ -110,10 +107,7 @@ def assumptions(
     num_rows: int,
     blur: Array | None = None,
 ) -> tuple[tuple[str, ...], ...]:
-    """What the frames cannot contradict, with its effect on vibrations (B) in image axes, one sentence for each.
-
-    ``blur`` (B, 3) as in ``OtherMotion``; None if it was not measured.
-    """
+    """What frames cannot contradict, with its effect on vibrations (B) in image axes; ``blur`` of ``OtherMotion``."""
     # 1. Sentences about all stacks.
     sentences, times = [], ["exposure_rows"]
     if timing.frame_start_times is None:
@@ -155,10 +149,7 @@ _Tones = list[tuple[int, int, float]]  # axis, number and frequency in Hz of eac
 
 
 def _effects(name: str, tones: _Tones, changes: list[Array], timing: RowTiming) -> list[str]:
-    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %.
-
-    ``changes`` (A, K) are the sensitivities of the quantities ``_CHANGED`` to that time.
-    """
+    """Sentence about the effect of an error of 1 % of a stated time on every tone; none if all are below 0.1 %."""
     of_tones = []
     for axis, tone, frequency in tones:
         of_tone = zip(_CHANGED, (change[axis, tone] for change in changes), strict=True)

@@ -126,10 +126,7 @@ class DisplacementSpectrum(
 def displacement_spectrum(
     curve: OffsetCurve, timing: SensorTiming, vibration: Vibration, fitted: Tensor
 ) -> DisplacementSpectrum:
-    """The spectrum of the displacement from the offsets of one stack, at least 8.
-
-    Lines of the ``vibration`` are known; ``fitted`` (P, N, A) are the offsets by its tones and the image motion.
-    """
+    """The spectrum of the displacement from offsets of one stack, ``fitted`` (P, N, A) by a known vibration."""
     check_single("result", curve)
     good = curve.good & (curve.quality > 0)
     if curve.std is not None:

@@ -95,10 +95,7 @@ def camera_in_row_order(options: ProjectionOptions, size: tuple[int, int], timin
 
 
 def combined_strips(measured: Measurements, factors: Array) -> Measurements:
-    """Components (B, N, G, A) of the motion of every row from the displacements (B S, N, G, 2) of strips.
-
-    ``factors`` (B, S, N, 2, A) are displacements by unit components.
-    """
+    """Components (B, N, G, A) of rows from displacements (B S, N, G, 2) of strips by ``factors`` (B, S, N, 2, A)."""
     strips = factors.shape[1]
 
     def of_strips(values: Array) -> Array:

@@ -226,10 +226,7 @@ def _band_reasons(axis: str, numbers: Table) -> list[Reason]:
 
 
 def residual_reasons(axis: str, numbers: Table) -> list[Reason]:
-    """Reasons from motion of the rows along an axis that no vibration explains; ``numbers`` of ``OtherMotion`` in px.
-
-    docs/verdicts.md lists the limits; they exceed the errors of interpolation and of the correction for unequal blur.
-    """
+    """Reasons from motion of rows in px that no vibration explains; limits exceed errors of interpolation and blur."""
     if numbers["unexplained"] > numbers["permitted"]:
         return [Reason("rows_unexplained", axis, numbers["unexplained"], numbers["permitted"])]
     allowed = max(0.01, 0.0025 * numbers["size"])  # px
@@ -331,10 +328,7 @@ def _exposure_reasons(timing: RowTiming, ratio: float, std: float, size: float) 
 
 
 def recording_reasons(moved: Sequence[float], unexplained: Sequence[float], other: float | None) -> list[Reason]:
-    """Reasons against a recorded motion, from the rms motion of the rows by it and beside it along each axis, in px.
-
-    ``other`` is another offset of its clock in s that explains the frames as well.
-    """
+    """Reasons against a recorded motion, from rms motion in px by it and beside it, and another clock offset in s."""
     reasons, largest = [], max(moved)
     if largest < _MIN_MOTION:
         reasons.append(Reason("recorded_motion_too_small", None, largest, _MIN_MOTION))

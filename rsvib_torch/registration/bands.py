@@ -57,10 +57,7 @@ class BandTask:
 
 
 def take_windows(images: Tensor, tops: Tensor, lefts: Tensor, height: int, width: int) -> Tensor:
-    """Windows (L, N, height, width) of images (L, H, W) from rows ``tops`` and columns ``lefts`` (L, N) int64 on.
-
-    Rows beyond the edge repeat the edge row; columns are clamped to the image.
-    """
+    """Windows (L, N, height, width) of images (L, H, W) at rows and columns (L, N); beyond the edge, rows repeat."""
     batch, num_rows, num_columns = images.shape
     rows = (tops[..., None] + torch.arange(height, device=images.device)).clamp(0, num_rows - 1)
     lefts = lefts.clamp(0, num_columns - width)

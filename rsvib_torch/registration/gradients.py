@@ -162,10 +162,7 @@ def row_gradients(
 def residual_products(
     warp: Callable[[slice], Tensor], runs: list[slice], gradients: RowGradients, visible: Tensor
 ) -> Tensor:
-    """Products (B, S, A + 1, G) of gradients with the differences of frames, as ``RowGradients.residual_products``.
-
-    The gradients are those of a similar motion; other arguments as in ``row_gradients``.
-    """
+    """``RowGradients.residual_products`` of other frames, or of a similar motion; arguments as in ``row_gradients``."""
     length = gradients.images.shape[-1]
 
     def of_run(rows: slice) -> Tensor:
@@ -247,10 +244,7 @@ def _means(products: Tensor) -> Tensor:
 
 
 def _sums_of_parts(weighted: Tensor, rows: _Rows, edges: list[int]) -> Tensor:
-    """Products (B, s, parts, A + 2, A + 2 + G) float64 of weighted images and ones with images, differences and ones.
-
-    ``edges`` are the first columns of the parts of the rows but the first.
-    """
+    """Products (B, s, parts, A + 2, A + 2 + G) of weighted images and ones with images, differences and ones."""
     count, parts = weighted.shape[2], len(edges) + 1
     sums = weighted.new_empty(*weighted.shape[:2], parts, count + 1, 1 + rows.planes.shape[2], dtype=torch.float64)
     for part, (first, end) in enumerate(itertools.pairwise([0, *edges, None])):

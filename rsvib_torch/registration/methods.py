@@ -25,10 +25,7 @@ from rsvib_torch.registration.bands import (
 
 
 def register_ncc(task: BandTask) -> tuple[Tensor, Tensor]:
-    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution.
-
-    The contract is that of ``BAND_METHODS``.
-    """
+    """Offsets and quality of bands: a search for whole pixels in binned columns, then the peak at full resolution."""
     factor = next((factor for factor in (BINNING, BINNING // 2) if task.width // factor >= 64), 1)
     reach, width, height = -(-task.search // factor), task.width // factor, task.first.shape[-2]
 
@@ -99,10 +96,7 @@ def _normalise(cross: Tensor, energy: Tensor, template_energy: Tensor, typical: 
 def _window_sums(
     images: Tensor, places: Tensor, size: tuple[int, int], reach: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Sums of the values and of their squares over windows at all lags, float64 (L, N, lags_y, lags_x).
-
-    NaN where a window leaves the image.
-    """
+    """Sums of values and squares over windows at all lags, float64 (L, N, lags_y, lags_x); NaN beyond the image."""
     height, width = size
     num_rows, num_columns = images.shape[-2:]
     device = images.device
@@ -137,7 +131,7 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by phase correlation under a Hann window that moves with the scene.
 
     The cross-power spectrum is whitened where it exceeds the noise, and low-passed, so that samples at whole pixels
-    determine its peak. The contract is that of ``BAND_METHODS``.
+    determine its peak.
     """
     places = task.places
     num_rows = task.first.shape[-2]
@@ -178,8 +172,7 @@ def _phase_surface(
 ) -> Tensor:
     """Phase correlation of windows (L, N, h, w) at the lags -reach ... reach: (L, N, lags_y, lags_x).
 
-    ``fraction`` (L, N, 2) px is the shift (x, y) of the Hann window of the second; ``pixel`` is the size of the
-    windows' pixels across the rows and along the columns, in px.
+    ``fraction`` (L, N, 2) is the shift of the Hann window of the second, ``pixel`` the size (y, x) of pixels, in px.
     """
     shape = first.shape[:2]
     first, second, fraction = first.flatten(0, 1), second.flatten(0, 1), fraction.flatten(0, 1)
@@ -219,9 +212,8 @@ def register_projection(task: BandTask) -> tuple[Tensor, Tensor]:
     """Offsets and quality of bands by correlation of profiles, the means of rows and of columns.
 
     Across the rows, the profile of a band is too short for the search range. Windows that are eight search ranges tall
-    therefore give a smooth course of the offset across the rows first. With that shift, the bands give the offset
-    along the rows, and with both shifts the remaining offset across the rows. The contract is that of
-    ``BAND_METHODS``.
+    therefore give a smooth course of the offset first. With that shift, the bands give the offset along
+    the rows, and with both shifts the remaining offset across the rows.
     """
     places = task.places
     course = _smooth_course(_search_rows(task)).round().long()

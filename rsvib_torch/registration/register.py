@@ -150,10 +150,7 @@ def register_bands(frames: FramesOrFiles, timing: SensorTiming, options: BandReg
 
 
 def similar_share(curve: OffsetCurve, columns: int) -> Tensor:
-    """(B,) fraction of the registered bands of frames of ``columns`` px that correlate more than noise; 0 without any.
-
-    Frames of different scenes, and of noise, have offsets as well: of the places with the largest correlation.
-    """
+    """(B,) share of the registered bands of frames of ``columns`` px that correlate more than noise or other scenes."""
     limit = max(0.1, _CHANCE / math.sqrt(max(curve.heights) * columns))
     good = curve.good.flatten(1)
     return ((curve.quality.flatten(1) > limit) & good).double().sum(1) / good.double().sum(1).clamp(min=1.0)

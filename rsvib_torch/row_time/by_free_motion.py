@@ -28,10 +28,7 @@ GRID_STEP = 0.02  # of the row time; minima of the residual are 0.1 wide or wide
 def row_time_of_splines(
     places: FramePlaces, num_rows: int, low: float, high: float, directions: tuple[float, ...]
 ) -> tuple[RowTimeFit, float] | None:
-    """Row time from ``low`` to ``high`` s at which the fewest knots explain the displacements, and their distance in s.
-
-    None if no motion explains them. Readout directions are 1.0 and -1.0.
-    """
+    """Row time at which the fewest knots explain the displacements, and their distance in s; None if no motion does."""
     problem = _Problem.of(places, num_rows, high)
     coarse_problem = _Problem.of(places.of_first_frames(_GRID_FRAMES), num_rows, high)
     count = max(1, math.ceil(math.log(high / low) / GRID_STEP))
@@ -132,10 +129,7 @@ class _Problem:
 
 
 def _fitted(values: Array, record: RowRecord, index: Array, basis: Array, factor: Array) -> tuple[Array, Array]:
-    """Coefficients ``index`` (N, G, M) of ``basis`` functions fitted to values (N, G), and the residual (N, G).
-
-    ``factor`` is the banded Cholesky factor of the normal matrix.
-    """
+    """Coefficients ``index`` (N, G, M) of ``basis`` functions fitted to values (N, G), and the residual (N, G)."""
     weighted = record.weights[:, None, None] * values[..., None]
     right = np.bincount(index.ravel(), (basis * weighted).ravel(), factor.shape[1])
     solution = linalg.cho_solve_banded((factor, True), right, check_finite=False)

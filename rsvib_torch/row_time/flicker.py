@@ -272,10 +272,7 @@ def _starts(brightness: Array) -> list[float]:
 
 
 def find_bands(profiles: Profiles) -> tuple[BandFit, SceneModel]:
-    """The bands whose period has the smallest relative standard deviation, and the model of the scene.
-
-    Several frames of a still scene are fitted together if their bands move, which eliminates the texture of the scene.
-    """
+    """The bands with the best known period, and the model of the scene, which several frames separate if bands move."""
     brightness = profiles.rows
     scenes: list[tuple[SceneModel, Array]] = [("smooth", brightness)]
     if len(brightness) > 1:

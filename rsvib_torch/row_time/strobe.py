@@ -124,10 +124,7 @@ def exposure_from_shape(fits: list[StrobeFit], on_fraction: float) -> tuple[floa
 
 
 def exposure_from_contrast(contrast: float, light_contrast: float, period: float) -> float:
-    """Exposure that attenuates a sine of known contrast to the contrast of the bands: ``sinc(f T_e)``, first lobe.
-
-    The result has the unit of the period 1/f; the contrast is the amplitude of the fundamental over the mean.
-    """
+    """Exposure, in units of the period, that attenuates a sine to the contrast of the bands by ``sinc(f T_e)``."""
     ratio = contrast / light_contrast
     if ratio > 1.0:
         raise ValueError(

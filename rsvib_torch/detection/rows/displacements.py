@@ -330,10 +330,7 @@ def differential_motion(gradients: list[RowGradients], stacks: int) -> Array:
 
 
 def uneven_motion(gradients: list[RowGradients], stacks: int) -> Array:
-    """(B, 2) px, part of the displacements of the quarters of the rows that is not linear in the column; without noise.
-
-    Parallax, clouds and objects that move by themselves cause it, roll and zoom do not.
-    """
+    """(B, 2) px, part of the displacements of quarters of the rows that roll and zoom cannot cause; without noise."""
     quadratic, cubic = [0.5, -0.5, -0.5, 0.5], [value / math.sqrt(20) for value in (-1.0, 3.0, -3.0, 1.0)]
     return _rms_of_contrasts(gradients, stacks, [quadratic, cubic])
 
@@ -361,11 +358,9 @@ def _rms_of_contrasts(gradients: list[RowGradients], stacks: int, weights: list[
 
 
 def displacements_of_parts(gradients: RowGradients, parts: int = 4) -> tuple[Tensor, Tensor, Tensor]:
-    """Residual displacements of 2 or 4 parts of the rows from first to last frame, from sums over 64 rows.
+    """Displacements (B, N, parts, 2) in px of parts of the rows from first to last frame, from sums over 64 rows.
 
-    Returns:
-        The differences of the displacements (B, N, parts, 2) in px, the variance of their noise, and (B, N) whether all
-        parts have structure along both directions.
+    Also the variance of their noise, and (B, N) whether all parts have structure along both directions.
     """
     sums, rows = gradients.quarters.unflatten(2, (parts, -1)).sum(3), _SUMMED_ROWS
     count = sums.shape[1] // rows * rows

@@ -94,10 +94,7 @@ _NEARLY_EQUAL = (math.inf, 0.1, 0.008)
 
 
 def differently_blurred(starts: Tensor, height: int, timing: RowTiming, motion: Motion) -> tuple[Tensor, Tensor]:
-    """Whether frames of ``height`` rows that start at ``starts`` (B, G) in s are blurred differently, two bool (B,).
-
-    The second states whether they are blurred so differently that only the blur of two frames can be equalised.
-    """
+    """(B,) bool each, whether frames from ``starts`` (B, G) on are blurred differently, and only pairs equalise it."""
     rows = torch.arange(0, height, 8, dtype=torch.float64, device=starts.device)
     return _differences(*exposure_paths(starts[..., None] + rows * timing.row_time, timing, motion))
 

@@ -285,8 +285,7 @@ def start_curve(
 ) -> tuple[RowTiming, OffsetCurve, tuple[float, float]]:
     """Timing in row order, the offsets of the row bands of one stack, start and end of the record in seconds.
 
-    Raises:
-        ValueError: If the frames do not fit the timing, or fewer than a quarter of the bands are found.
+    An error if the frames do not fit the timing, or fewer than a quarter of the bands are found.
     """
     frames = stack.images
     rowwise = timing.in_row_order()
@@ -388,10 +387,7 @@ class _SplineFit:
         return self.start + (np.arange(self.coefficients.shape[-1]) - 1.0) * self.spacing
 
     def variances(self, index: Array, weights: Array) -> Array:
-        """Variances (S, F, A) of linear functions of coefficients ``index`` (S, M), at most ``step`` apart.
-
-        Their factors are ``weights`` (S, F, M); the sum of a function is 1 or 0.
-        """
+        """Variances (S, F, A) of sums of ``weights`` (S, F, M) times coefficients ``index`` (S, M)."""
         part = np.minimum(index.min(1) // self.step, len(self.covariances[0]) - 1)
         place = index - self.step * part[:, None]
         parts = [values[part[:, None, None], place[:, :, None], place[:, None]] for values in self.covariances]

@@ -417,9 +417,8 @@ def _settle(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Levenberg-Marquardt from several starts (S, 6) side by side, for one axis of one stack.
 
-    Returns:
-        Best fit first: parameters (S, 6), their covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the
-        tone, and chi-square less that of the best fit (S,).
+    Best fit first: parameters (S, 6), covariances (S, 6, 6), decrease of chi-square per parameter (S,) by the tone, and
+    chi-square less that of the best fit (S,).
     """
     middle = 0.5 * (record[0] + record[1])
     weight = tensor(measured.inverse_variances[0, :, axis])

@@ -116,10 +116,7 @@ def residual_of(measurements: Measurements, fit: ToneFit) -> Array:
 
 
 def _jacobian_of_tones(smearing_times: Array, time: Array, tones: Array) -> Array:
-    """Derivatives (B, N, G, 2, 3 K) of mean displacements by Re C, Im C in px and f >= 0 in Hz of tones (B, 2, K, 3).
-
-    ``smearing_times`` and mid-exposures ``time`` as in ``Measurements``.
-    """
+    """Derivatives (B, N, G, 2, 3 K) of displacements by Re C, Im C in px and f >= 0 in Hz of tones (B, 2, K, 3)."""
     frequencies = tones[..., 2]
     smeared, smeared_slope = _sinc(frequencies * smearing_times)
     attenuation = smeared[0] * smeared[1]
@@ -173,10 +170,7 @@ class _Estimate:
 
 
 class _Problem:
-    """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` for the ``active`` (B, 2, K) tones of displacements.
-
-    r is the residual and W the information of scene row n.
-    """
+    """Nonlinear least squares ``min sum_n r_n^T W_n r_n`` of the rows for the ``active`` (B, 2, K) tones."""
 
     def __init__(self, measurements: Measurements, active: Array, model: MotionModel) -> None:
         self.measurements, self.active, self.model = measurements, active, model
@@ -303,10 +297,7 @@ class _Problem:
         return self.evaluate(self.moved(state.values, _step(state, self.linear, np.zeros_like(state.cost))))
 
     def solve(self, start: Array | ToneFit, iterations: int, tolerance: float) -> _Estimate:
-        """Levenberg-Marquardt from start frequencies or another fit, each stack on its own.
-
-        It ends when a step promises a relative decrease of the cost below the tolerance.
-        """
+        """Levenberg-Marquardt, each stack on its own, until a step promises a relative decrease below the tolerance."""
         # 1. Start values.
         if isinstance(start, ToneFit):
             start = start.about(self.measurements.centre)
@@ -454,10 +445,7 @@ def offset_gain(frequencies: Array, intervals: Array) -> Array:
 
 
 def motion_of_fit(fit: ToneFit, device: torch.device | None = None) -> Vibration:
-    """Vibration (B, 2, K) of a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8).
-
-    Gain and exposure are part of the fit. Tones that are not active have amplitude and frequency 0.
-    """
+    """Vibration (B, 2, K) of a fit: ``A = |C|``, ``phi = arg C + pi/2 - 2 pi f centre`` (Eqs. 6-8); 0 if not active."""
     centre = fit.centre[:, None, None]
     frequency = np.where(fit.active, fit.frequencies, 0.0)
     phase = np.angle(fit.coefficients) + 0.5 * math.pi - 2 * math.pi * frequency * centre

@@ -105,10 +105,7 @@ def strongest_frequencies(
 
 
 def _of_families(total: Array, first: int, harmonics: int) -> Array:
-    """Power (..., F) of multiples of a frequency, from the ``first`` on, with that of the multiples of each.
-
-    Half the fundamental explains as much by its even multiples: of nearly equal powers, the highest frequency wins.
-    """
+    """Power (..., F) of frequencies with that of their multiples; of nearly equal ones, the highest frequency wins."""
     if harmonics == 1:
         return total
     place = np.arange(total.shape[-1]) + first
@@ -137,10 +134,7 @@ def visibility(measurements: Measurements, frequencies: Array) -> Array:
 
 
 def without_stretches(measurements: Measurements) -> Array:
-    """(8, N) bool, rows to use: all, then all but one of seven stretches of 35 % that overlap by about two thirds.
-
-    A stretch of outliers of up to 24 % of the rows lies within one of them.
-    """
+    """(8, N) bool, rows to use: all, then all but one of seven overlapping stretches of 35 %, for outliers of 24 %."""
     rows = measurements.exposure_starts.shape[1]
     place = (np.arange(rows) + 0.5) / rows
     first = np.linspace(0, 0.65, 7)[:, None]

@@ -295,10 +295,7 @@ class StatedFit:
 def with_further_tones(
     measurements: Measurements, fit: ToneFit, exposure_starts: Array, *, number_is_known: bool = False
 ) -> tuple[StatedFit, StatedFit]:
-    """The fit with slow errors in its covariance, and the same with an allowance for a further tone.
-
-    ``exposure_starts`` (N,) of the rows are in s. There are no further tones if the ``number_is_known``.
-    """
+    """The fit with slow errors in its covariance, and with an allowance for a further tone; rows start at (N,) s."""
     rows = np.broadcast_to(exposure_starts, (len(fit.centre), len(exposure_starts)))
     variance = np.square(displacement_std(fit, exposure_starts, measurements.exposure_time))
     stated = [(fit.covariance.copy(), variance.copy()) for _ in range(2)]
