@@ -107,5 +107,4 @@ class Acceleration:
         ridge = 1e-3 * np.maximum(gram.diagonal(axis1=-2, axis2=-1).mean(-1), 1e-30)
         share = np.linalg.solve(gram + ridge[:, None, None] * np.eye(len(pairs)), right)[..., 0]
         share = np.clip(share, -_MAX_EXTRAPOLATION, _MAX_EXTRAPOLATION) * where[:, None]
-        correction: Array = (fitted * share[:, None, None, None]).sum(-1)
-        return correction
+        return (fitted * share[:, None, None, None]).sum(-1)

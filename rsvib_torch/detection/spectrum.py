@@ -248,8 +248,7 @@ class _Offsets:
         scale = np.maximum(scale, 1e-300)
         scaled = root * design / scale
         normal, right = scaled.T @ scaled, scaled.T @ (root[:, 0] * self.values)
-        solution: Array = np.linalg.lstsq(normal, right, rcond=1e-7)[0] / scale
-        return solution
+        return np.linalg.lstsq(normal, right, rcond=1e-7)[0] / scale
 
     def _refined(self, lines: Array, span: float) -> Array:
         """Lines after three Gauss-Newton steps of all amplitudes and frequencies; the first sets new amplitudes."""
@@ -264,8 +263,7 @@ class _Offsets:
         """Offsets (N,) without the lines and the drift."""
         design = self._design(lines)
         kept = np.r_[: 2 * len(lines), 3 * len(lines) : design.shape[1]]
-        rest: Array = self.values - design[:, kept] @ self._solved(design[:, kept], len(lines))
-        return rest
+        return self.values - design[:, kept] @ self._solved(design[:, kept], len(lines))
 
 
 def _lines_of(vibration: Vibration, axis: int, centre: float) -> Array:

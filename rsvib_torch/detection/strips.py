@@ -72,8 +72,7 @@ class FieldScale:
 
     def factors(self, x: Tensor, y: Tensor) -> Tensor:
         """Displacement (S, 2, A) at positions (S) in px from the centre by unit components in px."""
-        factors: Tensor = displacement_factors(x, y, self.axes, self.camera) * self.units(x)
-        return factors
+        return displacement_factors(x, y, self.axes, self.camera) * self.units(x)
 
 
 def camera_in_row_order(options: ProjectionOptions, size: tuple[int, int], timing: SensorTiming) -> Camera | None:

@@ -240,8 +240,7 @@ def column_pattern(groups: list[tuple[RowSpectra, Tensor, Tensor, Tensor, Tensor
 
     def of_stacks(values: Tensor) -> Tensor:
         """Sums (B, ...) over the groups of each stack of values (B M, ...)."""
-        total: Tensor = values.unflatten(0, (stacks, -1)).sum(1)
-        return total
+        return torch.stack(values.tensor_split(stacks)).sum(1)
 
     for spectra, rows, shift, shown, variance in groups:
         typical = torch.where(variance > 0, variance, torch.nan).nanmedian(dim=-1, keepdim=True).values

@@ -100,8 +100,7 @@ def _solve(matrix: Array, right: Array) -> Array:
 
 def unexplained(matrix: Array, values: Array) -> Array:
     """Residual of a least-squares fit of (T, H, N) to (T, H)."""
-    residual: Array = values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
-    return residual
+    return values - (matrix @ _solve(matrix, values)[..., None])[..., 0]
 
 
 def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
@@ -118,8 +117,7 @@ def deviations(jacobian: Array, residual: Array, reach: int) -> Array:
     sums = (correlated, np.einsum("tin,tim->nm", score, score))
     variances = [np.diag(information @ total @ information) for total in sums]
     variances.append((residual**2).mean() * np.diag(information))
-    std: Array = np.sqrt(np.max(variances, axis=0).clip(min=0.0))
-    return std
+    return np.sqrt(np.max(variances, axis=0).clip(min=0.0))
 
 
 def _fit_period(brightness: Array, start: float, scene: SceneModel) -> BandFit | None:
@@ -248,8 +246,7 @@ def _certainty(coefficients: Array, residual: Array, period: float) -> float:
 def _less_parabola(curves: Array) -> Array:
     """Curves (..., H) less the parabola that fits each of them."""
     smooth = np.linalg.qr(np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, curves.shape[-1]), 2))[0]
-    flat: Array = curves - curves @ smooth @ smooth.T
-    return flat
+    return curves - curves @ smooth @ smooth.T
 
 
 def _starts(brightness: Array) -> list[float]:

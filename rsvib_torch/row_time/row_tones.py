@@ -38,8 +38,7 @@ class RowRecord:
         """Values (N, G, ...) less their mean over the frames that contain the row; 0 in other frames."""
         seen = self.visible.reshape(*self.visible.shape, *(1,) * (values.ndim - 2))
         mean = (seen * values).sum(1, keepdims=True) / np.maximum(seen.sum(1, keepdims=True), 1.0)
-        difference: Array = seen * (values - mean)
-        return difference
+        return seen * (values - mean)
 
     @property
     def num_measurements(self) -> float:

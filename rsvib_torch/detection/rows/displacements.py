@@ -180,8 +180,7 @@ def measure_strips(
     positions = Positions.of(group.starts, spectra.height, timing, of_strips)
 
     def over_strips(values: Tensor) -> Tensor:
-        split: Tensor = values.unflatten(0, (-1, count))
-        return split
+        return values.unflatten(0, (-1, count))
 
     visible = over_strips(positions.visible(spectra.height, BLOCK_ROWS)).amin(1)
     warp = warp_to_scene(spectra, positions, timing, of_strips)
@@ -190,8 +189,7 @@ def measure_strips(
 
     def joined(run: slice) -> Tensor:
         pixels = torch.fft.irfft(warp(run), n=spectra.length)[..., : spectra.width]
-        spectrum: Tensor = torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
-        return spectrum
+        return torch.fft.rfft(extend_rows(strips.joined(pixels), length, hold=0.0))
 
     if gradients is None:
         valid = spectra.warped_valid(positions.rows, positions.shift)
@@ -280,8 +278,7 @@ def _solved(information: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
 def _in_blocks(values: Tensor) -> Tensor:
     """Rows on axis 2 as blocks of ``BLOCK_ROWS`` rows on axes 2 and 3; the remaining rows are left out."""
     count = values.shape[2] // BLOCK_ROWS
-    blocks: Tensor = values[:, :, : count * BLOCK_ROWS].unflatten(2, (count, BLOCK_ROWS))
-    return blocks
+    return values[:, :, : count * BLOCK_ROWS].unflatten(2, (count, BLOCK_ROWS))
 
 
 def joined_groups(parts: list[MeasuredGroup], exposure_time: float, groups: int = 1) -> Measurements:

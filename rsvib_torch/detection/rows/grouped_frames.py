@@ -61,11 +61,8 @@ class MeasuredRows:
         for part in self.gradients:
             of_groups = np.arange(len(part.variance)).reshape(self.num_stacks, -1)[stacks].ravel()
             gradients.append(part.stacks(tensor(of_groups).to(part.variance.device)))
-        return MeasuredRows(
-            take_stacks([self.measurements], stacks),
-            gradients,
-            None if self.apart is None else self.apart[stacks],
-        )
+        apart = None if self.apart is None else self.apart[stacks]
+        return MeasuredRows(take_stacks([self.measurements], stacks), gradients, apart)
 
     def differential(self) -> Array:
         """(B, 2) px, rms difference of the displacements along a row that the components do not explain."""
@@ -149,11 +146,11 @@ class GroupedFrames:
     def differently_blurred(self, motion: Vibration) -> Array:
         """Whether the frames of any group of each stack are blurred differently, (B,) bool, as in ``warping``."""
         view, height = self.view(motion), self.groups[0].spectra.height
-        of_groups = [
+        different = [
             differently_blurred(group.starts_of_groups, height, self.timing, group.motion_of_groups(view))[0]
             for group in self.groups
         ]
-        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in of_groups], 1).any(1))
+        return table(torch.cat([part.unflatten(0, (len(motion.amplitude), -1)) for part in different], 1).any(1))
 
 
 def grouped_frames(
@@ -170,6 +167,9 @@ def grouped_frames(
 # Strips
 
 _MAX_SLIDE_OF_BLUR = 0.15  # px
+# px, difference of the displacements by roll and zoom of two neighbouring strips: the second order of their
+# interpolation blurs as an exposure with a path of this length; and their distance: narrower ones are margins mostly
+_MAX_SLIDE, _MIN_PITCH = 0.1, 48
 
 
 def _in_rad(motion: Vibration | FreeMotion, scale: FieldScale) -> Vibration | FreeMotion:
@@ -247,16 +247,8 @@ def grouped_strips(
     scale: FieldScale,
     *,
     pairs: bool = True,
-    max_slide: float = 0.1,
-    min_pitch: int = 48,
 ) -> GroupedStrips:
-    """Frames (B, T, H, W) in strips of columns, for a motion of which all components are in px.
-
-    ``pairs``: form pairs if the frames are blurred differently. ``max_slide`` is the difference in px of the
-    displacements by roll and zoom of two neighbouring strips; the second order of their interpolation blurs as an
-    exposure with a path of this length. ``min_pitch`` are the columns from the middle of a strip to that of the next;
-    narrower strips consist of margins mostly.
-    """
+    """Frames (B, T, H, W) in strips of columns, for a motion in px; in ``pairs`` if they are blurred differently."""
     field, count = _in_rad(motion, scale), frames.shape[1]
     starts = timing.row_starts(count, scale.height, frames.device)[:, :: max(1, scale.height // 64)].flatten()
     ends = 0.5 * scale.width * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=frames.device)
@@ -266,7 +258,7 @@ def grouped_strips(
     margin = math.ceil(float(along.abs().amax()) + 1.0) + MARGIN  # 1 px: whole pixels of an image motion
     reached = field.largest_displacement(float(starts[0]), float(starts[-1]))
     slope = float(largest_slope(reached, scale.width, scale.height, scale.camera).amax())
-    strips = ColumnStrips.between_ends(scale.width, max(min_pitch, max_slide / max(slope, 1e-9)), margin)
+    strips = ColumnStrips.between_ends(scale.width, max(_MIN_PITCH, _MAX_SLIDE / max(slope, 1e-9)), margin)
     spectra = stack_spectra(frames, valid, strips)
     columns = strips.columns.to(frames.device)
     view = ColumnMotion.of_columns(field, columns, timing, count, scale.height)

@@ -171,10 +171,10 @@ def _warp_with_mean_moments(
     second, third = (values[..., None, None].to(by_x.real) for values in (second, third))
 
     def warped(part: slice) -> Tensor:
-        index = _with_neighbours(part, positions, _FILTERS)
+        index = _with_neighbours(part, positions, _REACH)
         images = spectra.warped(positions.rows[..., index], positions.shift[..., index])
         by_y, by_yy, by_yyy = _across_rows(torch.view_as_real(images), _FILTERS)
-        images = _inner(images, _FILTERS)
+        images = images[:, :, _REACH:-_REACH]
         here = torch.view_as_real(images)
         xx, xy, yy = (second[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
         xxx, xxy, xyy, yyy = (third[:, :, part, i, j, k] for i, j, k in ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1)))
@@ -208,7 +208,7 @@ def _warp_along_paths(
     factors = torch.stack([weights.expand_as(y), weights * y]).to(by_x.real).movedim(-1, 0)[..., None, None]
 
     def warped(part: slice) -> Tensor:
-        index = _with_neighbours(part, positions, _SHORT_FILTERS)
+        index = _with_neighbours(part, positions, _SHORT_REACH)
         totals = by_x.new_zeros(2, *positions.rows.shape[:2], len(index), len(by_x))
         of_numbers = torch.view_as_real(totals)
         copies = spectra.warped_copies(node_rows[..., index], node_shift[..., index])
@@ -217,27 +217,22 @@ def _warp_along_paths(
         mean, moment = totals  # of the copies, and of y times them
         by_y, by_yy = _across_rows(torch.view_as_real(moment), _SHORT_FILTERS)
         xx, xy, yy = (slope[:, :, part, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        total = _inner(moment, _SHORT_FILTERS) * by_x
+        inner = slice(_SHORT_REACH, -_SHORT_REACH)
+        total = moment[:, :, inner] * by_x
         numbers = torch.view_as_real(total)
         numbers.mul_(xx).addcmul_(by_y, xy, value=2)
-        total.mul_(by_x).add_(_inner(mean, _SHORT_FILTERS))
+        total.mul_(by_x).add_(mean[:, :, inner])
         numbers.addcmul_(by_yy, yy)
         return total
 
     return warped
 
 
-def _with_neighbours(part: slice, positions: Positions, filters: Array) -> Tensor:
-    """Indices of scene rows, with the neighbours of the first and of the last that filters use."""
-    count, reach = positions.rows.shape[-1], filters.shape[1] // 2
+def _with_neighbours(part: slice, positions: Positions, reach: int) -> Tensor:
+    """Indices of scene rows, with the neighbours of the first and of the last within reach."""
+    count = positions.rows.shape[-1]
     first, last, _ = part.indices(count)
     return torch.arange(first - reach, last + reach, device=positions.rows.device).clamp_(0, count - 1)
-
-
-def _inner(images: Tensor, filters: Array) -> Tensor:
-    """Images (B, G, s + R - 1, ...) without the neighbours that filters (K, R) use."""
-    reach = filters.shape[1] // 2
-    return images[:, :, reach : images.shape[2] - reach]
 
 
 def _derivative_filters(reach: int) -> Array:
@@ -257,7 +252,8 @@ def _derivative_filters(reach: int) -> Array:
     return np.stack(filters)
 
 
-_FILTERS = _derivative_filters(5)
+_REACH, _SHORT_REACH = 5, 2  # rows to either side
+_FILTERS = _derivative_filters(_REACH)
 # differences of fourth order: enough for corrections, and each run of rows has fewer neighbours
 _SHORT_FILTERS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12
 

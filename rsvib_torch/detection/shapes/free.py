@@ -323,8 +323,7 @@ def band_errors(banded: Measurements, motion: Motion) -> list[float]:
     """Mean difference in px of the offsets of the row bands of one stack from a motion in row order, for each axis."""
     rest = _offsets_of_bands(banded, residual_of_motion(banded, motion))
     best = np.sort(np.abs(rest), 0)[: math.ceil(0.75 * len(rest))]  # clouds may cover the others
-    errors: list[float] = best.mean(0).tolist()
-    return errors
+    return best.mean(0).tolist()
 
 
 def _offsets_of_bands(banded: Measurements, displacements: Array) -> Array:

@@ -153,8 +153,7 @@ def _constraints(model: MotionModel, tones: int, axes: int) -> Array:
         column += 3 if harmonic == 0 else 2
     for power in range(model.drift_order):
         matrix[3 * tones + power, column + power] = 1.0
-    of_axes: Array = block_diag(*[matrix] * axes)
-    return of_axes
+    return block_diag(*[matrix] * axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +238,7 @@ class _Problem:
     def inverse(self, state: _Estimate) -> Array:
         """Inverse (B, M, M) of the normal matrix of the free parameters; 0 for the others."""
         matrix, scale = _scaled(state, self.free, np.zeros_like(state.cost))
-        inverse: Array = np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
-        return inverse
+        return np.linalg.inv(matrix) * scale[:, :, None] * scale[:, None]
 
     def covariance_of_blocks(self, state: _Estimate) -> Array:
         """Covariance (B, A P, A P) from the scatter of the residuals between blocks of the scene.
