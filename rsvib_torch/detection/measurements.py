@@ -131,19 +131,12 @@ class Measurements:
         names = ("exposure_starts", "displacements", "visible", "information")
         return replace(self, **{name: getattr(self, name)[:, rows] for name in names})
 
-    def only(self, counts: Array) -> "Measurements":
-        """The measurements with information 0 in the rows where ``counts`` (B, N) is False."""
-        return self._with_information(self.information * counts[..., None, None])
-
     def scaled(self, factor: Array) -> "Measurements":
         """The measurements with their information multiplied by factors (B, N, 2) of each axis."""
         root = np.sqrt(factor)
-        return self._with_information(self.information * root[..., :, None] * root[..., None, :])
-
-    def _with_information(self, information: Array) -> "Measurements":
-        """The same displacements with other information; cached values are kept if they depend on times only."""
+        # cached values are kept if they depend on times only
         result = copy(self)
-        object.__setattr__(result, "information", information)
+        object.__setattr__(result, "information", self.information * root[..., :, None] * root[..., None, :])
         for name in ("root", "inverse_variances"):
             result.__dict__.pop(name, None)
         return result

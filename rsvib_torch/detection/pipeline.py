@@ -39,7 +39,7 @@ from rsvib_torch.detection.tones.uncertainty import (
     with_weak_aliasing,
     without_aliasing,
 )
-from rsvib_torch.detection.verdict import BandOffsets, Findings, judged, scene_reasons, with_reasons_of_all
+from rsvib_torch.detection.verdict import Findings, compared_bands, judged, scene_reasons, with_reasons_of_all
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.motion.vibration import Vibration, VibrationStd, blind_frequencies
@@ -192,14 +192,14 @@ def _with_errors_of_scene(
     )
 
 
-def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> BandOffsets:
-    """The offsets of the row bands with those that a fit predicts."""
+def _band_offsets(start: BandStart, fit: ToneFit, options: DetectionOptions, height: int) -> dict[str, Array]:
+    """``compared_bands`` of the offsets of the row bands and of those that a fit predicts."""
     (offsets, rows), predicted = tables(start.curve.offsets, start.curve.rows), start.predicted(fit)
     # an image motion may carry bands out of the later frame
     later, half = rows + predicted[..., 1], 0.5 * options.bands.band_rows
     visible = (later >= half) & (later <= height - 1 - half)
     flat = (len(offsets), -1, offsets.shape[-1])
-    return BandOffsets(offsets.reshape(flat), predicted.reshape(flat), visible.reshape(flat[:2]))
+    return compared_bands(offsets.reshape(flat), predicted.reshape(flat), visible.reshape(flat[:2]))
 
 
 # Methods of detection

@@ -214,7 +214,8 @@ class DetectionResult(
         def of_findings(findings: tuple[Any, ...], depth: int) -> tuple[Any, ...]:
             return findings[:count] if depth == 0 else tuple(of_findings(part, depth - 1) for part in findings)
 
-        std, hidden = self.offsets.std, self.std_if_hidden_tone
+        curve, hidden = self.offsets, self.std_if_hidden_tone
+        std = None if curve.std is None else curve.std[..., :count]
         return replace(
             self,
             vibration=self.vibration.mapped(first),
@@ -224,11 +225,7 @@ class DetectionResult(
             residual=first(self.residual),
             reliable=first(self.reliable),
             findings=of_findings(self.findings, batch),
-            offsets=replace(
-                self.offsets,
-                offsets=self.offsets.offsets[..., :count],
-                std=None if std is None else std[..., :count],
-            ),
+            offsets=replace(curve, offsets=curve.offsets[..., :count], std=std),
             fitted=self.fitted[..., :count],
             sensitivity=self.sensitivity.mapped(first),
         )

@@ -5,7 +5,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,19 +30,10 @@ _MIN_MOTION = 0.05  # px between frames; offsets of bands have errors of this si
 _OF_STACK = ("measured", "bands", "differential", "blur")  # quantities without an entry for each axis
 
 
-@dataclass(frozen=True, eq=False)
-class BandOffsets:
-    """Offsets of M row bands of B stacks."""
-
-    offsets: Array  # (B, M, A) px, NaN where a band could not be registered
-    fitted: Array  # (B, M, A) px, offsets predicted by the vibration
-    visible: Array  # (B, M) bool, bands that both frames contain
-
-
 def judged(
     vibration: Vibration,
     std: VibrationStd,
-    measured: OtherMotion | BandOffsets,
+    measured: OtherMotion | dict[str, Array],
     *,
     intervals: Array,
     displacement: Array,
@@ -53,7 +44,7 @@ def judged(
 ) -> tuple[Findings, ...]:
     """Reasons against the vibrations of B stacks, for each of their A axes in row order.
 
-    ``measured`` is the motion of the rows that they do not explain, or the offsets of row bands. ``intervals`` in s are
+    ``measured`` is the motion of the rows that they do not explain, or ``compared_bands``. ``intervals`` in s are
     those between the frames of the largest groups. ``displacement`` and ``known_std`` (B, A) in px are the displacement
     of the rows by the tones without its mean, rms over the rows, and its standard deviation if the number of tones is
     right. An axis with ``max_tones``, the largest number that was tried, may have more. ``radius`` is the distance from
@@ -77,7 +68,7 @@ def judged(
         # Condition (24) concerns the tones only: the blur by a uniform motion is exact at any speed.
         tones = Vibration(vibration.amplitude, vibration.frequency, vibration.phase)
         within = tones.displacement_within(timing.row_time)
-        quantities |= {**_compared_bands(measured), "within_row_time": table(within)}
+        quantities |= measured | {"within_row_time": table(within)}
 
     # 2. The comparisons with the limits.
     findings, least_gain = [], _MIN_GAIN_OF_TWO if intervals.size == 1 else MIN_GAIN
@@ -94,18 +85,22 @@ def judged(
     return tuple(findings)
 
 
-def _compared_bands(bands: BandOffsets) -> dict[str, Array]:
-    """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them."""
-    good = np.isfinite(bands.offsets).all(-1) & bands.visible
+def compared_bands(offsets: Array, fitted: Array, visible: Array) -> dict[str, Array]:
+    """Fraction of the visible bands that were registered, and size and residual of the best three quarters of them.
+
+    Offsets (B, M, A) in px are NaN where a band could not be registered; the vibration predicts those that are
+    ``fitted``, and both frames contain the ``visible`` (B, M) bands.
+    """
+    good = np.isfinite(offsets).all(-1) & visible
     number = good.sum(1, keepdims=True)
-    offsets = np.where(good[..., None], bands.offsets, np.nan)
+    offsets = np.where(good[..., None], offsets, np.nan)
     # Clouds may cover the other quarter.
-    residuals = np.sort(without_nan(np.abs(offsets - bands.fitted), math.inf), 1)
+    residuals = np.sort(without_nan(np.abs(offsets - fitted), math.inf), 1)
     counted = np.ceil(0.75 * number)
     best = np.arange(residuals.shape[1])[:, None] < counted[:, None]
     return {
-        "measured": number[:, 0] / np.maximum(bands.visible.sum(1), 1),
-        "bands": bands.visible.sum(1),
+        "measured": number[:, 0] / np.maximum(visible.sum(1), 1),
+        "bands": visible.sum(1),
         "residual": np.where(best, residuals, 0.0).sum(1) / counted,
         "size": valid_mean(np.abs(offsets - valid_mean(offsets, 1)[:, None]), 1),
     }

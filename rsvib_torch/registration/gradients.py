@@ -29,12 +29,7 @@ from torch.nn import functional
 from rsvib_torch.execution.chunking import chunks
 from rsvib_torch.execution.parallel import in_parallel
 from rsvib_torch.numerics.fourier import fast_length
-from rsvib_torch.registration.row_spectra import (
-    combined,
-    differences,
-    inner_columns,
-    mean_over_frames,
-)
+from rsvib_torch.registration.row_spectra import combined, differences, inner_columns, mean_over_frames
 
 BLOCK = 16  # px, side of the blocks of pixels that share a weight
 _SMOOTH = 16  # spectral values averaged along each axis for the power of scene and noise

@@ -35,11 +35,7 @@ class RowSpectra:
     """
 
     def __init__(
-        self,
-        frames: Tensor,
-        valid: Tensor | None = None,
-        level: Tensor | float = 0.0,
-        contrast: Tensor | float = 1.0,
+        self, frames: Tensor, valid: Tensor | None = None, level: Tensor | float = 0.0, contrast: Tensor | float = 1.0
     ) -> None:
         self.height, self.width = frames.shape[-2:]
         self.length = fast_length(self.width + 64)  # 32 px of boundary extension per end close the period smoothly

@@ -25,13 +25,7 @@ from rsvib_torch.motion.motion import Motion
 from rsvib_torch.motion.timing import RowTiming
 from rsvib_torch.numerics.fourier import extend_rows, fast_length
 from rsvib_torch.numerics.tables import Array, table, tables
-from rsvib_torch.registration.gradients import (
-    BLOCK,
-    RowGradients,
-    residual_products,
-    row_equations,
-    row_gradients,
-)
+from rsvib_torch.registration.gradients import BLOCK, RowGradients, residual_products, row_equations, row_gradients
 from rsvib_torch.registration.row_spectra import EVERY, RowSpectra, column_pattern, overlapping
 
 BLOCK_ROWS = 8  # rows of one measurement; tones up to 1 / (16 T_row) are resolved
@@ -136,10 +130,7 @@ def frame_groups(
 
 
 def measure_group(
-    group: FrameGroups,
-    timing: RowTiming,
-    motion: Motion,
-    gradients: RowGradients | None = None,
+    group: FrameGroups, timing: RowTiming, motion: Motion, gradients: RowGradients | None = None
 ) -> tuple["MeasuredGroup", RowGradients]:
     """Displacements of blocks of scene rows in the frames of groups, measured around a motion of each stack.
 

@@ -31,11 +31,7 @@ from rsvib_torch.execution.precision import full_precision, without_gradients
 from rsvib_torch.execution.progress import whole_steps
 from rsvib_torch.frames.entry_points import frames_options
 from rsvib_torch.frames.grey import GreyFrames, grey_frames
-from rsvib_torch.frames.orientation import (
-    findings_from_row_order,
-    magnitudes_from_row_order,
-    offsets_from_row_order,
-)
+from rsvib_torch.frames.orientation import findings_from_row_order, magnitudes_from_row_order, offsets_from_row_order
 from rsvib_torch.io.stack_reading import FramesOrFiles
 from rsvib_torch.motion.spline import FreeMotion
 from rsvib_torch.motion.timing import SensorTiming

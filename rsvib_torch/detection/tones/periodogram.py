@@ -164,7 +164,8 @@ def best_candidate(
     parts, weights, peaks = measurements, weighed.weights[:, None], 4  # outliers may raise a wrong peak
     if leave_out:
         kept = without_stretches(measurements)
-        parts = measurements.repeated(len(kept)).only(np.tile(kept, (len(measurements.exposure_starts), 1)))
+        used = np.tile(kept, (len(measurements.exposure_starts), 1))[..., None].astype(np.float64)
+        parts = measurements.repeated(len(kept)).scaled(used)
         weights, peaks = np.concatenate([weights, kept[1:, :, None] * measurements.weights[:, None]], 1), 2
     # 2. The highest peaks of each part, for the two axes, each fitted roughly with the tones of the earlier fit.
     unexplained = replace(measurements, displacements=residual)

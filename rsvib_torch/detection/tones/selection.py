@@ -108,18 +108,11 @@ def find_tones(
 
     The strongest tone of the gain-aware periodogram is added and all parameters are fitted again, until ``tones`` are
     found, or until the next one is not significant: it must pass an F-test and explain ``least_gain`` of the residual.
-
-    Args:
-        measurements: The displacements.
-        sample_interval: Seconds between neighbouring rows or bands.
-        tones: Number of tones of each axis (of families, where harmonics are tied); None to choose it from the data.
-        model: Structure of the motion.
-        least_gain: Share of the residual sum of squares that a further tone must explain.
-        start: Fit whose tones are accepted.
-        blind: (F,) Hz, blind frequencies of the frames, to recognise side tones of blind tones.
-        accuracy: px; a fit is good enough once nearly all residuals of an axis are smaller.
-        stretches: Whether the search allows for stretches of outliers, if there is no start.
-        iterations: As in ``fit_tones``.
+    Rows or bands are ``sample_interval`` seconds apart. ``tones`` are those of each axis (families, where harmonics are
+    tied), None to choose their number from the data; those of the fit ``start`` are accepted. ``blind`` (F,) in Hz are
+    the blind frequencies of the frames, to recognise side tones. A fit is good enough once nearly all residuals of an
+    axis are below the ``accuracy`` in px. ``stretches``: whether the search allows for stretches of outliers, if there
+    is no start; ``iterations`` as in ``fit_tones``.
     """
     model, stretches = model or MotionModel(), stretches and start is None
     search = _Search(measurements, sample_interval, tones, model, least_gain, start, accuracy, stretches, iterations)
