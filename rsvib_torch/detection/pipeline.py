@@ -125,15 +125,13 @@ def attempt(stacks: GreyFrames, timing: RowTiming, options: DetectionOptions, hy
 
     # 1. Start: the offsets of row bands between consecutive frames, and the tones that are known.
     if scale.same_for_all_columns:
-        start = band_start(
-            stacks, timing, options.bands, mere_start=not method.needs_whole_curve, known=hypothesis.known_offsets
-        )
+        known = hypothesis.known_offsets
+        start = band_start(stacks, timing, options.bands, known, mere_start=not method.needs_whole_curve)
     else:
         start = field_start(stacks, timing, options.bands, scale, hypothesis.translation)
     if hypothesis.frequencies is not None:
         active = np.ones_like(hypothesis.frequencies, dtype=bool)
-        known, _ = robust_fit(start.measurements, hypothesis.frequencies, active, options.model)
-        start = replace(start, fit=known)
+        start = replace(start, fit=robust_fit(start.measurements, hypothesis.frequencies, active, options.model)[0])
 
     # 2. Fit: tones and image motion, to the bands or to the rows.
     fitted = method.fit(start, stacks, timing, options, hypothesis)

@@ -79,8 +79,8 @@ def with_row_time_std(
         torch.stack([getattr(sensitivity, f"{of}_by_{time}") for of in ("amplitude", "frequency", "phase")])
         for time in ("row_time", "frame_rows", "exposure_rows")
     )
-    change = (by_row_time - by_frame_rows - by_exposure_rows) * (timing.row_time_std / timing.row_time)
-    amplitude, frequency, phase = change
+    relative = timing.row_time_std / timing.row_time
+    amplitude, frequency, phase = (by_row_time - by_frame_rows - by_exposure_rows) * relative
     return replace(
         std,
         amplitude=torch.hypot(std.amplitude, vibration.amplitude * amplitude),
@@ -130,7 +130,7 @@ def assumptions(
             f"{what}, readout direction, scan axis and order of the frames: two frames cannot contradict them, more "
             "frames can"
         )
-        times.insert(0, "frame_rows" if timing.frame_start_times is None else "row_time")
+        times.insert(0, what.partition(",")[0])
     # 2. Effects on the tones of each stack.
     amplitudes, frequencies = tables(vibration.amplitude, vibration.frequency)
     changes = {name: tables(*(getattr(sensitivity, f"{of}_by_{name}") for of in _CHANGED)) for name in times}

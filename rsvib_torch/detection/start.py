@@ -11,8 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from rsvib_torch.detection.measurements import Measurements
-from rsvib_torch.detection.strips import FieldScale, combined_strips, cut_into_strips
+from rsvib_torch.detection.strips import FieldScale, combined_strips
 from rsvib_torch.detection.tones.fit import ToneFit, model_displacements, with_axes
+from rsvib_torch.frames.column_strips import ColumnStrips
 from rsvib_torch.frames.grey import GreyFrames
 from rsvib_torch.frames.pixels import cut_columns, detailed_parts
 from rsvib_torch.motion.timing import RowTiming
@@ -66,12 +67,7 @@ class BandStart:
 
 
 def band_start(
-    stacks: GreyFrames,
-    timing: RowTiming,
-    options: RegistrationOptions,
-    *,
-    mere_start: bool,
-    known: OffsetCurve | None = None,
+    stacks: GreyFrames, timing: RowTiming, options: RegistrationOptions, known: OffsetCurve | None, *, mere_start: bool
 ) -> BandStart:
     """``band_curve`` with its measurements; ``known`` are the offsets of these frames with another timing."""
     if known is None:
@@ -99,16 +95,16 @@ def field_start(
     """Offsets of row bands for a motion with roll or zoom, from two to four parts of the columns.
 
     Bands of parts of the width are often registered wrongly. The tones of x and y are therefore taken from the
-    ``translation``, a fit without roll and zoom, which has smaller errors.
-
-    Raises:
-        ValueError: If the parts are too narrow, see ``strips_fit``.
+    ``translation``, a fit without roll and zoom, which has smaller errors. Parts that are too narrow are an error.
     """
-    frames, valid = stacks.images, stacks.valid
-    count = _num_strips(frames.shape[-1])
-    parts, columns = cut_into_strips(frames, count)
-    valid_parts = None if valid is None else cut_into_strips(valid, count)[0]
-    of_strips = band_curve(parts, valid_parts, timing, options, mere_start=False)
+    frames, valid, width = stacks.images, stacks.valid, stacks.images.shape[-1]
+    count = _num_strips(width)
+    part = round(width / count)  # px
+    firsts = tuple(round(number * (width - part) / (count - 1)) for number in range(count))
+    strips = ColumnStrips(width, part, firsts, tuple(first + 0.5 * (part - 1) for first in firsts))
+    cut_valid = None if valid is None else strips.cut(valid)
+    of_strips = band_curve(strips.cut(frames), cut_valid, timing, options, mere_start=False)
+    columns = strips.columns.to(frames.device)
     rows = (of_strips.rows - 0.5 * (scale.height - 1)).repeat(len(of_strips.pairs))
     factors = scale.factors(columns[:, None].expand(-1, len(rows)), rows.expand(count, -1))
     of_parts = measurements_of_curve(of_strips, timing, options.band_step)

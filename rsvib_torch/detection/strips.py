@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from rsvib_torch.detection.measurements import Measurements
@@ -126,13 +125,3 @@ def combined_strips(measured: Measurements, factors: Array) -> Measurements:
         measured.average_times,
         measured.independent,
     )
-
-
-def cut_into_strips(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Images (B, T, H, W) in ``count`` strips of columns (B S, T, H, w), and the middles (S,) of the strips."""
-    width = values.shape[-1]
-    columns = round(width / count)
-    firsts = [round(number * (width - columns) / max(1, count - 1)) for number in range(count)]
-    strips = torch.stack([values[..., first : first + columns] for first in firsts], 1).flatten(0, 1)
-    middles = torch.tensor(firsts, dtype=torch.float64, device=values.device) + 0.5 * (columns - width)
-    return strips, middles

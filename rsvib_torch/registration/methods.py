@@ -136,8 +136,7 @@ def register_phase(task: BandTask) -> tuple[Tensor, Tensor]:
     places = task.places
     num_rows = task.first.shape[-2]
     # search for whole pixels: these windows contain the band's content at every lag of the search range
-    tall = task.height + 2 * task.search
-    factor = BINNING
+    tall, factor = task.height + 2 * task.search, BINNING
     width = task.width // factor * factor
     up = torch.tensor([0, task.search], device=places.device)
     pair = [

@@ -538,11 +538,10 @@ def _inverse_near_diagonal(band: Array) -> tuple[int, Array]:
 def _fit_with_spectrum(gram: Tensor, right: Tensor, noise: float, smoothness: float) -> tuple[Tensor, Tensor]:
     """Coefficients (N,) of a spline and their covariance (N, N), with the power of each frequency estimated.
 
-    The smoothness penalty assumes how fast the power of a motion falls with frequency. A motion with a resonance has
-    more power there, and may have more in undetermined components of similar frequency. The coefficients are a straight
-    line and cosines, ``c = sum_j a_j cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates
-    between a for given s, and s_j = mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the
-    penalty.
+    A motion with a resonance has more power there than the smoothness penalty assumes, and may have more in
+    undetermined components of similar frequency. The coefficients are a straight line and cosines, ``c = sum_j a_j
+    cos(w_j (n + 1/2))`` with a_j of variance s_j. Expectation maximisation alternates between a for given s, and s_j =
+    mean of ``a_j^2 + var(a_j)`` over neighbouring frequencies, relative to the penalty.
 
     ``gram`` (N, N) and ``right`` (N,) are the normal equations, ``noise`` is the variance of measurements of unit
     weight, and ``smoothness`` the weight of squared second differences to start with.
@@ -654,12 +653,9 @@ def _blind_tone(values: Array, times: Array, noise: Array) -> Array:
 
     Of a tone at ``1 + e`` times the frame rate, the frames show ``2 pi e`` of its amplitude, and e only in the change
     of that from frame to frame. The rms displacement is the mean over all e of its posterior, where such a tone beside
-    a uniformly accelerated motion explains the visible motion. Of 400 displacements by tones of 1.5 px within 8 % of
-    the frame rate in five frames, 94 % of the 95 % intervals contain the truth; 79 % did with four times the standard
-    deviation that the power at other frequencies suggests.
-
-    ``values`` (T, R, A) px are the displacements of rows at ``times`` (T, R) in s, ``noise`` (A,) px is the standard
-    deviation of their visible part.
+    a uniformly accelerated motion explains the visible one. Of 400 displacements by tones of 1.5 px within 8 % of the
+    frame rate in five frames, 94 % of the 95 % intervals contain the truth. ``values`` (T, R, A) px are displacements
+    at ``times`` (T, R) in s, ``noise`` (A,) px is the standard deviation of their visible part.
     """
     starts = times[:, 0]
     period, frames = np.diff(starts).mean(), len(starts)
